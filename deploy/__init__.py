@@ -1,0 +1,1 @@
+"""Putting the parts to work: the router, configurations, and the demo."""

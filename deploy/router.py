@@ -1,0 +1,80 @@
+"""A Zenoh router in a process of its own: `python -m deploy.router [--config FILE] [--listen ENDPOINT]`.
+
+The Python package of Zenoh holds the whole router, so no other binary is needed.
+It prints `router: tcp/…` when it listens (with the real port where port 0 was asked for) and ends on SIGINT or SIGTERM.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+import zenoh
+
+from schemas.errors import InputError
+
+CONFIG = Path(__file__).with_name("router.json5")
+
+
+def configuration(config: Path = CONFIG, listen: str | None = None) -> zenoh.Config:
+    """The router's configuration from a file, with another endpoint if one is given.
+
+    Raises:
+        InputError: the file cannot be read as a Zenoh configuration, or the endpoint is none.
+    """
+    try:
+        settings = zenoh.Config.from_file(str(config))
+    except zenoh.ZError as error:
+        raise InputError("config", f"cannot use {config} ({error})", "give a Zenoh configuration file") from error
+    if listen is not None:
+        settings.insert_json5("listen/endpoints", json.dumps([listen]))
+        settings.insert_json5("adminspace/enabled", "true")  # tells the port that port 0 became
+    return settings
+
+
+def open_router(config: Path = CONFIG, listen: str | None = None) -> tuple[zenoh.Session, list[str]]:
+    """Start a router in this process; returns its session and the endpoints that it listens on.
+
+    Raises:
+        InputError: the configuration is wrong, or the endpoint is taken.
+    """
+    settings = configuration(config, listen)
+    try:
+        session = zenoh.open(settings)
+    except zenoh.ZError as error:
+        raise InputError("listen", f"the router cannot start ({error})", "free the port or give another") from error
+    if listen is None:
+        return session, list(json.loads(settings.get_json("listen/endpoints")))
+    reply = next(iter(session.get(f"@/{session.zid()}/router"))).ok
+    if reply is None:
+        raise InputError("listen", "the router does not tell its endpoints", "give a fixed port")
+    return session, list(json.loads(reply.payload.to_string())["locators"])
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a router until a signal ends it."""
+    parser = argparse.ArgumentParser(prog="deploy.router", description="A Zenoh router for GripMap.")
+    parser.add_argument("--config", type=Path, default=CONFIG, help="Zenoh configuration file (JSON5)")
+    parser.add_argument("--listen", help="endpoint instead of the file's, e.g. tcp/127.0.0.1:0 for a free port")
+    args = parser.parse_args(argv)
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    try:
+        session, endpoints = open_router(args.config, args.listen)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    with session:
+        print(f"router: {' '.join(endpoints)}", flush=True)
+        stop.wait()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,25 @@
+"""Errors that a person or another program can act on.
+
+InputError          misuse or bad input: names the field and the fix (exit code 2 at the command line)
+└── WireError       a payload that is not the message it claims to be (a counted refusal in the service)
+"""
+
+from __future__ import annotations
+
+
+class InputError(ValueError):
+    """Input that cannot be used.
+
+    Args:
+        field: the name of the field, column, option or file that is wrong.
+        problem: what is wrong with it.
+        fix: what to do about it.
+    """
+
+    def __init__(self, field: str, problem: str, fix: str) -> None:
+        super().__init__(f"{field}: {problem}; {fix}")
+        self.field, self.problem, self.fix = field, problem, fix
+
+
+class WireError(InputError):
+    """A payload that cannot be read as the message that its key or encoding claims."""

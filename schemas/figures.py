@@ -1,0 +1,78 @@
+"""Figures that a campaign measured, each with its bar: one `figures.json`, and the table made from it."""
+
+from __future__ import annotations
+
+import json
+import math
+import platform
+import subprocess
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Literal
+
+PACKAGES = ("eclipse-zenoh", "numba", "numpy", "protobuf", "pyarrow", "pydantic", "scipy")
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One measured value.
+
+    Attributes:
+        bar: what it is held against; a pair for "within"; None where it is only shown.
+        better: on which side of the bar it must lie.
+    """
+
+    name: str
+    value: float
+    unit: str
+    bar: float | tuple[float, float] | None = None
+    better: Literal["less", "more", "within"] = "less"
+
+    @property
+    def holds(self) -> bool:
+        """Whether the bar holds; NaN (not measured) never does."""
+        if self.bar is None:
+            return not math.isnan(self.value)
+        if isinstance(self.bar, tuple):
+            return self.bar[0] <= self.value <= self.bar[1]
+        return self.value <= self.bar if self.better == "less" else self.value >= self.bar
+
+
+def header(campaign: str, seeds: Sequence[int]) -> dict[str, object]:
+    """What a figure depends on besides the code: commit, machine, versions, seeds, date."""
+    try:
+        command = ["git", "rev-parse", "--short", "HEAD"]
+        commit = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        commit = "unknown"
+    return {
+        "campaign": campaign,
+        "commit": commit,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "machine": f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}",
+        "versions": {name: metadata.version(name) for name in PACKAGES},
+        "seeds": list(seeds),
+    }
+
+
+def write(path: Path, campaign: str, seeds: Sequence[int], figures: Sequence[Figure]) -> None:
+    """Write the header record and the figures as one JSON list."""
+    rows = [{**asdict(figure), "holds": figure.holds} for figure in figures]
+    for row in rows:
+        row["value"] = row["value"] if math.isfinite(row["value"]) else None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps([header(campaign, seeds), *rows], indent=1) + "\n")
+
+
+def markdown(figures: Sequence[Figure]) -> str:
+    """The figures as a Markdown table; a bar that does not hold says so."""
+    signs = {"less": "≤", "more": "≥", "within": ""}
+    lines = ["| figure | value | bar | |", "|---|---|---|---|"]
+    for f in figures:
+        bar = "" if f.bar is None else f"{f.bar[0]:g} – {f.bar[1]:g}" if isinstance(f.bar, tuple) else f"{f.bar:g}"
+        verdict = "" if f.bar is None else "holds" if f.holds else "DOES NOT HOLD"
+        lines.append(f"| `{f.name}` | {f.value:.4g} {f.unit} | {signs[f.better]} {bar} | {verdict} |")
+    return "\n".join(lines)

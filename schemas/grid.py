@@ -1,0 +1,144 @@
+"""Where on earth: quadint cells, tiles, regions, zones, and heading sectors. Everything is vectorised.
+
+A *quadint* at zoom z interleaves the bits of the Web-Mercator tile column x and row y (x in the even bits), so that its
+base-4 digits are the quadkey and a parent is a shift: `parent = cell >> 2·(21 - z)`.
+
+    cell     zoom 21   9 m (60° north) to 19 m (equator)   the canonical cell, int64
+    tile     zoom 14   one map message
+    region   zoom 10   one key of observations
+    zone     zoom 7    one folder of the archive
+    sector   0 east, 1 north, 2 west, 3 south: quarter of the compass the vehicle heads for, so carriageways do not mix
+
+Latitudes are limited to ±85.0511° (Web Mercator). Longitudes wrap at ±180°.
+Source: the slippy-map tile scheme (OpenStreetMap wiki, "Slippy map tilenames") and Bing's quadkeys.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from schemas.numeric import FloatArray, IntArray
+
+CELL_ZOOM: Final = 21
+TILE_ZOOM: Final = 14
+REGION_ZOOM: Final = 10
+ZONE_ZOOM: Final = 7
+MAX_LATITUDE: Final = 85.05112877980659
+SECTORS: Final = 4
+SECTOR_MARGIN: Final = np.radians(15.0)  # a heading this near to a sector's edge belongs to both sectors
+
+# spreading the bits of a 32-bit number to the even places of a 64-bit one: shift, then keep
+_SPREAD: Final = (
+    (16, 0x0000FFFF0000FFFF), (8, 0x00FF00FF00FF00FF), (4, 0x0F0F0F0F0F0F0F0F),
+    (2, 0x3333333333333333), (1, 0x5555555555555555),
+)  # fmt: skip
+
+
+def _spread(v: IntArray) -> IntArray:
+    for shift, mask in _SPREAD:
+        v = (v | (v << shift)) & mask
+    return v
+
+
+def _gather(v: IntArray) -> IntArray:
+    v = v & 0x5555555555555555
+    for (shift, _), mask in zip(reversed(_SPREAD), (*(m for _, m in reversed(_SPREAD[:-1])), 0xFFFFFFFF), strict=True):
+        v = (v | (v >> shift)) & mask
+    return v
+
+
+def interleave(x: IntArray, y: IntArray) -> IntArray:
+    """Tile column and row as a quadint of the same zoom."""
+    return _spread(x) | (_spread(y) << 1)
+
+
+def deinterleave(cell: ArrayLike) -> tuple[IntArray, IntArray]:
+    """Column and row of a quadint."""
+    c = np.asarray(cell, dtype=np.int64)
+    return _gather(c), _gather(c >> 1)
+
+
+def cell_of(latitude: ArrayLike, longitude: ArrayLike, zoom: int = CELL_ZOOM) -> IntArray:
+    """The cell that holds a position [deg]; (…,) int64. Positions must be finite."""
+    n = 1 << zoom
+    phi = np.radians(np.clip(np.asarray(latitude, dtype=np.float64), -MAX_LATITUDE, MAX_LATITUDE))
+    x = np.floor((np.asarray(longitude, dtype=np.float64) + 180.0) / 360.0 * n).astype(np.int64) % n
+    y = np.floor((1.0 - np.arcsinh(np.tan(phi)) / np.pi) / 2.0 * n).astype(np.int64)
+    return interleave(x, np.clip(y, 0, n - 1))
+
+
+def parent(cell: ArrayLike, zoom: int, of: int = CELL_ZOOM) -> IntArray:
+    """The ancestor at `zoom` of a cell at zoom `of`."""
+    return np.asarray(cell, dtype=np.int64) >> (2 * (of - zoom))
+
+
+def tile_of(cell: ArrayLike) -> IntArray:
+    """The z14 tile of a cell."""
+    return parent(cell, TILE_ZOOM)
+
+
+def region_of(cell: ArrayLike) -> IntArray:
+    """The z10 region of a cell."""
+    return parent(cell, REGION_ZOOM)
+
+
+def zone_of(cell: ArrayLike) -> IntArray:
+    """The z7 zone of a cell."""
+    return parent(cell, ZONE_ZOOM)
+
+
+def _latitude(row: NDArray[Any], zoom: int) -> FloatArray:
+    return np.degrees(np.arctan(np.sinh(np.pi * (1.0 - 2.0 * row / (1 << zoom)))))
+
+
+def _longitude(column: NDArray[Any], zoom: int) -> FloatArray:
+    return column / (1 << zoom) * 360.0 - 180.0
+
+
+def centre(cell: ArrayLike, zoom: int = CELL_ZOOM) -> tuple[FloatArray, FloatArray]:
+    """Latitude and longitude [deg] of the middle of a cell."""
+    x, y = deinterleave(cell)
+    return _latitude(y + 0.5, zoom), _longitude(x + 0.5, zoom)
+
+
+def bounds(cell: ArrayLike, zoom: int = CELL_ZOOM) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """West, south, east, north [deg] of a cell."""
+    x, y = deinterleave(cell)
+    return _longitude(x, zoom), _latitude(y + 1, zoom), _longitude(x + 1, zoom), _latitude(y, zoom)
+
+
+def neighbours(cell: ArrayLike, zoom: int = CELL_ZOOM) -> IntArray:
+    """The eight cells around a cell, (…, 8), row by row from the north-west; columns wrap, beyond the poles is -1."""
+    n = 1 << zoom
+    x, y = deinterleave(cell)
+    dx = np.array([-1, 0, 1, -1, 1, -1, 0, 1])
+    dy = np.array([-1, -1, -1, 0, 0, 1, 1, 1])
+    columns, rows = (x[..., None] + dx) % n, y[..., None] + dy
+    return np.where((rows >= 0) & (rows < n), interleave(columns, np.clip(rows, 0, n - 1)), -1)
+
+
+def quadkey(cell: int, zoom: int) -> str:
+    """The digits of one quadint: a string of `zoom` digits 0–3."""
+    return "".join(str((cell >> (2 * place)) & 3) for place in range(zoom - 1, -1, -1))
+
+
+def from_quadkey(digits: str) -> int:
+    """The quadint of a quadkey; its zoom is the number of digits."""
+    return int(digits, 4)
+
+
+def sector_of(yaw: ArrayLike) -> NDArray[np.int8]:
+    """The heading sector of a yaw [rad, counter-clockwise from east]."""
+    quarter = np.floor((np.asarray(yaw, dtype=np.float64) + np.pi / 4) / (np.pi / 2))
+    return np.mod(quarter, SECTORS).astype(np.int8)
+
+
+def sectors_touched(yaw: ArrayLike) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
+    """The sector of a yaw, and the second one where the yaw lies within 15° of an edge (else -1)."""
+    angle = np.asarray(yaw, dtype=np.float64)
+    first, left, right = sector_of(angle), sector_of(angle + SECTOR_MARGIN), sector_of(angle - SECTOR_MARGIN)
+    second = np.where(left != first, left, np.where(right != first, right, -1))
+    return first, second.astype(np.int8)

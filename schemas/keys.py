@@ -1,0 +1,130 @@
+"""The one table of topics: key expression → message and quality of service; keys are built and parsed here only.
+
+A region is cut into chunks of 4, 3 and 3 quadkey digits, a tile into 4, 3, 3 and 4, so that a wildcard is a region of
+any size: `gripmap/v1/map/1200/320/*/*` is a z7 zone.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Final, NamedTuple
+
+from schemas import grid
+from schemas.config import NAME_PATTERN
+from schemas.errors import InputError
+
+ROOT: Final = "gripmap/v1"
+_CHUNKS: Final = (4, 3, 3, 4)
+
+
+class Topic(NamedTuple):
+    """One kind of key.
+
+    Attributes:
+        place: zoom of the quadint in the key, None where there is none.
+        who: whether the last chunk is a name (a vehicle, or a service).
+        message: what is put there; None for a liveliness token.
+        priority: Zenoh priority by name.
+        block: congestion control: block (True) or drop (False).
+    """
+
+    name: str
+    place: int | None
+    who: bool
+    message: str | None
+    priority: str
+    block: bool
+
+
+TOPICS: Final = {
+    topic.name: topic
+    for topic in (
+        Topic("obs", grid.REGION_ZOOM, True, "gripmap.v1.ObservationBatch", "DATA", True),
+        Topic("state", grid.REGION_ZOOM, True, "gripmap.v1.StateBatch", "DATA_LOW", True),
+        Topic("ack", None, True, "gripmap.v1.Ack", "DATA_HIGH", True),
+        Topic("map", grid.TILE_ZOOM, False, "Arrow stream", "DATA_LOW", False),
+        Topic("alert", grid.TILE_ZOOM, False, "gripmap.v1.Alert", "REAL_TIME", True),
+        Topic("weather", grid.REGION_ZOOM, False, "gripmap.v1.Weather", "DATA", True),
+        Topic("alive", None, True, None, "DATA", True),
+        Topic("shard", None, True, None, "DATA", True),
+    )
+}
+
+
+def chunks(quadint: int, zoom: int) -> str:
+    """Quadkey digits of a region (z10) or tile (z14), cut by slashes."""
+    digits, parts = grid.quadkey(quadint, zoom), []
+    for size in _CHUNKS:
+        if digits:
+            parts.append(digits[:size])
+            digits = digits[size:]
+    return "/".join(parts)
+
+
+def observation_key(region: int, vehicle: str) -> str:
+    """Where a vehicle puts the observations of a region."""
+    return f"{ROOT}/obs/{chunks(region, grid.REGION_ZOOM)}/{vehicle}"
+
+
+def state_key(region: int, vehicle: str) -> str:
+    """Where a vehicle puts its states in a region."""
+    return f"{ROOT}/state/{chunks(region, grid.REGION_ZOOM)}/{vehicle}"
+
+
+def ack_key(vehicle: str) -> str:
+    """Where a vehicle hears what is settled."""
+    return f"{ROOT}/ack/{vehicle}"
+
+
+def map_key(tile: int) -> str:
+    """Where a tile of the map is put and asked for."""
+    return f"{ROOT}/map/{chunks(tile, grid.TILE_ZOOM)}"
+
+
+def alert_key(tile: int) -> str:
+    """Where the alerts of a tile are put."""
+    return f"{ROOT}/alert/{chunks(tile, grid.TILE_ZOOM)}"
+
+
+def weather_key(region: int) -> str:
+    """Where the weather of a region is put."""
+    return f"{ROOT}/weather/{chunks(region, grid.REGION_ZOOM)}"
+
+
+def alive_key(vehicle: str) -> str:
+    """Liveliness token of a vehicle."""
+    return f"{ROOT}/alive/{vehicle}"
+
+
+def shard_key(service: str) -> str:
+    """Liveliness token of a service."""
+    return f"{ROOT}/shard/{service}"
+
+
+class Parsed(NamedTuple):
+    """A concrete key taken apart: topic, quadint (None where the topic has no place), name (None likewise)."""
+
+    topic: Topic
+    place: int | None
+    who: str | None
+
+
+def parse(key: str) -> Parsed:
+    """Take a concrete key apart.
+
+    Raises:
+        InputError: a wildcard, an unknown topic, a wrong number of chunks or digits, or a name that is none.
+    """
+    head, _, rest = key.removeprefix(ROOT + "/").partition("/")
+    topic = TOPICS.get(head)
+    if not key.startswith(ROOT + "/") or topic is None:
+        raise InputError("key", f"{key[:80]!r} is none of ours", f"use {ROOT}/ and one of {', '.join(TOPICS)}")
+    parts = rest.split("/")
+    who = parts.pop() if topic.who else None
+    if who is not None and not re.fullmatch(NAME_PATTERN, who):
+        raise InputError("key", f"{who[:80]!r} is no name", f"use {NAME_PATTERN}")
+    place = "".join(parts)
+    sizes = _CHUNKS[: len(parts)] if topic.place else ()
+    if (topic.place or 0) != len(place) or [len(part) for part in parts] != list(sizes) or set(place) - set("0123"):
+        raise InputError("key", f"{key[:80]!r} names no place", f"cut {topic.place or 0} quadkey digits by {_CHUNKS}")
+    return Parsed(topic, grid.from_quadkey(place) if topic.place else None, who)

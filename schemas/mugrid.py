@@ -1,0 +1,64 @@
+"""The fixed friction grid, and what a log-likelihood on it means.
+
+Legend
+    μ        peak tyre–road adhesion coefficient                      [-]
+    EDGES    borders of the 32 equal bins on [0.05, 1.20]             (33,)
+    CENTRES  middles of the bins                                      (32,)
+    PRIOR    what is believed of a road nobody has measured: uniform  (32,)
+    ℓ        log p(a visit's measurements | μ), up to a constant      (…, 32), nats
+
+A log-likelihood travels as 32 bytes: steps of 1/16 nat below the maximum, floored at 255 steps.
+A flat one (all zeros) says that nothing was learned.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.numeric import ByteArray, FloatArray
+
+BINS: Final = 32
+LOWER: Final = 0.05
+UPPER: Final = 1.20
+EDGES: Final[FloatArray] = np.linspace(LOWER, UPPER, BINS + 1)
+CENTRES: Final[FloatArray] = (EDGES[:-1] + EDGES[1:]) / 2
+PRIOR: Final[FloatArray] = np.full(BINS, 1.0 / BINS)
+STEPS_PER_NAT: Final = 16
+FLOOR_STEPS: Final = 255
+
+
+def quantiles(probability: NDArray[np.floating[Any]], q: float) -> FloatArray:
+    """The q-quantile of histograms on the grid, linear inside a bin.
+
+    Args:
+        probability: (…, 32), non-negative; need not be normalised.
+        q: in [0, 1].
+
+    Returns:
+        (…,) values in [LOWER, UPPER].
+    """
+    p = np.asarray(probability, dtype=np.float64)
+    cdf = np.cumsum(p, axis=-1)
+    total = cdf[..., -1:]
+    target = q * total
+    bin_ = np.argmax(cdf >= target, axis=-1)[..., None]
+    mass = np.take_along_axis(p, bin_, axis=-1)
+    below = np.take_along_axis(cdf, bin_, axis=-1) - mass
+    share = np.divide(target - below, mass, out=np.zeros_like(mass), where=mass > 0)
+    width = (UPPER - LOWER) / BINS
+    return np.asarray(LOWER + width * (bin_[..., 0] + np.clip(share[..., 0], 0.0, 1.0)))
+
+
+def encode_log_likelihood(log_likelihood: NDArray[np.floating[Any]]) -> ByteArray:
+    """ℓ (…, 32) as bytes below its maximum; NaN is refused by the caller, -inf becomes the floor."""
+    below = np.max(log_likelihood, axis=-1, keepdims=True) - log_likelihood
+    steps: ByteArray = np.clip(np.rint(below * STEPS_PER_NAT), 0, FLOOR_STEPS).astype(np.uint8)
+    return steps
+
+
+def decode_log_likelihood(steps: ByteArray) -> FloatArray:
+    """Bytes (…, 32) as ℓ with maximum 0 (if the sender put it there) and floor -255/16 nat."""
+    return steps.astype(np.float64) / -STEPS_PER_NAT

@@ -1,0 +1,1 @@
+"""Wire messages: gripmap.proto and the module generated from it (`make proto`)."""

@@ -1,0 +1,97 @@
+"""What may be asked of the map: the parameters of `get gripmap/v1/map/**?…`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import datetime
+from enum import StrEnum
+from typing import Annotated, Final
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from schemas import wire
+from schemas.errors import InputError
+
+MAX_ROUTE_POINTS: Final = 500
+_FIXES: Final = {
+    "bbox": "give bbox=west,south,east,north in degrees, west < east and south < north",
+    "route": f"give route=lon,lat|lon,lat with 2 to {MAX_ROUTE_POINTS} points in degrees",
+    "min_vehicles": "give a whole number from 1",
+    "format": "give format=arrow, geojson or json",
+    "at": "give a time with zone, e.g. at=2026-01-31T07:00:00Z",
+    "basis": "give basis=borrowed, or leave it out",
+}
+
+
+class Format(StrEnum):
+    """Form of an answer."""
+
+    ARROW = "arrow"
+    GEOJSON = "geojson"
+    JSON = "json"
+
+    @property
+    def encoding(self) -> str:
+        """Zenoh encoding of the reply."""
+        return {"arrow": wire.ARROW, "geojson": wire.GEOJSON, "json": wire.JSON}[self.value]
+
+
+Degrees = Annotated[float, Field(ge=-180.0, le=180.0, allow_inf_nan=False)]
+
+
+class MapQuery(BaseModel):
+    """A parsed query; None is 'not asked'."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    bbox: tuple[Degrees, Degrees, Degrees, Degrees] | None = None
+    route: tuple[tuple[Degrees, Degrees], ...] | None = None
+    min_vehicles: int = Field(default=1, ge=1, le=1_000_000)
+    format: Format = Format.ARROW
+    at: datetime | None = None
+    basis: str | None = Field(default=None, pattern="^borrowed$")
+
+    @field_validator("bbox", mode="before")
+    @classmethod
+    def _split_bbox(cls, value: object) -> object:
+        return value.split(",") if isinstance(value, str) else value
+
+    @field_validator("bbox")
+    @classmethod
+    def _ordered(cls, value: tuple[float, float, float, float] | None) -> tuple[float, float, float, float] | None:
+        if value is not None and not (value[0] < value[2] and value[1] < value[3]):
+            raise ValueError("west < east and south < north do not hold")
+        return value
+
+    @field_validator("route", mode="before")
+    @classmethod
+    def _split_route(cls, value: object) -> object:
+        if not isinstance(value, str):
+            return value
+        points = value.split("|")
+        if not 2 <= len(points) <= MAX_ROUTE_POINTS:
+            raise ValueError(f"has {len(points)} points")
+        return [point.split(",") for point in points]
+
+    @field_validator("at")
+    @classmethod
+    def _zoned(cls, value: datetime | None) -> datetime | None:
+        if value is not None and value.tzinfo is None:
+            raise ValueError("has no time zone")
+        return value
+
+
+def parse(parameters: Mapping[str, str]) -> MapQuery:
+    """Read the parameters of a selector.
+
+    Raises:
+        InputError: an unknown parameter, or one that cannot be read; names it and the fix.
+    """
+    try:
+        return MapQuery.model_validate(dict(parameters))
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False)[0]
+        name = str(first["loc"][0])
+        unknown = first["type"] == "extra_forbidden"
+        problem = "is no parameter" if unknown else f"{str(first['input'])[:60]!r} is not usable ({first['msg']})"
+        raise InputError(name, problem, _FIXES.get(name, f"use {', '.join(MapQuery.model_fields)}")) from error

@@ -1,0 +1,61 @@
+"""The signals of a vehicle: names, order in an array, units, and what may be wrong with them.
+
+A block of signals is a float array (T, N, len(CHANNELS)) for T samples of N vehicles; NaN is a missing reading.
+Axes are ISO 8855: x forward, y left, z up; yaw, steering and lateral quantities are positive to the left.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum, IntFlag
+from typing import Final
+
+WHEELS: Final = ("fl", "fr", "rl", "rr")
+
+
+def per_wheel(name: str) -> tuple[str, ...]:
+    """Names of a quantity that every wheel has: `per_wheel("omega")` = omega_fl … omega_rr."""
+    return tuple(f"{name}_{wheel}" for wheel in WHEELS)
+
+
+# name -> unit, in the order of the last axis of a block
+UNITS: Final = {
+    "ax": "m/s^2",
+    "ay": "m/s^2",
+    "yaw_rate": "rad/s",
+    **dict.fromkeys(per_wheel("delta"), "rad at the road wheel"),
+    **dict.fromkeys(per_wheel("omega"), "rad/s"),
+    **dict.fromkeys(per_wheel("torque"), "N*m at the wheel, driving positive"),
+    "latitude": "deg (WGS 84)",
+    "longitude": "deg (WGS 84)",
+    "yaw": "rad counter-clockwise from east",
+}
+CHANNELS: Final = tuple(UNITS)
+
+
+class S(IntEnum):
+    """Index of a channel on the last axis of a block; of a wheel channel, the index of its first wheel (fl)."""
+
+    AX = CHANNELS.index("ax")
+    AY = CHANNELS.index("ay")
+    YAW_RATE = CHANNELS.index("yaw_rate")
+    DELTA = CHANNELS.index("delta_fl")
+    OMEGA = CHANNELS.index("omega_fl")
+    TORQUE = CHANNELS.index("torque_fl")
+    LATITUDE = CHANNELS.index("latitude")
+    LONGITUDE = CHANNELS.index("longitude")
+    YAW = CHANNELS.index("yaw")
+
+
+class Health(IntFlag):
+    """What limits an estimate; flags add up, 0 is sound."""
+
+    OK = 0
+    NO_TORQUE = 1  # wheel torque missing: longitudinal force from the accelerometer alone
+    NO_WHEEL_SPEED = 2
+    NO_INERTIAL = 4  # ax, ay or yaw rate missing
+    NO_STEERING = 8
+    NO_POSITION = 16
+    TIME_GAP = 32  # more than half a second without a sample, or time not increasing
+    OUTLIER = 64  # a reading that was refused
+    SLIDING = 128  # a wheel past its peak (locked or spinning)
+    RESET = 256  # the filter was started anew

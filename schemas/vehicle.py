@@ -1,0 +1,53 @@
+"""The vehicle file: nominal parameters, known to a few per cent, and the estimator knows that."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from schemas.config import explain
+from schemas.errors import InputError
+
+Metres = Annotated[float, Field(gt=0.0, lt=20.0, allow_inf_nan=False)]
+
+
+class Vehicle(BaseModel):
+    """Nominal parameters of one vehicle, SI units."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    name: Annotated[str, Field(min_length=1, max_length=64, description="what the vehicle is called")]
+    mass: Annotated[float, Field(gt=0.0, lt=100_000.0, allow_inf_nan=False, description="[kg]")]
+    yaw_inertia: Annotated[float, Field(gt=0.0, lt=1e7, allow_inf_nan=False, description="[kg m^2]")]
+    cg_to_front_axle: Annotated[Metres, Field(description="[m]")]
+    cg_to_rear_axle: Annotated[Metres, Field(description="[m]")]
+    track_front: Annotated[Metres, Field(description="[m]")]
+    track_rear: Annotated[Metres, Field(description="[m]")]
+    cg_height: Annotated[float, Field(gt=0.0, lt=5.0, allow_inf_nan=False, description="[m]")]
+    wheel_radius: Annotated[float, Field(gt=0.0, lt=2.0, allow_inf_nan=False, description="[m], effective")]
+    wheel_inertia: Annotated[float, Field(gt=0.0, lt=1000.0, allow_inf_nan=False, description="[kg m^2], one wheel")]
+    longitudinal_stiffness: Annotated[
+        float, Field(gt=0.0, lt=1e7, allow_inf_nan=False, description="[N per unit slip], one wheel at static load")
+    ]
+    cornering_stiffness: Annotated[
+        float, Field(gt=0.0, lt=1e7, allow_inf_nan=False, description="[N/rad], one wheel at static load")
+    ]
+    drive_split_front: Annotated[
+        float | None, Field(ge=0.0, le=1.0, description="share of the driving torque at the front axle, where known")
+    ] = None
+
+
+def load_vehicle(path: Path | str) -> Vehicle:
+    """Read a vehicle file (JSON).
+
+    Raises:
+        InputError: the file cannot be read, a field is missing or out of range; names the field and the fix.
+    """
+    try:
+        return Vehicle.model_validate_json(Path(path).read_bytes())
+    except OSError as error:
+        raise InputError("vehicle", f"cannot read {path} ({error.strerror})", "name a vehicle file") from error
+    except ValidationError as error:
+        raise explain(error, f"vehicle file {path}") from error

@@ -1,0 +1,62 @@
+"""Batches that the tests of the contract share; also how the kept bytes of version 1 were made (see __main__)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from schemas import grid, wire
+from schemas.wire import Alert, Batch, Kind, StreamAck
+
+DATA = Path(__file__).parent / "data"
+
+
+def batch(kind: Kind, rows: int = 3) -> Batch:
+    """A batch whose every column has values of its own."""
+    rng = np.random.default_rng(7)
+    columns = {}
+    for name, dtype in wire.column_types(kind).items():
+        if name == "log_likelihood":
+            columns[name] = rng.integers(0, 256, (rows, 32)).astype(np.uint8)
+        elif dtype.kind == "f":
+            columns[name] = rng.uniform(0.1, 1.0, rows).astype(dtype)
+        elif dtype == np.int64:
+            columns[name] = rng.integers(1, 1 << 42, rows)
+        else:
+            columns[name] = rng.integers(0, 4, rows).astype(dtype)
+    columns["latitude"] = 57.70 + 1e-4 * np.arange(rows)
+    columns["longitude"] = 11.97 + 1e-4 * np.arange(rows)
+    if kind is Kind.OBSERVATION:
+        columns["cell"] = grid.cell_of(columns["latitude"], columns["longitude"])
+    region = int(grid.region_of(grid.cell_of(57.70, 11.97)))
+    return Batch(kind, "volvo-240", 2**62 + 5, region, 17, 12, columns, "aco-fckf")
+
+
+def acknowledgement() -> tuple[str, list[StreamAck]]:
+    """An acknowledgement of two streams."""
+    return "volvo-240", [
+        StreamAck(2**62 + 5, Kind.OBSERVATION, 396_303, durable=((1, 12), (14, 14))),
+        StreamAck(2**62 + 5, Kind.STATE, 396_303, durable=((1, 3),), rejected=((4, 2, "latitude"),)),
+    ]
+
+
+def alert() -> Alert:
+    """An alert whose floats are exact in 32 bits."""
+    return Alert(
+        1_664_484_383_910, 2, True, 1_790_000_000_000_000_000, 0.25, 0.125, 0.375, 0.9375, 3, 57.7, 11.97, "seen by 3"
+    )
+
+
+MESSAGES = {
+    "observation_batch": lambda: wire.encode(batch(Kind.OBSERVATION)),
+    "state_batch": lambda: wire.encode(batch(Kind.STATE)),
+    "ack": lambda: wire.encode_ack(*acknowledgement()),
+    "alert": lambda: wire.encode_alert(alert()),
+}
+
+if __name__ == "__main__":  # only ever run to add a message: the kept bytes of a version do not change
+    for name, make in MESSAGES.items():
+        path = DATA / f"{name}.v1.bin"
+        if not path.exists():
+            path.write_bytes(make())

@@ -1,0 +1,36 @@
+"""A figure holds or it does not, and the file says which."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from schemas.figures import Figure, markdown, write
+
+
+@pytest.mark.parametrize(
+    ("figure", "holds"),
+    [
+        (Figure("a", 1.0, "s", 2.0, "less"), True),
+        (Figure("a", 3.0, "s", 2.0, "less"), False),
+        (Figure("a", 3.0, "s", 2.0, "more"), True),
+        (Figure("a", 0.9, "", (0.8, 0.99), "within"), True),
+        (Figure("a", 1.0, "", (0.8, 0.99), "within"), False),
+        (Figure("a", float("nan"), "s", 2.0, "less"), False),
+        (Figure("a", float("nan"), "s"), False),
+    ],
+)
+def test_a_figure_holds_on_the_right_side_of_its_bar_and_never_when_missing(figure: Figure, holds: bool) -> None:
+    assert figure.holds is holds
+
+
+def test_the_file_starts_with_a_header_and_says_what_does_not_hold(tmp_path: Path) -> None:
+    figures = [Figure("good", 1.0, "s", 2.0), Figure("bad", float("nan"), "s", 2.0)]
+    write(tmp_path / "out" / "figures.json", "demo", [1], figures)
+    first, good, bad = json.loads((tmp_path / "out" / "figures.json").read_text())
+    assert {"commit", "machine", "versions", "seeds", "date"} <= first.keys()
+    assert (good["value"], good["holds"]) == (1.0, True)
+    assert (bad["value"], bad["holds"]) == (None, False)
+    assert "DOES NOT HOLD" in markdown(figures)

@@ -1,0 +1,179 @@
+"""The separation of the house, read from its source: imports, sizes, entries, docstrings."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("schemas", "edge_agent", "fleet_service", "deploy")
+LONGEST_FILE = 400  # lines; beyond that a file does more than one thing
+
+# Which packages of this project a package may import, beside itself.
+MAY_IMPORT = {
+    "schemas": set(),
+    "edge_agent": {"schemas"},
+    "fleet_service": {"schemas"},
+    "deploy": {"schemas", "edge_agent", "fleet_service"},
+}
+
+# The pure core takes time and randomness as arguments and does no input or output.
+PURE = (
+    "edge_agent/dynamics",
+    "edge_agent/filters",
+    "edge_agent/adaptation",
+    "edge_agent/estimators",
+    "fleet_service/fusion",
+)
+IMPURE = {
+    "asyncio", "datetime", "duckdb", "http", "logging", "multiprocessing", "os", "pathlib", "pyarrow", "random",
+    "secrets", "socket", "sqlite3", "subprocess", "tempfile", "threading", "time", "urllib", "zenoh",
+}  # fmt: skip
+IMPURE_CALLS = {"open", "print", "input"}
+
+# Top-level entries of the design, section 2; dot files and lock files may lie beside them.
+TOP_LEVEL = {
+    "pyproject.toml", "README.md", "edge_agent", "fleet_service", "schemas", "deploy", "tests",
+    "Makefile", "LICENSE", "CONTRIBUTING.md", "constraints.txt",
+}  # fmt: skip
+# What Python's own tools leave behind in a working copy; never part of a commit.
+LEFT_BEHIND = ("__pycache__", "gripmap.egg-info", "build", "dist")
+
+
+def sources(*folders: str) -> list[Path]:
+    """Every Python file below the folders that a person wrote."""
+    found = (path for folder in folders for path in sorted((ROOT / folder).rglob("*.py")))
+    return [path for path in found if not path.name.endswith("_pb2.py")]
+
+
+def imported(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Line and full module name of every import in a syntax tree, also of those inside functions."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, name.name) for name in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield node.lineno, "." * node.level + (node.module or "")
+
+
+def where(path: Path, line: int) -> str:
+    return f"{path.relative_to(ROOT)}:{line}"
+
+
+def crossings(tree: ast.AST, package: str) -> list[tuple[int, str]]:
+    """Imports of project packages that `package` may not know."""
+    forbidden = set(PACKAGES) - MAY_IMPORT[package] - {package}
+    return [(line, name) for line, name in imported(tree) if name.split(".")[0] in forbidden]
+
+
+def impurities(tree: ast.AST) -> list[tuple[int, str]]:
+    """Imports and calls by which a pure module would reach the world outside."""
+    found = [(line, name) for line, name in imported(tree) if name.split(".")[0] in IMPURE]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in IMPURE_CALLS:
+            found.append((node.lineno, node.func.id))
+        if isinstance(node, ast.Attribute) and ast.unparse(node).startswith(("np.random.", "numpy.random.")):
+            found.extend([(node.lineno, node.attr)] if node.attr not in {"Generator", "random"} else [])
+    return found
+
+
+def undocumented(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Public modules, classes and functions without a docstring; what is inside a function is private."""
+    if ast.get_docstring(tree) is None:
+        yield 1, "module"
+    stack: list[ast.AST] = [tree]
+    while stack:
+        for node in ast.iter_child_nodes(stack.pop()):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+                public = not node.name.startswith("_")
+                if public and ast.get_docstring(node) is None and not _is_overload(node):
+                    yield node.lineno, node.name
+                if public and isinstance(node, ast.ClassDef):
+                    stack.append(node)
+            elif isinstance(node, ast.If | ast.Try):
+                stack.append(node)
+
+
+def _is_overload(node: ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) -> bool:
+    return any(ast.unparse(decorator).endswith("overload") for decorator in node.decorator_list)
+
+
+def parse(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_imports_between_packages_point_one_way(package: str) -> None:
+    found = [
+        f"{where(path, line)} imports {name}"
+        for path in sources(package)
+        for line, name in crossings(parse(path), package)
+    ]
+    assert not found, "\n".join(found)
+
+
+def test_no_package_imports_relatively_so_that_every_import_names_its_package() -> None:
+    found = [where(path, line) for path in sources(*PACKAGES) for line, name in imported(parse(path)) if name[0] == "."]
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize("folder", PURE)
+def test_pure_core_reaches_neither_files_network_clock_nor_global_randomness(folder: str) -> None:
+    assert sources(folder), f"{folder} is gone; name its successor in PURE"
+    found = [f"{where(path, line)} uses {name}" for path in sources(folder) for line, name in impurities(parse(path))]
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import zenoh",
+        "def f():\n    from time import monotonic",
+        "import os.path",
+        "open('x')",
+        "import numpy as np\nnp.random.normal()",
+        "import numpy as np\nnp.random.default_rng()",
+    ],
+)
+def test_an_impure_line_is_seen(text: str) -> None:
+    assert impurities(ast.parse(text))
+
+
+def test_a_generator_as_an_argument_is_pure() -> None:
+    assert not impurities(ast.parse("import numpy as np\ndef f(rng: np.random.Generator): return rng.normal()"))
+
+
+def test_an_import_across_packages_is_seen() -> None:
+    assert crossings(ast.parse("def f():\n    import fleet_service.service"), "edge_agent")
+    assert crossings(ast.parse("from edge_agent import agent"), "schemas")
+    assert not crossings(ast.parse("from schemas import grid"), "edge_agent")
+
+
+def test_no_file_is_longer_than_it_can_be_read() -> None:
+    lengths = {path: path.read_text(encoding="utf-8").count("\n") for path in sources(*PACKAGES, "tests")}
+    found = [f"{path.relative_to(ROOT)}: {length} lines" for path, length in lengths.items() if length > LONGEST_FILE]
+    assert not found, "\n".join(found)
+
+
+def test_top_level_holds_only_the_entries_of_the_design() -> None:
+    present = {path.name for path in ROOT.iterdir() if not path.name.startswith(".")}
+    found = sorted(name for name in present - TOP_LEVEL - set(LEFT_BEHIND) if not name.endswith(".lock"))
+    assert not found, f"not in the design, section 2: {', '.join(found)}"
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_everything_public_has_a_docstring(package: str) -> None:
+    found = [f"{where(path, line)} {name}" for path in sources(package) for line, name in undocumented(parse(path))]
+    assert not found, "\n".join(found)
+
+
+def test_a_missing_docstring_is_seen_and_a_private_one_is_not_missed() -> None:
+    tree = ast.parse('"""M."""\nclass A:\n    """A."""\n    def f(self): ...\n    def _g(self): ...\ndef _h(): ...')
+    assert [name for _, name in undocumented(tree)] == ["f"]
+
+
+def test_the_tests_mirror_the_packages() -> None:
+    folders = {path.name for path in (ROOT / "tests").iterdir() if path.is_dir() and path.name != "__pycache__"}
+    assert folders - {"end_to_end", "data"} <= set(PACKAGES)
