@@ -1,0 +1,148 @@
+"""The map beside the truth: the demo's figures.
+
+The truth is what the simulator says of each visit of a vehicle to a cell: mean friction under its wheels, and the
+largest share of the grip that it used. A visit with a share of at least 0.6 is *excited*: it can tell friction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from schemas.figures import Figure
+from schemas.numeric import BoolArray, FloatArray, IntArray
+from schemas.wire import Alert
+
+EXCITED = 0.6
+SLIPPERY = 0.4
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Cells of the map that have a truth, row by row; `truth` is the friction when the demo ended."""
+
+    cells: pa.Table
+    truth: FloatArray
+
+    @property
+    def covered(self) -> BoolArray:
+        """Whether the truth lies in the interval."""
+        lower, upper = (self.cells[end].to_numpy() for end in ("mu_lower", "mu_upper"))
+        return np.asarray((lower <= self.truth) & (self.truth <= upper))
+
+    @property
+    def several(self) -> BoolArray:
+        """Whether two or more vehicles were there."""
+        return np.asarray(self.cells["vehicles"].to_numpy() >= 2)
+
+    @property
+    def measured(self) -> BoolArray:
+        """Whether the value rests on more than lower bounds."""
+        return np.asarray(self.cells["basis"].to_numpy(zero_copy_only=False) == "measured")
+
+
+def final_truth(visits: pa.Table, changed_ns: int) -> dict[tuple[int, int], float]:
+    """Friction of each visited (cell, sector) at the end: mean over visits since the road changed, else over all."""
+    keys = _keys(visits)
+    after = visits["enter_time"].cast(pa.int64()).to_numpy() >= changed_ns
+    mu = visits["mu"].to_numpy()
+    groups: dict[tuple[int, int], list[int]] = {}
+    for row, key in enumerate(keys):
+        groups.setdefault(key, []).append(row)
+    return {key: float(np.mean(mu[[r for r in rows if after[r]] or rows])) for key, rows in groups.items()}
+
+
+def compare(cells: pa.Table, visits: pa.Table, changed_ns: int) -> Comparison:
+    """Join the map with the truth by (cell, sector)."""
+    truth = final_truth(visits, changed_ns)
+    found = np.array([truth.get(key, np.nan) for key in _keys(cells)])
+    known = np.isfinite(found)
+    return Comparison(cells.filter(pa.array(known)), found[known])
+
+
+def delay_passes(visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Alert]], changed_ns: int) -> float:
+    """Excited passes over the new patch until its first alert was heard; infinite without one.
+
+    Args:
+        visits: the truth.
+        patch: (visits,) whether the visit was to a cell of the patch, after it had appeared.
+        alerts: (ns when it was heard, alert).
+        changed_ns: when the patch appeared.
+    """
+    cells = set(visits["cell"].filter(pa.array(patch)).to_pylist())
+    heard = [at for at, alert in alerts if alert.raised and alert.cell in cells and at >= changed_ns]
+    if not heard:
+        return float("inf")
+    left: IntArray = visits["leave_time"].cast(pa.int64()).to_numpy()
+    excited = visits["utilisation"].to_numpy() >= EXCITED
+    rows = visits.filter(pa.array(patch & excited & (left <= min(heard))))
+    return float(passes(rows))
+
+
+def passes(rows: pa.Table) -> int:
+    """Number of passes: visits of one vehicle to neighbouring cells in a row are one pass."""
+    order = rows.sort_by([("vehicle", "ascending"), ("enter_time", "ascending")])
+    vehicle = order["vehicle"].to_numpy(zero_copy_only=False)
+    enter, left = (order[name].cast(pa.int64()).to_numpy() for name in ("enter_time", "leave_time"))
+    if not len(order):
+        return 0
+    gap_ns = 10_000_000_000
+    return 1 + int(np.sum((vehicle[1:] != vehicle[:-1]) | (enter[1:] - left[:-1] > gap_ns)))
+
+
+def figures(
+    comparison: Comparison, visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int,
+    counts: dict[str, int], archive: Path, wall_s: float,
+) -> list[Figure]:  # fmt: skip
+    """The demo's figures with their bars."""
+    several, value = comparison.several, comparison.several & comparison.measured
+    error = comparison.cells["mu"].to_numpy() - comparison.truth
+    patch = (visits["mu"].to_numpy() < SLIPPERY) & newly_slippery(visits, changed_ns)
+    rows, distinct, vehicles = archived(archive)
+    return [
+        Figure("demo.vehicles", vehicles, "", 30, "more"),
+        Figure("demo.map.coverage90", _mean(comparison.covered[several]), "", (0.80, 0.99), "within"),
+        Figure("demo.map.rmse", float(np.sqrt(_mean(error[value] ** 2))), "", 0.12),
+        Figure("demo.alert.delay_passes", delay_passes(visits, patch, alerts, changed_ns), "passes", 8),
+        Figure("demo.observations.unacknowledged", counts["unsettled"], "", 0),
+        Figure("demo.observations.duplicates", rows - distinct, "", 0),
+        Figure("demo.wall_s", wall_s, "s", 240),
+        Figure("demo.observations", rows, ""),
+        Figure("demo.map.cells", len(comparison.cells), ""),
+        Figure("demo.map.cells_measured", int(value.sum()), "with two or more vehicles"),
+    ]
+
+
+def newly_slippery(visits: pa.Table, changed_ns: int) -> BoolArray:
+    """(visits,) whether the cell was not slippery before the road changed, and the visit came after."""
+    enter = visits["enter_time"].cast(pa.int64()).to_numpy()
+    cell, mu = visits["cell"].to_numpy(), visits["mu"].to_numpy()
+    before = np.unique(cell[(enter < changed_ns) & (mu < SLIPPERY)])
+    return np.asarray((enter >= changed_ns) & ~np.isin(cell, before))
+
+
+def archived(archive: Path) -> tuple[int, int, int]:
+    """Rows, distinct rows and distinct vehicles of the archived observations."""
+    query = f"""select count(*), count(distinct (vehicle, boot, region, seq, "row")), count(distinct vehicle)
+                from read_parquet('{archive}/inbox/*.parquet', union_by_name=true) where enter_time is not null"""
+    found = duckdb.execute(query).fetchone()
+    rows, distinct, vehicles = found if found else (0, 0, 0)
+    return int(rows), int(distinct), int(vehicles)
+
+
+def read_truth(path: Path) -> pa.Table:
+    """Visits of the simulated vehicles, as the simulator knows them."""
+    return pq.read_table(path)
+
+
+def _keys(table: pa.Table) -> list[tuple[int, int]]:
+    return list(zip(table["cell"].to_numpy().tolist(), table["sector"].to_numpy().tolist(), strict=True))
+
+
+def _mean(values: FloatArray | BoolArray) -> float:
+    return float(np.mean(values)) if len(values) else float("nan")

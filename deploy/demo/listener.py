@@ -1,0 +1,66 @@
+"""What a user hears while the fleet drives: tiles and alerts, as they are put."""
+
+from __future__ import annotations
+
+import io
+import threading
+import time
+from dataclasses import dataclass, field
+
+import pyarrow as pa
+import pyarrow.ipc
+import zenoh
+
+from schemas import wire
+from schemas.wire import Alert
+
+
+def read_tile(payload: bytes) -> pa.Table:
+    """The cells of one tile."""
+    return pa.ipc.open_stream(io.BytesIO(payload)).read_all()
+
+
+@dataclass
+class Listener:
+    """Subscribes to map and alerts; keeps the newest of each tile, and every alert with the time it was heard."""
+
+    session: zenoh.Session
+    tiles: dict[str, pa.Table] = field(default_factory=dict)
+    alerts: list[tuple[int, Alert]] = field(default_factory=list)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def __post_init__(self) -> None:
+        self.session.declare_subscriber("gripmap/v1/map/**", self._on_tile)
+        self.session.declare_subscriber("gripmap/v1/alert/**", self._on_alert)
+
+    def _on_tile(self, sample: zenoh.Sample) -> None:
+        with self._lock:
+            self.tiles[str(sample.key_expr)] = read_tile(sample.payload.to_bytes())
+
+    def _on_alert(self, sample: zenoh.Sample) -> None:
+        with self._lock:
+            self.alerts.append((time.time_ns(), wire.decode_alert(sample.payload.to_bytes())))
+
+    def close(self) -> None:
+        """End the session; a session that is left open keeps the interpreter from ending."""
+        self.session.close()
+
+    def progress(self) -> str:
+        """One line: cells, how many are measured and slippery, alerts that stand."""
+        with self._lock:
+            cells = pa.concat_tables(self.tiles.values()) if self.tiles else None
+            alerts = list(self.alerts)
+        if cells is None:
+            return "no cell yet"
+        basis = cells["basis"].to_pylist()
+        several = int((cells["vehicles"].to_numpy() >= 2).sum())
+        standing = {(alert.cell, alert.sector): alert.raised for _, alert in alerts}
+        return (
+            f"{len(basis):5d} cells, {basis.count('measured'):4d} measured, {several:4d} by two or more vehicles, "
+            f"{sum(standing.values()):3d} alerts stand"
+        )
+
+    def whole_map(self) -> pa.Table:
+        """Ask for the whole map, one reply per tile."""
+        replies = self.session.get("gripmap/v1/map/**", consolidation=zenoh.ConsolidationMode.NONE, timeout=10.0)
+        return pa.concat_tables([read_tile(reply.ok.payload.to_bytes()) for reply in replies if reply.ok is not None])

@@ -1,0 +1,117 @@
+"""The parts as a user would start them: each its own process, with its log in the demo's folder."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+START_S = 60.0  # the first start compiles the kernels
+STOP_S = 10.0
+
+
+class DemoError(RuntimeError):
+    """A part did not start, or ended before its time; says where its log is."""
+
+
+class Part:
+    """One process of the demo; what it prints goes to `folder/NAME.log`."""
+
+    def __init__(self, name: str, command: Sequence[str], folder: Path) -> None:
+        self.name, self.log = name, folder / f"{name}.log"
+        with self.log.open("w") as out:
+            self.process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT)
+
+    def lines(self) -> list[str]:
+        """What it has printed so far."""
+        return self.log.read_text().splitlines()
+
+    def line_with(self, start: str, patience_s: float = START_S) -> str:
+        """The first line that begins with `start`; waits for it.
+
+        Raises:
+            DemoError: the process ended, or did not print it in time.
+        """
+        deadline = time.monotonic() + patience_s
+        while time.monotonic() < deadline:
+            for line in self.lines():
+                if line.startswith(start):
+                    return line
+            if self.process.poll() is not None:
+                break
+            time.sleep(0.05)
+        raise DemoError(f"{self.name} did not say {start!r}; see {self.log}")
+
+    def wait(self, every_s: float, tell: Callable[[], None]) -> int:
+        """Wait for the end, calling `tell` now and then; returns the exit code."""
+        while True:
+            try:
+                return self.process.wait(every_s)
+            except subprocess.TimeoutExpired:
+                tell()
+
+    def stop(self) -> None:
+        """Ask it to end, and make it end."""
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+            try:
+                self.process.wait(STOP_S)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+                self.process.wait()
+
+    def report(self) -> dict[str, int]:
+        """The counts in its last line, which is JSON.
+
+        Raises:
+            DemoError: the last line is none.
+        """
+        try:
+            counts: dict[str, int] = json.loads(self.lines()[-1])
+        except (IndexError, json.JSONDecodeError) as error:
+            raise DemoError(f"{self.name} ended without its counts; see {self.log}") from error
+        return counts
+
+
+@contextmanager
+def system(folder: Path) -> Iterator[tuple[str, Part]]:
+    """Router and fleet service on a free port of loopback; yields the endpoint and the service.
+
+    The agents' configuration is left in `folder/agent.json`.
+    """
+    scripts = Path(sys.executable).parent
+    router = Part("router", [sys.executable, "-m", "deploy.router", "--listen", "tcp/127.0.0.1:0"], folder)
+    try:
+        endpoint = router.line_with("router: ").removeprefix("router: ").split()[0]
+        zenoh = {"connect": [endpoint]}
+        (folder / "service.json").write_text(json.dumps({"zenoh": zenoh, "name": "demo"}))
+        (folder / "agent.json").write_text(json.dumps({"zenoh": zenoh, "spool": str(folder / "spool.sqlite")}))
+        command = ["run", "--config", str(folder / "service.json"), "--archive", str(folder / "archive")]
+        service = Part("service", [str(scripts / "fleet-service"), *command], folder)
+        try:
+            service.line_with("ready")
+            yield endpoint, service
+        finally:
+            service.stop()
+    finally:
+        router.stop()
+
+
+def fleet(folder: Path, vehicles: int, duration_s: float, seed: int) -> Part:
+    """The simulated vehicles: one process, a Zenoh session and an identity for each."""
+    scripts = Path(sys.executable).parent
+    options = {
+        "--vehicles": vehicles,
+        "--scenario": "demo",
+        "--duration": duration_s,
+        "--seed": seed,
+        "--config": folder / "agent.json",
+        "--truth": folder / "truth.parquet",
+    }
+    words = [str(word) for option in options.items() for word in option]
+    return Part("fleet", [str(scripts / "edge-agent"), "fleet", *words], folder)
