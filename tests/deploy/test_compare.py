@@ -1,0 +1,97 @@
+"""The demo's figures mean what they say."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from deploy.demo import compare, page, picture
+from schemas.wire import Alert
+
+S = 1_000_000_000
+
+
+def visits(*rows: tuple[str, float, int, float, float]) -> pa.Table:
+    """Visits (vehicle, second, cell, mu, utilisation), each half a second long, sector 0."""
+    vehicle, at, cell, mu, used = zip(*rows, strict=True)
+    enter = np.array([int(second * S) for second in at])
+    return pa.table(
+        {
+            "vehicle": list(vehicle),
+            "enter_time": pa.array(enter, pa.timestamp("ns", "UTC")),
+            "leave_time": pa.array(enter + S // 2, pa.timestamp("ns", "UTC")),
+            "cell": list(cell),
+            "sector": pa.array([0] * len(rows), pa.int8()),
+            "mu": list(mu),
+            "utilisation": list(used),
+        }
+    )
+
+
+def tile(cells: list[int], lower: float, upper: float) -> pa.Table:
+    n = len(cells)
+    return pa.table(
+        {
+            "cell": cells, "sector": pa.array([0] * n, pa.int8()), "mu": [(lower + upper) / 2] * n,
+            "mu_lower": [lower] * n, "mu_upper": [upper] * n, "p_slippery": [0.1] * n, "vehicles": [2] * n,
+            "observations": [3] * n, "basis": ["measured"] * n, "latitude": [57.7] * n, "longitude": [11.97] * n,
+            "west": [11.97 + 1e-4 * i for i in range(n)], "south": [57.7] * n,
+            "east": [11.9701 + 1e-4 * i for i in range(n)], "north": [57.7001] * n,
+        }
+    )  # fmt: skip
+
+
+def alert(cell: int) -> Alert:
+    return Alert(cell, 0, True, 0, 0.2, 0.1, 0.3, 0.95, 2, 57.7, 11.97, "test")
+
+
+def test_the_truth_is_the_friction_after_the_change_where_there_is_one() -> None:
+    road = visits(("a", 1, 7, 0.9, 0.1), ("a", 11, 7, 0.2, 0.1), ("b", 12, 7, 0.3, 0.1), ("a", 2, 8, 0.6, 0.1))
+    assert compare.final_truth(road, 10 * S) == pytest.approx({(7, 0): 0.25, (8, 0): 0.6})
+
+
+def test_a_cell_without_a_truth_is_left_out() -> None:
+    found = compare.compare(tile([7, 99], 0.1, 0.4), visits(("a", 11, 7, 0.2, 0.1)), 10 * S)
+    assert found.cells["cell"].to_pylist() == [7]
+    assert found.covered.tolist() == [True]
+
+
+def test_passes_count_excited_drives_over_the_patch_until_its_alert() -> None:
+    road = visits(
+        ("a", 11, 7, 0.2, 0.9), ("a", 12, 8, 0.2, 0.9),  # one pass of a over two cells
+        ("b", 20, 7, 0.2, 0.9), ("c", 21, 7, 0.2, 0.1),  # c rolled over it
+        ("a", 40, 7, 0.2, 0.9), ("d", 60, 7, 0.2, 0.9),  # d comes after the alert
+    )  # fmt: skip
+    patch = compare.newly_slippery(road, 10 * S) & (road["mu"].to_numpy() < 0.4)
+    assert compare.delay_passes(road, patch, [(50 * S, alert(7))], 10 * S) == 3.0
+
+
+def test_an_alert_elsewhere_or_none_at_all_is_an_infinite_delay() -> None:
+    road = visits(("a", 11, 7, 0.2, 0.9))
+    patch = np.array([True])
+    assert compare.delay_passes(road, patch, [(50 * S, alert(99))], 10 * S) == float("inf")
+    assert compare.delay_passes(road, patch, [], 10 * S) == float("inf")
+
+
+def test_a_road_that_was_slippery_before_is_not_the_new_patch() -> None:
+    road = visits(("a", 1, 7, 0.2, 0.9), ("a", 11, 7, 0.2, 0.9), ("a", 12, 8, 0.2, 0.9))
+    assert compare.newly_slippery(road, 10 * S).tolist() == [False, False, True]
+
+
+def test_picture_and_page_are_written_and_no_value_can_end_the_script(tmp_path: Path) -> None:
+    found = compare.compare(tile([7, 8], 0.1, 0.4), visits(("a", 11, 7, 0.2, 0.1), ("a", 12, 8, 0.5, 0.1)), 10 * S)
+    basis = found.cells.schema.get_field_index("basis")
+    hostile = replace(found, cells=found.cells.set_column(basis, "basis", [["</script><b>", "measured"]]))
+    picture.draw(found, tmp_path / "map.png")
+    page.write(hostile, "| table |", tmp_path / "map.html")
+    assert (tmp_path / "map.png").stat().st_size > 10_000
+    text = (tmp_path / "map.html").read_text()
+    assert text.count("</script>") == 1
+    data = json.loads(text.split("const data = ")[1].split(";\nconst points")[0].replace("<\\/", "</"))
+    assert [cell["truth"] for cell in data["cells"]] == [0.2, 0.5]
+    assert "http" not in text

@@ -1,0 +1,72 @@
+"""The router is a process of Python alone, and the shipped configurations fit the contract."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from deploy import router
+from schemas import config
+from schemas.config import AgentConfig, ServiceConfig, ZenohSettings
+from schemas.errors import InputError
+from schemas.transport import open_session
+from tests.waiting import until
+
+
+def test_clients_of_a_router_hear_each_other() -> None:
+    session, endpoints = router.open_router(listen="tcp/127.0.0.1:0")
+    with session:
+        settings = ZenohSettings(connect=endpoints)
+        first, second = open_session(settings), open_session(settings)
+        assert first is not None
+        assert second is not None
+        with first, second:
+            queryable = second.declare_queryable(
+                "gripmap/v1/map/test", lambda query: query.reply(query.key_expr, "here")
+            )
+            querier = first.declare_querier("gripmap/v1/map/test")
+            until(lambda: querier.matching_status.matching)
+            assert [reply.ok.payload.to_string() for reply in querier.get() if reply.ok] == ["here"]
+            queryable.undeclare()
+
+
+def test_a_router_process_tells_its_endpoint_and_ends_on_a_signal() -> None:
+    command = [sys.executable, "-m", "deploy.router", "--listen", "tcp/127.0.0.1:0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("router: tcp/127.0.0.1:")
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(10) == 0
+
+
+def test_a_wrong_configuration_names_the_field_and_the_fix(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "router.json5"
+    path.write_text("{ mode: 'wanderer' }")
+    assert router.main(["--config", str(path)]) == 2
+    assert capsys.readouterr().err.startswith("error: config: cannot use")
+
+
+def test_a_taken_port_is_said() -> None:
+    session, endpoints = router.open_router(listen="tcp/127.0.0.1:0")
+    with session, pytest.raises(InputError, match="^listen: "):
+        router.open_router(listen=endpoints[0])
+
+
+@pytest.mark.parametrize(("name", "model"), [("agent.json", AgentConfig), ("service.json", ServiceConfig)])
+def test_shipped_configurations_are_read(name: str, model: type[AgentConfig]) -> None:
+    assert config.load(router.CONFIG.with_name(name), model).zenoh.connect == ["tcp/127.0.0.1:7447"]
+
+
+def test_every_setting_of_a_session_is_one_that_zenoh_knows() -> None:
+    with pytest.raises(InputError, match=r"^zenoh.config.transport/link/tx/colour: "):
+        open_session(ZenohSettings(config={"transport/link/tx/colour": "red"}))
+
+
+def test_the_router_listens_on_loopback_only() -> None:
+    endpoints = zenoh.Config.from_file(str(router.CONFIG)).get_json("listen/endpoints")
+    assert endpoints == '["tcp/127.0.0.1:7447"]'

@@ -1,0 +1,22 @@
+"""Waiting for a condition with a deadline, instead of sleeping for luck."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+PATIENCE_S = 30.0
+
+
+def until(condition: Callable[[], object], patience_s: float = PATIENCE_S) -> None:
+    """Return as soon as `condition` holds.
+
+    Raises:
+        TimeoutError: it did not within `patience_s`.
+    """
+    deadline, pause = time.monotonic() + patience_s, threading.Event()
+    while not condition():
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"not within {patience_s} s: {condition}")
+        pause.wait(0.005)
