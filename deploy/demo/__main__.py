@@ -15,7 +15,7 @@ from pathlib import Path
 
 from deploy.demo import compare, page, picture, processes
 from deploy.demo.listener import Listener
-from edge_agent.simulation import SCENARIOS
+from edge_agent.simulation.scenarios import scenario_named
 from schemas import figures
 from schemas.config import ZenohSettings
 from schemas.transport import open_session
@@ -24,8 +24,8 @@ FOLDER = Path(".demo")
 TELL_S = 5.0
 
 
-def drive(folder: Path, endpoint: str, args: argparse.Namespace) -> tuple[Listener, dict[str, int], int]:
-    """Let the fleet drive; returns what was heard, the fleet's counts, and when the first vehicle moved [ns]."""
+def drive(folder: Path, endpoint: str, args: argparse.Namespace) -> tuple[Listener, dict[str, float]]:
+    """Let the fleet drive; returns what was heard, and the fleet's counts."""
     session = open_session(ZenohSettings(connect=[endpoint]))
     if session is None:
         raise processes.DemoError(f"no session to {endpoint}")
@@ -38,8 +38,7 @@ def drive(folder: Path, endpoint: str, args: argparse.Namespace) -> tuple[Listen
 
     if fleet.wait(TELL_S, tell) != 0:
         raise processes.DemoError(f"the fleet ended with an error; see {fleet.log}")
-    counts = fleet.report()
-    return listener, counts, int(counts["started_ns"])
+    return listener, fleet.report()
 
 
 def show(folder: Path, endpoint: str, comparison: compare.Comparison) -> None:
@@ -65,12 +64,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     began = time.monotonic()
     shutil.rmtree(FOLDER, ignore_errors=True)
     FOLDER.mkdir()
-    appears_s = min(patch.start for patch in SCENARIOS["demo"].events)
+    appears_s = scenario_named("demo").events[0].start
     print(f"{args.vehicles} vehicles drive for {args.duration:.0f} s; after {appears_s:.0f} s an ice patch appears.")
     with processes.system(FOLDER) as (endpoint, _):
-        listener, counts, started_ns = drive(FOLDER, endpoint, args)
-        changed_ns = started_ns + int(appears_s * 1e9)
+        listener, counts = drive(FOLDER, endpoint, args)
         visits = compare.read_truth(FOLDER / "truth.parquet")
+        changed_ns = compare.started(visits) + int(appears_s * 1e9)
         comparison = compare.compare(listener.whole_map(), visits, changed_ns)
         show(FOLDER, endpoint, comparison)
         listener.close()

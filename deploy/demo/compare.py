@@ -97,7 +97,7 @@ def passes(rows: pa.Table) -> int:
 
 def figures(
     comparison: Comparison, visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int,
-    counts: dict[str, int], archive: Path, wall_s: float,
+    counts: dict[str, float], archive: Path, wall_s: float,
 ) -> list[Figure]:  # fmt: skip
     """The demo's figures with their bars."""
     several, value = comparison.several, comparison.several & comparison.measured
@@ -109,7 +109,7 @@ def figures(
         Figure("demo.map.coverage90", _mean(comparison.covered[several]), "", (0.80, 0.99), "within"),
         Figure("demo.map.rmse", float(np.sqrt(_mean(error[value] ** 2))), "", 0.12),
         Figure("demo.alert.delay_passes", delay_passes(visits, patch, alerts, changed_ns), "passes", 8),
-        Figure("demo.observations.unacknowledged", counts["unsettled"], "", 0),
+        Figure("demo.observations.unacknowledged", counts["observations_unsettled"], "", 0),
         Figure("demo.observations.duplicates", rows - distinct, "", 0),
         Figure("demo.wall_s", wall_s, "s", 240),
         Figure("demo.observations", rows, ""),
@@ -138,6 +138,11 @@ def archived(archive: Path) -> tuple[int, int, int]:
 def read_truth(path: Path) -> pa.Table:
     """Visits of the simulated vehicles, as the simulator knows them."""
     return pq.read_table(path)
+
+
+def started(visits: pa.Table) -> int:
+    """When the first vehicle moved [ns]."""
+    return int(visits["enter_time"].cast(pa.int64()).to_numpy().min())
 
 
 def _keys(table: pa.Table) -> list[tuple[int, int]]:

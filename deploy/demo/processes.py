@@ -65,14 +65,14 @@ class Part:
                 self.process.kill()
                 self.process.wait()
 
-    def report(self) -> dict[str, int]:
+    def report(self) -> dict[str, float]:
         """The counts in its last line, which is JSON.
 
         Raises:
             DemoError: the last line is none.
         """
         try:
-            counts: dict[str, int] = json.loads(self.lines()[-1])
+            counts: dict[str, float] = json.loads(self.lines()[-1])
         except (IndexError, json.JSONDecodeError) as error:
             raise DemoError(f"{self.name} ended without its counts; see {self.log}") from error
         return counts
