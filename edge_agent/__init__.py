@@ -1,0 +1,1 @@
+"""The software of one vehicle: sensors in, friction evidence out."""

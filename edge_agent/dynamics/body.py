@@ -1,0 +1,63 @@
+"""The planar rigid body: from wheel forces to accelerations.
+
+Legend: Fx, Fy wheel forces in the wheel's frame [N], delta road-wheel angle [rad], m mass [kg], Iz yaw inertia [kg m^2],
+(x, y) wheel position [m], a_x, a_y acceleration of the centre of gravity in body axes [m/s^2] (what a level accelerometer
+there would read), r yaw rate [rad/s]. The velocities follow from v_x' = a_x + r*v_y and v_y' = a_y - r*v_x
+(paper 004, equation 2, with the sign of the errata).
+"""
+
+from __future__ import annotations
+
+import math
+
+from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.slip import wheel_position
+from schemas.numeric import FloatArray, compiled
+
+
+@compiled
+def accelerations(
+    row: FloatArray, force_x: FloatArray, force_y: FloatArray, delta: FloatArray
+) -> tuple[float, float, float]:
+    """(a_x, a_y [m/s^2], yaw acceleration [rad/s^2]); force_x, force_y [N] and delta [rad] of shape (4,)."""
+    total_x = total_y = moment = 0.0
+    for wheel in range(4):
+        cos, sin = math.cos(delta[wheel]), math.sin(delta[wheel])
+        ahead = cos * force_x[wheel] - sin * force_y[wheel]
+        left = sin * force_x[wheel] + cos * force_y[wheel]
+        x, y = wheel_position(row, wheel)
+        total_x += ahead
+        total_y += left
+        moment += x * left - y * ahead
+    return total_x / row[P.MASS], total_y / row[P.MASS], moment / row[P.YAW_INERTIA]
+
+
+@compiled
+def axle_lateral_forces(row: FloatArray, ay: float, yaw_acceleration: float, moment_x: float) -> tuple[float, float]:
+    """(front, rear) lateral force [N] of the axles in body axes, from what an accelerometer and a gyroscope measure.
+
+    moment_x [N m] is the yaw moment of the forces along the body, sum of -y*F_ahead.
+    """
+    base = row[P.TO_FRONT] + row[P.TO_REAR]
+    total = row[P.MASS] * ay
+    moment = row[P.YAW_INERTIA] * yaw_acceleration - moment_x
+    front = (row[P.TO_REAR] * total + moment) / base
+    return front, total - front
+
+
+@compiled
+def advance_velocity(vx: float, vy: float, ax: float, ay: float, yaw_rate: float, step: float) -> tuple[float, float]:
+    """(v_x, v_y) [m/s] after `step` [s] of constant a_x, a_y, r: the exact solution, a rotation by -r*step.
+
+    Heun's rule is its second-order part; Euler's rule costs a factor of four in v_y (errata).
+    """
+    angle = yaw_rate * step
+    cos, sin = math.cos(angle), math.sin(angle)
+    if abs(angle) < 1e-6:
+        along, across = step, 0.5 * angle * step
+    else:
+        along, across = sin / yaw_rate, (1.0 - cos) / yaw_rate
+    return (
+        cos * vx + sin * vy + along * ax + across * ay,
+        cos * vy - sin * vx + along * ay - across * ax,
+    )

@@ -1,0 +1,36 @@
+"""Vertical wheel loads under quasi-static transfer.
+
+Legend: m mass [kg], h height of the centre of gravity [m], L wheelbase [m], a, b distances to the front and rear axle [m],
+a_x, a_y acceleration of the centre of gravity [m/s^2], Fz load [N]; wheels in the order fl, fr, rl, rr.
+ISO 8855 signs: accelerating loads the rear, a left turn (a_y > 0) loads the right wheels.
+"""
+
+from __future__ import annotations
+
+from edge_agent.dynamics.parameters import GRAVITY, P
+from schemas.numeric import FloatArray, compiled
+
+LEAST_LOAD_SHARE = 0.02  # of a static wheel load: a lifted wheel keeps a trace of load, so that shares stay finite
+
+
+@compiled
+def wheel_loads(row: FloatArray, ax: float, ay: float) -> tuple[float, float, float, float]:
+    """Loads (fl, fr, rl, rr) [N] of the vehicle `row` at accelerations ax, ay [m/s^2].
+
+    The lateral transfer of each axle is in proportion to the mass it carries (equal roll stiffness per load).
+    """
+    mass, height = row[P.MASS], row[P.CG_HEIGHT]
+    base = row[P.TO_FRONT] + row[P.TO_REAR]
+    pitch = mass * ax * height / base
+    front = mass * GRAVITY * row[P.TO_REAR] / base - pitch
+    rear = mass * GRAVITY * row[P.TO_FRONT] / base + pitch
+    roll = ay * height / GRAVITY
+    shift_front = front * roll / row[P.TRACK_FRONT]
+    shift_rear = rear * roll / row[P.TRACK_REAR]
+    least = LEAST_LOAD_SHARE * mass * GRAVITY / 4.0
+    return (
+        max(0.5 * front - shift_front, least),
+        max(0.5 * front + shift_front, least),
+        max(0.5 * rear - shift_rear, least),
+        max(0.5 * rear + shift_rear, least),
+    )

@@ -1,0 +1,64 @@
+"""A vehicle as one row of numbers for the compiled kernels.
+
+Legend of the row (index, meaning, unit): see `P`. All values are nominal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntEnum
+
+import numpy as np
+
+from schemas.numeric import FloatArray
+from schemas.vehicle import Vehicle
+
+GRAVITY = 9.81  # [m/s^2]
+
+
+class P(IntEnum):
+    """Index of a vehicle parameter in its row."""
+
+    MASS = 0  # [kg]
+    YAW_INERTIA = 1  # [kg m^2]
+    TO_FRONT = 2  # centre of gravity to front axle [m]
+    TO_REAR = 3  # centre of gravity to rear axle [m]
+    TRACK_FRONT = 4  # [m]
+    TRACK_REAR = 5  # [m]
+    CG_HEIGHT = 6  # [m]
+    RADIUS = 7  # wheel radius [m]
+    WHEEL_INERTIA = 8  # [kg m^2]
+    SLOPE_X = 9  # longitudinal slip stiffness per wheel load [1]
+    SLOPE_Y = 10  # cornering stiffness per wheel load [1/rad]
+    DRIVE_FRONT = 11  # share of the driving force on the front axle [1]; NaN where unknown
+
+
+def parameter_row(vehicle: Vehicle) -> FloatArray:
+    """The parameters of `vehicle`, shape (12,), indexed by `P`.
+
+    Stiffnesses of the vehicle file are means over the four wheels at static load; a slope per newton of load makes
+    them valid for the lightly and the heavily loaded wheel alike.
+    """
+    static_load = vehicle.mass * GRAVITY / 4.0
+    drive = vehicle.drive_split_front
+    return np.array(
+        [
+            vehicle.mass,
+            vehicle.yaw_inertia,
+            vehicle.cg_to_front_axle,
+            vehicle.cg_to_rear_axle,
+            vehicle.track_front,
+            vehicle.track_rear,
+            vehicle.cg_height,
+            vehicle.wheel_radius,
+            vehicle.wheel_inertia,
+            vehicle.longitudinal_stiffness / static_load,
+            vehicle.cornering_stiffness / static_load,
+            np.nan if drive is None else drive,
+        ]
+    )
+
+
+def parameter_table(vehicles: Sequence[Vehicle]) -> FloatArray:
+    """One row per vehicle, shape (N, 12)."""
+    return np.stack([parameter_row(v) for v in vehicles])

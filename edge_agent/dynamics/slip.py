@@ -1,0 +1,45 @@
+"""Velocity of a wheel centre and the slip of its tyre.
+
+Legend: v_x, v_y velocity of the centre of gravity [m/s], r yaw rate [rad/s], (x, y) wheel position in the body [m],
+delta road-wheel angle [rad], R radius [m], omega wheel speed [rad/s]; index w: in the wheel's frame.
+"""
+
+from __future__ import annotations
+
+import math
+
+from edge_agent.dynamics.parameters import P
+from schemas.numeric import FloatArray, compiled
+
+SLOWEST_M_S = 0.5  # slip's denominator is kept above it: near standstill slip has no meaning
+
+
+@compiled
+def wheel_position(row: FloatArray, wheel: int) -> tuple[float, float]:
+    """(x, y) [m] of wheel 0..3 (fl, fr, rl, rr) from the centre of gravity; y is positive to the left."""
+    front = wheel < 2
+    x = row[P.TO_FRONT] if front else -row[P.TO_REAR]
+    half = 0.5 * (row[P.TRACK_FRONT] if front else row[P.TRACK_REAR])
+    return x, (half if wheel % 2 == 0 else -half)
+
+
+@compiled
+def wheel_velocity(
+    row: FloatArray, wheel: int, vx: float, vy: float, yaw_rate: float, delta: float
+) -> tuple[float, float]:
+    """(v_wx, v_wy) [m/s] of the centre of `wheel`, along and across the wheel's own plane."""
+    x, y = wheel_position(row, wheel)
+    ahead = vx - y * yaw_rate
+    left = vy + x * yaw_rate
+    cos, sin = math.cos(delta), math.sin(delta)
+    return cos * ahead + sin * left, cos * left - sin * ahead
+
+
+@compiled
+def slips(radius: float, omega: float, along: float, across: float) -> tuple[float, float]:
+    """(slip_x, slip_y) [1]: (R*omega - v_wx)/|v_wx| and -v_wy/|v_wx|, the tangent of the slip angle.
+
+    Positive slip_x drives forward, positive slip_y pushes to the left.
+    """
+    speed = max(abs(along), SLOWEST_M_S)
+    return (radius * omega - along) / speed, -across / speed

@@ -1,0 +1,83 @@
+"""Tyre curves in normalised slip, and their combination in two directions.
+
+Legend
+    theta       normalised slip, K*slip/(mu*Fz) [1]
+    K           slip stiffness, independent of mu [N] or [N/rad]
+    mu          peak adhesion [1]
+    Fz          wheel load [N]
+    f           curve with f(0) = 0, f'(0) = 1, peak 1; the force is mu*Fz*f(theta)
+    c, e        shape and curvature of the Magic Formula [1]
+
+Because K does not depend on mu, all roads share one initial slope: friction is seen in the bend of the curve only
+(errata of papers 002 and 004). Sources: Pacejka, Tyre and Vehicle Dynamics, chapter 4; Dugoff, Fancher and Segel,
+SAE 700377.
+"""
+
+from __future__ import annotations
+
+import math
+
+from schemas.numeric import compiled
+
+TINY = 1e-12  # below it a slip has no direction and no force
+
+
+@compiled
+def magic_formula(theta: float, c: float, e: float) -> float:
+    """Magic Formula f(theta) = sin(c*atan(b - e*(b - atan(b)))), b = theta/c; odd in theta; 1 < c <= 2, e < 1."""
+    b = theta / c
+    return math.sin(c * math.atan(b - e * (b - math.atan(b))))
+
+
+@compiled
+def magic_formula_inverse(rho: float, c: float) -> float:
+    """theta on the rising branch with magic_formula(theta, c, 0) = rho; infinite at and beyond the peak, |rho| >= 1."""
+    if rho >= 1.0:
+        return math.inf
+    if rho <= -1.0:
+        return -math.inf
+    return c * math.tan(math.asin(rho) / c)
+
+
+@compiled
+def dugoff(theta: float) -> float:
+    """Dugoff curve: theta up to one half, then 1 - 1/(4*theta); odd in theta; it has no falling branch."""
+    size = abs(theta)
+    return theta if size <= 0.5 else math.copysign(1.0 - 0.25 / size, theta)
+
+
+@compiled
+def combined_magic(
+    slip_x: float, slip_y: float, stiffness_x: float, stiffness_y: float, mu: float, load: float, c: float, e: float
+) -> tuple[float, float]:
+    """(Fx, Fy) [N] of one wheel in its own frame by similarity with the Magic Formula.
+
+    slip_x [1], slip_y = tan(alpha) [1], stiffness_x [N], stiffness_y [N/rad], mu [1], load [N].
+    """
+    grip = mu * load
+    if grip <= 0.0:
+        return 0.0, 0.0
+    theta_x = stiffness_x * slip_x / grip
+    theta_y = stiffness_y * slip_y / grip
+    theta = math.hypot(theta_x, theta_y)
+    if theta < TINY:
+        return 0.0, 0.0
+    gain = grip * magic_formula(theta, c, e) / theta
+    return gain * theta_x, gain * theta_y
+
+
+@compiled
+def combined_dugoff(
+    slip_x: float, slip_y: float, stiffness_x: float, stiffness_y: float, mu: float, load: float
+) -> tuple[float, float]:
+    """(Fx, Fy) [N] of one wheel in its own frame by similarity with the Dugoff curve; arguments as `combined_magic`."""
+    grip = mu * load
+    if grip <= 0.0:
+        return 0.0, 0.0
+    theta_x = stiffness_x * slip_x / grip
+    theta_y = stiffness_y * slip_y / grip
+    theta = math.hypot(theta_x, theta_y)
+    if theta < TINY:
+        return 0.0, 0.0
+    gain = grip * dugoff(theta) / theta
+    return gain * theta_x, gain * theta_y

@@ -1,0 +1,68 @@
+"""Random numbers without a state: the number is a hash of (key, counter).
+
+A generator that is carried along would couple a vehicle's noise to how many vehicles there are and to how a drive is
+cut into blocks. A counter-based generator (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011)
+does not: sample k of channel c of a vehicle is the same number whoever asks for it, in whatever order. The hash is the
+finaliser of SplitMix64 (Steele, Lea, Flood, OOPSLA 2014).
+
+Counters must be non-negative.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from schemas.errors import InputError
+from schemas.numeric import compiled
+
+STEP: Final = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio, odd
+MULTIPLY_1: Final = np.uint64(0xBF58476D1CE4E5B9)
+MULTIPLY_2: Final = np.uint64(0x94D049BB133111EB)
+SHIFTS: Final = (np.uint64(30), np.uint64(27), np.uint64(31))
+DROP: Final = np.uint64(11)  # 64 - 53: a float64 has 53 bits
+UNIT: Final = 2.0**-53
+TWO: Final = np.uint64(2)
+ONE: Final = np.uint64(1)
+
+
+def checked_seed(seed: int) -> int:
+    """The seed itself.
+
+    Raises:
+        InputError: it is negative.
+    """
+    if seed < 0:
+        raise InputError("seed", f"{seed} is negative", "give a whole number from 0 on")
+    return seed
+
+
+def key_of(*seeds: int) -> np.uint64:
+    """A key from non-negative integers, e.g. (seed, vehicle number): different lists give unrelated streams."""
+    return np.uint64(np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0])
+
+
+@compiled
+def mixed(key: np.uint64, counter: np.uint64) -> np.uint64:
+    """64 random bits of `counter` in the stream `key`."""
+    z = key + (counter + ONE) * STEP
+    z = (z ^ (z >> SHIFTS[0])) * MULTIPLY_1
+    z = (z ^ (z >> SHIFTS[1])) * MULTIPLY_2
+    return z ^ (z >> SHIFTS[2])
+
+
+@compiled
+def uniform(key: np.uint64, counter: int) -> float:
+    """A number strictly between 0 and 1."""
+    return (float(mixed(key, np.uint64(counter)) >> DROP) + 0.5) * UNIT
+
+
+@compiled
+def normal(key: np.uint64, counter: int) -> float:
+    """A standard normal number (Box and Muller, 1958); uses the hashes 2·counter and 2·counter + 1 of the stream."""
+    first = TWO * np.uint64(counter)
+    u = (float(mixed(key, first) >> DROP) + 0.5) * UNIT
+    angle = 2.0 * math.pi * float(mixed(key, first + ONE) >> DROP) * UNIT
+    return math.sqrt(-2.0 * math.log(u)) * math.cos(angle)

@@ -1,0 +1,84 @@
+"""Sensor faults: what may go wrong with a channel, as one table of kind -> effect on a drive."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from schemas.errors import InputError
+from schemas.numeric import BoolArray, FloatArray
+from schemas.signals import CHANNELS
+
+
+@dataclass(frozen=True)
+class Fault:
+    """`kind` of FAULTS on one channel (or all whose name begins so: "omega") for `start` <= t < `end` [s].
+
+    `size` is in the channel's unit; only spikes and bias steps have one.
+    """
+
+    kind: str
+    channel: str
+    start: float = -math.inf
+    end: float = math.inf
+    size: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.kind not in FAULTS:
+            raise InputError("fault", f"there is no fault {self.kind!r}", f"choose one of {', '.join(FAULTS)}")
+        if not self.indices:
+            raise InputError("channel", f"there is no channel {self.channel!r}", f"choose one of {', '.join(CHANNELS)}")
+
+    @property
+    def indices(self) -> list[int]:
+        """Which channels of a block are meant."""
+        return [i for i, name in enumerate(CHANNELS) if name == self.channel or name.startswith(self.channel + "_")]
+
+
+Effect = Callable[[FloatArray, BoolArray, float], None]
+"""(values (T,) of one channel, changed in place; when (T,); size)."""
+
+
+def silent(values: FloatArray, when: BoolArray, _size: float) -> None:
+    """No reading."""
+    values[when] = np.nan
+
+
+def stuck(values: FloatArray, when: BoolArray, _size: float) -> None:
+    """The last reading before the fault is repeated."""
+    if when.any():
+        first = int(np.argmax(when))
+        values[when] = values[max(first - 1, 0)]
+
+
+def spike(values: FloatArray, when: BoolArray, size: float) -> None:
+    """Every tenth reading is off by `size`."""
+    values[np.flatnonzero(when)[::10]] += size
+
+
+def bias(values: FloatArray, when: BoolArray, size: float) -> None:
+    """A step of the offset by `size`."""
+    values[when] += size
+
+
+FAULTS: Final[dict[str, Effect]] = {
+    "dropout": silent,
+    "missing": silent,  # for a whole drive: the vehicle does not have the channel
+    "stuck": stuck,
+    "spike": spike,
+    "bias": bias,
+}
+
+
+def apply_faults(t: FloatArray, signals: FloatArray, faults: tuple[Fault, ...]) -> FloatArray:
+    """A copy of the signals (T, 18) at times t (T,) with the faults in it, in their order."""
+    faulty = signals.copy()
+    for fault in faults:
+        when = (t >= fault.start) & (t < fault.end)
+        for i in fault.indices:
+            FAULTS[fault.kind](faulty[:, i], when, fault.size)
+    return faulty

@@ -1,0 +1,95 @@
+"""Friction of the road as a field over position and time: a background, and oriented rectangles laid upon it.
+
+A later patch lies on top of an earlier one. Each patch says what its grip *is* (`mu`) and what a driver takes it for
+(`looks`): black ice looks like the road around it, which is why drivers respond late.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from schemas.errors import InputError
+from schemas.numeric import FloatArray, compiled
+
+# what the surfaces of the scenarios are made of: peak adhesion of a passenger-car tyre, middle of the usual ranges
+DRY, WET, SNOW, ICE = 0.90, 0.60, 0.35, 0.18
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A rectangle of road surface.
+
+    `x, y` centre [m]; `length` along the direction `angle` [rad, counter-clockwise from x] and `width` across [m];
+    `mu` its friction; `looks` the friction a driver expects of it (None: what lies beneath);
+    present for `start` <= t < `end` [s].
+    """
+
+    name: str
+    x: float
+    y: float
+    length: float
+    width: float
+    mu: float
+    angle: float = 0.0
+    looks: float | None = None
+    start: float = -math.inf
+    end: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.mu <= 2.0:
+            raise InputError("mu", f"patch {self.name} has friction {self.mu}", "give a number in (0, 2]")
+        if not (self.length > 0.0 and self.width > 0.0 and self.start < self.end):
+            raise InputError("patch", f"{self.name} covers nothing", "give positive sizes, and start before end")
+
+
+class F(IntEnum):
+    """Columns of a friction table (one row per patch, float64)."""
+
+    X = 0
+    Y = 1
+    COS = 2
+    SIN = 3
+    HALF_LENGTH = 4
+    HALF_WIDTH = 5
+    START = 6
+    END = 7
+    MU = 8
+    LOOKS = 9
+
+
+def friction_table(background: float, patches: tuple[Patch, ...]) -> FloatArray:
+    """Rows for `look_up`, shape (1 + patches, 10); the background is the first, endless patch."""
+    everywhere = Patch("background", 0.0, 0.0, math.inf, math.inf, background, looks=background)
+    table = np.empty((1 + len(patches), len(F)))
+    for row, p in zip(table, (everywhere, *patches), strict=True):
+        looks = math.nan if p.looks is None else p.looks
+        box = (p.x, p.y, math.cos(p.angle), math.sin(p.angle), p.length / 2, p.width / 2)
+        row[:] = (*box, p.start, p.end, p.mu, looks)
+    return table
+
+
+@compiled
+def look_up(table: FloatArray, column: int, t: float, x: float, y: float) -> float:
+    """Column F.MU or F.LOOKS of the topmost patch at (x, y) [m] and t [s] that says something about it."""
+    for i in range(table.shape[0] - 1, 0, -1):
+        row = table[i]
+        if t < row[F.START] or t >= row[F.END] or math.isnan(row[column]):
+            continue
+        dx, dy = x - row[F.X], y - row[F.Y]
+        along, across = dx * row[F.COS] + dy * row[F.SIN], dy * row[F.COS] - dx * row[F.SIN]
+        if abs(along) <= row[F.HALF_LENGTH] and abs(across) <= row[F.HALF_WIDTH]:
+            return float(row[column])
+    return float(table[0, column])
+
+
+@compiled
+def look_up_many(table: FloatArray, column: int, t: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
+    """`look_up` for arrays of one length."""
+    values = np.empty(x.size)
+    for i in range(x.size):
+        values[i] = look_up(table, column, t[i], x[i], y[i])
+    return values

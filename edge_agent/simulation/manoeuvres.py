@@ -1,0 +1,166 @@
+"""The manoeuvres: what the driver of a test track does, as one table of name -> manoeuvre.
+
+A manoeuvre is a function of the moment, giving the mean road-wheel angle [rad] and the longitudinal acceleration that
+is asked for [m/s^2]. The test track starts at the origin and leads along x.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+WHEELBASE: Final = 2.7  # [m] every driver knows his own near enough
+SPEED_GAIN: Final = 1.5  # [1/s] how fast a driver takes back an error of speed
+LARGEST_STEER: Final = 0.5  # [rad at the road wheel]
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What a driver knows: time [s], pose [m, m, rad], speed [m/s], and the speed that was asked for [m/s]."""
+
+    t: float
+    x: float
+    y: float
+    yaw: float
+    vx: float
+    speed: float
+
+
+Control = Callable[[Moment], tuple[float, float]]
+Friction = float | Callable[[float, float], float]
+"""Friction everywhere, or a function of (x along the track, y to the left) [m], asked for each wheel."""
+
+
+@dataclass(frozen=True)
+class Manoeuvre:
+    """One row of the table; `friction` and `speed` are what is usual for it and may be replaced."""
+
+    control: Control
+    speed: float  # [m/s] at the start, and to be held unless the control does otherwise
+    duration: float  # [s]
+    friction: Friction
+    about: str
+
+
+def jump(before: float, after: float, at: float) -> Callable[[float, float], float]:
+    """A friction that changes at `at` [m] along the track."""
+    return lambda x, _y: before if x < at else after
+
+
+def split(left: float, right: float) -> Callable[[float, float], float]:
+    """A friction that differs between the left and the right of the track."""
+    return lambda _x, y: left if y > 0.0 else right
+
+
+def hold(now: Moment, speed: float | None = None) -> float:
+    """Acceleration that brings the vehicle back to `speed`, or to the one that was asked for."""
+    return SPEED_GAIN * ((now.speed if speed is None else speed) - now.vx)
+
+
+def steer_to(now: Moment, target_x: float, target_y: float) -> float:
+    """Pure pursuit (Coulter, CMU-RI-TR-92-01): the steering of the circle through a point ahead."""
+    dx, dy = target_x - now.x, target_y - now.y
+    ahead = math.cos(now.yaw) * dx + math.sin(now.yaw) * dy
+    left = math.cos(now.yaw) * dy - math.sin(now.yaw) * dx
+    curvature = 2.0 * left / max(ahead * ahead + left * left, 1.0)
+    return min(max(math.atan(WHEELBASE * curvature), -LARGEST_STEER), LARGEST_STEER)
+
+
+def preview(now: Moment) -> float:
+    """How far ahead a driver looks [m]."""
+    return max(4.0, 0.6 * now.vx)
+
+
+def smooth_step(u: float) -> float:
+    """0 before u = 0, 1 after u = 1, and bends without a kink between (3u² − 2u³)."""
+    u = min(max(u, 0.0), 1.0)
+    return u * u * (3.0 - 2.0 * u)
+
+
+def lane_change_path(s: float) -> float:
+    """Lateral position [m] of a double lane change at distance s: gates like those of ISO 3888-1, 3.5 m over."""
+    return 3.5 * (smooth_step((s - 20.0) / 30.0) - smooth_step((s - 75.0) / 25.0))
+
+
+def double_lane_change(now: Moment) -> tuple[float, float]:
+    """Into the other lane and back, the speed held."""
+    ahead = now.x + preview(now)
+    return steer_to(now, ahead, lane_change_path(ahead)), hold(now)
+
+
+def slalom(now: Moment) -> tuple[float, float]:
+    """Around cones 18 m apart."""
+    ahead = now.x + preview(now)
+    return steer_to(now, ahead, 1.2 * math.sin(math.pi * ahead / 18.0) * smooth_step(ahead / 18.0)), hold(now)
+
+
+def sine(now: Moment) -> tuple[float, float]:
+    """Steering to and fro with half a hertz, amplitude for 4 m/s^2 of a bicycle without slip."""
+    amplitude = min(WHEELBASE * 4.0 / now.speed**2, 0.15)
+    return amplitude * math.sin(math.pi * max(now.t - 1.0, 0.0)), hold(now)
+
+
+def acceleration(now: Moment) -> tuple[float, float]:
+    """Full throttle after one second."""
+    return 0.0, 8.0 if now.t >= 1.0 else hold(now)
+
+
+def braking(now: Moment) -> tuple[float, float]:
+    """A stop with anti-lock control after one second, down to walking pace."""
+    return 0.0, -12.0 if now.t >= 1.0 and now.vx > 2.0 else hold(now, now.speed if now.t < 1.0 else 1.5)
+
+
+def split_braking(now: Moment) -> tuple[float, float]:
+    """The same stop, kept straight by the driver while one side pulls."""
+    return steer_to(now, now.x + preview(now), 0.0), braking(now)[1]
+
+
+def gentle_braking(now: Moment) -> tuple[float, float]:
+    """2 m/s^2 after one second, down to walking pace."""
+    return 0.0, -2.0 if now.t >= 1.0 and now.vx > 2.0 else hold(now, now.speed if now.t < 1.0 else 1.5)
+
+
+def constant_radius(now: Moment) -> tuple[float, float]:
+    """A circle of 40 m radius to the left, entered straight (ISO 4138)."""
+    radius, look = 40.0, preview(now)
+    angle = math.atan2(now.x, radius - now.y) + look / radius
+    return steer_to(now, radius * math.sin(angle), radius - radius * math.cos(angle)), hold(now)
+
+
+def straight(now: Moment) -> tuple[float, float]:
+    """Straight on at constant speed: it tells nothing of the road."""
+    return steer_to(now, now.x + preview(now), 0.0), hold(now)
+
+
+def j_turn(now: Moment) -> tuple[float, float]:
+    """One step of the steering after one second, held (ISO 7401)."""
+    return 0.06 * smooth_step((now.t - 1.0) / 0.3), hold(now)
+
+
+def pulses(now: Moment) -> tuple[float, float]:
+    """Two seconds of throttle, two of brakes, in a gentle weave: town traffic in short."""
+    wanted = 2.5 if now.t % 4.0 < 2.0 else -2.5
+    return 0.03 * math.sin(2.0 * now.t), wanted if 0.5 * now.speed < now.vx < 1.5 * now.speed else hold(now)
+
+
+def kmh(speed: float) -> float:
+    """[m/s] of a speed in km/h."""
+    return speed / 3.6
+
+
+MANOEUVRES: Final = {
+    "double-lane-change": Manoeuvre(double_lane_change, kmh(80), 10.0, 0.85, "double lane change, ISO 3888-1 in kind"),
+    "slalom": Manoeuvre(slalom, kmh(30), 15.0, 0.30, "slalom around cones 18 m apart"),
+    "sine": Manoeuvre(sine, kmh(70), 12.0, 0.50, "sine steering of half a hertz"),
+    "acceleration": Manoeuvre(acceleration, kmh(20), 8.0, 0.85, "full throttle in a straight line"),
+    "braking": Manoeuvre(braking, kmh(80), 8.0, 0.85, "stop with anti-lock control, ISO 21994 in kind"),
+    "jump-braking": Manoeuvre(braking, kmh(80), 8.0, jump(0.85, 0.30, 45.0), "the same stop from dry onto snow"),
+    "split-braking": Manoeuvre(split_braking, kmh(60), 8.0, split(0.80, 0.30), "stop with one side on snow, ISO 14512"),
+    "gentle-braking": Manoeuvre(gentle_braking, kmh(60), 10.0, 0.85, "braking with 2 m/s^2"),
+    "constant-radius": Manoeuvre(constant_radius, kmh(40), 30.0, 0.35, "circle of 40 m radius, ISO 4138 in kind"),
+    "straight": Manoeuvre(straight, kmh(60), 20.0, 0.85, "straight on at constant speed: unexcited"),
+    "j-turn": Manoeuvre(j_turn, kmh(70), 8.0, 0.85, "step of the steering, ISO 7401 in kind"),
+    "pulses": Manoeuvre(pulses, kmh(50), 30.0, 0.60, "throttle and brakes in turn while weaving"),
+}

@@ -1,0 +1,39 @@
+"""Metres on a plane that touches the earth at an origin: x to the east, y to the north."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from schemas.numeric import FloatArray
+
+EARTH_RADIUS_M: Final = 6_378_137.0  # of the sphere that Web Mercator tiles are cut from
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where x = y = 0 lies [deg, WGS 84]."""
+
+    latitude: float
+    longitude: float
+
+    @property
+    def per_metre(self) -> tuple[float, float]:
+        """Degrees of latitude per metre north and of longitude per metre east."""
+        north = float(np.degrees(1.0 / EARTH_RADIUS_M))
+        return north, north / float(np.cos(np.radians(self.latitude)))
+
+    def to_latlon(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(latitude, longitude) [deg] of the points (x, y) [m]."""
+        north, east = self.per_metre
+        return self.latitude + np.asarray(y) * north, self.longitude + np.asarray(x) * east
+
+    def from_latlon(self, latitude: FloatArray, longitude: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(x, y) [m] of the points given in degrees."""
+        north, east = self.per_metre
+        return (np.asarray(longitude) - self.longitude) / east, (np.asarray(latitude) - self.latitude) / north
+
+
+GOTHENBURG: Final = Origin(57.70, 11.97)

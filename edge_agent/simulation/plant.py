@@ -1,0 +1,276 @@
+"""The vehicle that is driven: a planar body on four wheels with Magic Formula tyres.
+
+It shares its equations with `edge_agent.dynamics` but is not the estimator's model: its tyres have another shape, their
+stiffness grows less than the load, its loads follow the accelerations with a lag, it rolls, drags and resists rolling.
+
+    m (dv_x/dt − r v_y) = ΣX − D v_x|v_x|        v_x, v_y  speed of the centre of gravity in the body [m/s]
+    m (dv_y/dt + r v_x) = ΣY                     r         yaw rate [rad/s]
+    I_z dr/dt = Σ (x_i Y_i − y_i X_i)            X, Y      wheel forces in the body's axes [N]
+    J dω/dt = T − R F_x − k_r R F_z              ω, T      wheel speed [rad/s], torque at the wheel [N·m]
+
+    θ = K s / (μ F_z),  F = μ F_z f(|θ|) θ/|θ|   s         slip (longitudinal, lateral), K its stiffness
+    K = κ F_z (1 − ε (F_z/F_0 − 1))              F_0       static load, ε how degressive the tyre is
+
+K does not know μ: friction acts by similarity (Pacejka, Tyre and Vehicle Dynamics, 3rd ed., §4.2), and |F| ≤ μ F_z.
+
+Explicit Euler for the body and linearly implicit Euler for the wheels, whose slip is stiff: with the secant slope of
+the tyre in the denominator a wheel step is stable at any speed. The tyre's force is taken at the step's end, where the
+ground has changed its speed too; without that term a wheel would seem to have twice its inertia.
+Wheel order fl, fr, rl, rr; ISO 8855 signs.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import Final
+
+from edge_agent.dynamics.body import accelerations
+from edge_agent.dynamics.loads import wheel_loads
+from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.slip import SLOWEST_M_S, slips, wheel_position, wheel_velocity
+from edge_agent.dynamics.tyres import TINY, magic_formula
+from schemas.numeric import FloatArray, compiled
+
+LONGEST_SUBSTEP: Final = 1e-3  # [s]; lateral dynamics at 1 m/s have poles near 150/s
+SOFTEST: Final = 0.3  # stiffness never degrades below this share of proportional, however overloaded the wheel
+REAR_LIMIT: Final = 0.5  # slip control lets go of the rear wheels at this share of the limit, so that they still guide
+STANDING: Final = 1.0  # [rad/s] below it a brake fades, so that it holds a wheel and does not turn it backwards
+
+
+class X(IntEnum):
+    """State of one vehicle."""
+
+    VX = 0  # [m/s]
+    VY = 1
+    YAW_RATE = 2  # [rad/s]
+    OMEGA = 3  # four wheels [rad/s]
+    AX_LAGGED = 7  # [m/s^2], what the suspension has followed so far
+    AY_LAGGED = 8
+    X = 9  # [m] east
+    Y = 10  # [m] north
+    YAW = 11  # [rad], not wrapped
+
+
+STATES: Final = 12
+
+
+class Q(IntEnum):
+    """What only the true vehicle has; these continue the row of `edge_agent.dynamics.parameters.P`."""
+
+    SHAPE = len(P)  # c and e of the tyre curve
+    CURVATURE = len(P) + 1
+    DEGRESSION = len(P) + 2  # ε
+    LAG = len(P) + 3  # [s] of the sprung body behind the accelerations
+    ROLL_LEAK = len(P) + 4  # gravity that an accelerometer feels in the rolled and pitched body, per a_y and per a_x
+    PITCH_LEAK = len(P) + 5
+    DRAG = len(P) + 6  # D [N per (m/s)^2]
+    ROLLING = len(P) + 7  # k_r
+    SLIP_LIMIT = len(P) + 8  # slip at which anti-lock and traction control begin to let go; inf: none
+    BRAKE_FRONT = len(P) + 9  # share of the braking torque at the front axle
+    POWER = len(P) + 10  # [W]
+
+
+PARAMETERS: Final = len(P) + len(Q)
+
+
+class U(IntEnum):
+    """Rows of what is done to the four wheels, shape (4, 4)."""
+
+    STEER = 0  # [rad at the road wheel]
+    DRIVE = 1  # [N·m] asked for; slip control may allow less
+    BRAKE = 2  # [N·m], positive, asked for
+    MU = 3  # friction under the wheel
+
+
+class W(IntEnum):
+    """Rows of what the four wheels do at an instant, shape (8, 4)."""
+
+    FX = 0  # [N] in the wheel's axes
+    FY = 1
+    FZ = 2
+    SPEED = 3  # [m/s] of the wheel's centre along the wheel
+    SLIP = 4  # longitudinal
+    THETA = 5  # normalised slip; beyond about 2 the wheel slides
+    SLOPE = 6  # dF_x/dω along the secant [N·s/rad]
+    TORQUE = 7  # [N·m] that acts, driving positive
+
+
+@compiled
+def stiffness_per_load(slope: float, degression: float, load: float, at_rest: float) -> float:
+    """K/F_z of a wheel under `load` [N] that carries `at_rest` [N] when standing."""
+    return slope * max(1.0 - degression * (load / at_rest - 1.0), SOFTEST)
+
+
+@compiled
+def allowed(slip: float, limit: float) -> float:
+    """Share of the torque that slip control lets through: all up to `limit`, nothing from twice the limit."""
+    return min(max(2.0 - abs(slip) / limit, 0.0), 1.0)
+
+
+@compiled
+def slip_limit(p: FloatArray, i: int) -> float:
+    """Slip at which the control of wheel `i` begins to let go."""
+    return float(p[Q.SLIP_LIMIT] if i < 2 else REAR_LIMIT * p[Q.SLIP_LIMIT])
+
+
+@compiled
+def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> None:
+    """Fill `w` (8, 4) for the state `x` (12,), parameters `p` (23,) and inputs `u` (4, 4)."""
+    loads = wheel_loads(p, x[X.AX_LAGGED], x[X.AY_LAGGED])
+    at_rest = wheel_loads(p, 0.0, 0.0)
+    for i in range(4):
+        load, omega = loads[i], x[X.OMEGA + i]
+        along, across = wheel_velocity(p, i, x[X.VX], x[X.VY], x[X.YAW_RATE], u[U.STEER, i])
+        slip_x, slip_y = slips(p[P.RADIUS], omega, along, across)
+        slope_x = stiffness_per_load(p[P.SLOPE_X], p[Q.DEGRESSION], load, at_rest[i])
+        slope_y = stiffness_per_load(p[P.SLOPE_Y], p[Q.DEGRESSION], load, at_rest[i])
+        theta_x, theta_y = slope_x * slip_x / u[U.MU, i], slope_y * slip_y / u[U.MU, i]
+        theta = math.hypot(theta_x, theta_y)
+        secant = magic_formula(theta, p[Q.SHAPE], p[Q.CURVATURE]) / theta if theta > TINY else 1.0
+        pull = secant * u[U.MU, i] * load
+        drive, brake = u[U.DRIVE, i], u[U.BRAKE, i]
+        if slip_x > 0.0:
+            drive *= allowed(slip_x, slip_limit(p, i))
+        else:
+            brake *= allowed(slip_x, slip_limit(p, i))
+        w[W.FX, i], w[W.FY, i], w[W.FZ, i] = pull * theta_x, pull * theta_y, load
+        w[W.SPEED, i], w[W.SLIP, i], w[W.THETA, i] = along, slip_x, theta
+        w[W.SLOPE, i] = secant * slope_x * load * p[P.RADIUS] / max(abs(along), SLOWEST_M_S)
+        w[W.TORQUE, i] = drive - brake * omega / max(abs(omega), STANDING)
+
+
+@compiled
+def body_accelerations(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> tuple[float, float, float]:
+    """(a_x, a_y) of the centre of gravity [m/s^2] and the yaw acceleration [rad/s^2], from the filled `w`."""
+    ax, ay, yaw_acceleration = accelerations(p, w[W.FX], w[W.FY], u[U.STEER])
+    return ax - p[Q.DRAG] * x[X.VX] * abs(x[X.VX]) / p[P.MASS], ay, yaw_acceleration
+
+
+@compiled
+def turn_wheels(
+    x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float, gain: float, yaw_acceleration: float
+) -> None:
+    """One linearly implicit Euler step of the wheel speeds in `x`: every torque that falls with ω damps it.
+
+    gain is dv_x/dt [m/s^2], yaw_acceleration in rad/s^2: how the ground's speed changes under the wheels.
+    """
+    radius = p[P.RADIUS]
+    for i in range(4):
+        ground = gain - wheel_position(p, i)[1] * yaw_acceleration
+        omega, slip = x[X.OMEGA + i], abs(w[W.SLIP, i])
+        slow = max(abs(omega), STANDING)
+        resistance = p[Q.ROLLING] * radius * w[W.FZ, i] * omega / slow
+        excess = w[W.TORQUE, i] - resistance - radius * w[W.FX, i] + dt * w[W.SLOPE, i] * ground
+        damping = radius * w[W.SLOPE, i]
+        if slip_limit(p, i) < slip < 2.0 * slip_limit(p, i):
+            asked = u[U.DRIVE, i] if w[W.SLIP, i] > 0.0 else u[U.BRAKE, i]
+            damping += asked * radius / (max(abs(w[W.SPEED, i]), SLOWEST_M_S) * slip_limit(p, i))
+        if abs(omega) < STANDING:
+            damping += u[U.BRAKE, i] / STANDING
+        x[X.OMEGA + i] = omega + dt * excess / (p[P.WHEEL_INERTIA] + dt * damping)
+
+
+@compiled
+def advance(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float, substeps: int) -> None:
+    """Move the state `x` on by `substeps` steps of `dt` [s] with the inputs `u` held; `w` is scratch."""
+    for _ in range(substeps):
+        wheel_forces(x, p, u, w)
+        ax, ay, yaw_acceleration = body_accelerations(x, p, u, w)
+        vx, vy, r = x[X.VX], x[X.VY], x[X.YAW_RATE]
+        turn_wheels(x, p, u, w, dt, ax + r * vy, yaw_acceleration)
+        c, s = math.cos(x[X.YAW] + 0.5 * dt * r), math.sin(x[X.YAW] + 0.5 * dt * r)
+        x[X.X] += dt * (c * vx - s * vy)
+        x[X.Y] += dt * (s * vx + c * vy)
+        x[X.YAW] += dt * r
+        x[X.VX] += dt * (ax + r * vy)
+        x[X.VY] += dt * (ay - r * vx)
+        x[X.YAW_RATE] += dt * yaw_acceleration
+        follow = min(dt / p[Q.LAG], 1.0)
+        x[X.AX_LAGGED] += follow * (ax - x[X.AX_LAGGED])
+        x[X.AY_LAGGED] += follow * (ay - x[X.AY_LAGGED])
+
+
+@compiled
+def command(p: FloatArray, u: FloatArray, steer: float, force: float) -> None:
+    """Fill STEER, DRIVE and BRAKE of `u` from a mean road-wheel angle [rad] and a longitudinal force [N].
+
+    The steered wheels follow Ackermann: they point at one centre on the line of the rear axle.
+    """
+    base = p[P.TO_FRONT] + p[P.TO_REAR]
+    curvature = math.tan(steer) / base
+    for i in range(4):
+        side = 1.0 if i % 2 == 0 else -1.0
+        inner = 1.0 - side * 0.5 * p[P.TRACK_FRONT] * curvature
+        u[U.STEER, i] = math.atan(base * curvature / inner) if i < 2 else 0.0
+        drive_share = p[P.DRIVE_FRONT] if i < 2 else 1.0 - p[P.DRIVE_FRONT]
+        brake_share = p[Q.BRAKE_FRONT] if i < 2 else 1.0 - p[Q.BRAKE_FRONT]
+        u[U.DRIVE, i] = 0.5 * drive_share * max(force, 0.0) * p[P.RADIUS]
+        u[U.BRAKE, i] = 0.5 * brake_share * max(-force, 0.0) * p[P.RADIUS]
+
+
+class R(IntEnum):
+    """Columns of a record: the truth of one sample of one vehicle."""
+
+    AX = 0  # [m/s^2] of the centre of gravity, level
+    AY = 1
+    AX_FELT = 2  # [m/s^2] by an accelerometer fixed to the rolling and pitching body
+    AY_FELT = 3
+    YAW_RATE = 4
+    DELTA = 5  # four wheels each, from here on
+    OMEGA = 9
+    TORQUE = 13
+    X = 17
+    Y = 18
+    YAW = 19
+    VX = 20
+    VY = 21
+    MU = 22
+    UTILISATION = 26  # |F| / (μ F_z)
+
+
+RECORD: Final = 30
+
+
+@compiled
+def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: FloatArray) -> None:
+    """Fill `record` (30,) with what is true at this instant under the inputs `u`; fills `w` too."""
+    wheel_forces(x, p, u, w)
+    ax, ay, _ = body_accelerations(x, p, u, w)
+    record[R.AX], record[R.AY] = ax, ay
+    record[R.AX_FELT] = ax + p[Q.PITCH_LEAK] * x[X.AX_LAGGED]
+    record[R.AY_FELT] = ay + p[Q.ROLL_LEAK] * x[X.AY_LAGGED]
+    record[R.YAW_RATE], record[R.VX], record[R.VY] = x[X.YAW_RATE], x[X.VX], x[X.VY]
+    record[R.X], record[R.Y], record[R.YAW] = x[X.X], x[X.Y], x[X.YAW]
+    for i in range(4):
+        record[R.DELTA + i], record[R.OMEGA + i], record[R.TORQUE + i] = u[U.STEER, i], x[X.OMEGA + i], w[W.TORQUE, i]
+        record[R.MU + i] = u[U.MU, i]
+        record[R.UTILISATION + i] = math.hypot(w[W.FX, i], w[W.FY, i]) / (u[U.MU, i] * w[W.FZ, i])
+
+
+@compiled
+def start_at(x: FloatArray, p: FloatArray, place: tuple[float, float, float], speed: float) -> None:
+    """Set the state `x` to rolling straight on at `speed` [m/s] from place (x [m], y [m], yaw [rad])."""
+    x[:] = 0.0
+    x[X.VX] = speed
+    x[X.X], x[X.Y], x[X.YAW] = place
+    x[X.OMEGA : X.OMEGA + 4] = speed / p[P.RADIUS]
+
+
+def substeps_of(rate_hz: float) -> int:
+    """How many equal plant steps of at most LONGEST_SUBSTEP make one sample."""
+    return max(1, math.ceil(round(1.0 / (rate_hz * LONGEST_SUBSTEP), 9)))
+
+
+@compiled
+def wheel_place(x: FloatArray, p: FloatArray, i: int) -> tuple[float, float]:
+    """Where wheel `i` stands on the ground, (x, y) [m]."""
+    ahead, left = wheel_position(p, i)
+    c, s = math.cos(x[X.YAW]), math.sin(x[X.YAW])
+    return x[X.X] + c * ahead - s * left, x[X.Y] + s * ahead + c * left
+
+
+@compiled
+def strongest_pull(p: FloatArray, vx: float) -> float:
+    """Largest driving force of the engine [N]: its power, and below 5 m/s the gearbox."""
+    return float(p[Q.POWER] / max(vx, 5.0))

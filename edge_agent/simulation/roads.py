@@ -1,0 +1,212 @@
+"""Roads as lanes: centre lines of straights and arcs, one lane each way on the right, and connectors through junctions.
+
+    lane       a directed polyline, points about a metre apart, with heading and curvature
+    connector  a lane through a junction, from the end of one lane to the start of one of another road
+    profile    v²/q at each point [m]: the square of the speed that a driver may have there who allows himself q m/s^2
+               across and BRAKING·q along, knowing where he will turn; it scales with q, so one profile serves all
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+import numpy as np
+
+from schemas.errors import InputError
+from schemas.numeric import FloatArray, IntArray
+
+SPACING_M: Final = 1.0
+LANE_OFFSET_M: Final = 2.0  # lanes of opposite directions are 4 m apart
+SETBACK_M: Final = 12.0  # where a lane ends before its junction: the connectors then turn with 8 to 14 m of radius
+SMOOTHING_M: Final = 5.0  # a driver opens his path where arcs meet straights
+BRAKING: Final = 0.8  # share of the budget that is used to slow down
+STRAIGHTEST: Final = 1.0 / 400.0  # [1/m] no road is straighter than this to a driver's speed
+YIELD_M: Final = 16.0  # v²/q within a junction, where one looks left and right: 6 to 9 m/s
+HANDLE: Final = 0.39  # of the chord: a cubic Bezier curve of 90 degrees is then nearly a circle
+
+
+class L(IntEnum):
+    """Columns of a lane point."""
+
+    X = 0  # [m]
+    Y = 1
+    COS = 2  # of the heading
+    SIN = 3
+    CURVATURE = 4  # [1/m], positive to the left
+    PROFILE = 5  # [m] for each way to go on, as many columns as MOST_WAYS
+
+
+MOST_WAYS: Final = 3
+
+
+@dataclass(frozen=True)
+class Road:
+    """A road between two junctions, straight from bend to bend, each bend an arc of `radius` [m]."""
+
+    start: str
+    end: str
+    bends: tuple[tuple[float, float], ...] = ()
+    radius: float = 35.0
+
+
+@dataclass(frozen=True)
+class Network:
+    """Lanes in one table of points, columns L (points, 8); lane k has `size[k]` points from `first[k]` on.
+
+    `ways[k]` (MOST_WAYS,) are the lanes one may go on to, -1 where there are fewer; `spacing[k]` [m] between points.
+    Lanes before number `roads` are roads, the others connectors.
+    """
+
+    points: FloatArray
+    first: IntArray
+    size: IntArray
+    spacing: FloatArray
+    ways: IntArray
+    roads: int
+
+    @property
+    def road_length(self) -> float:
+        """Length of all roads [m], each counted once."""
+        return float(((self.size - 1) * self.spacing)[: self.roads].sum() / 2.0)
+
+    def lane(self, k: int) -> FloatArray:
+        """The points of lane k."""
+        return self.points[self.first[k] : self.first[k] + self.size[k]]
+
+
+def build_network(junctions: dict[str, tuple[float, float]], roads: tuple[Road, ...]) -> Network:
+    """Lanes and connectors of the roads between `junctions` (name -> (x, y) [m]).
+
+    Raises:
+        InputError: a road leads to an unknown junction, or a junction leaves a lane without a way on or with too many.
+    """
+    lanes: list[FloatArray] = []
+    leaves: list[tuple[str, int]] = []  # junction where the lane begins, and its road
+    arrives: list[str] = []
+    for number, road in enumerate(roads):
+        for name in (road.start, road.end):
+            if name not in junctions:
+                raise InputError("roads", f"road {number} leads to {name!r}", f"use one of {', '.join(junctions)}")
+        centre = rounded([junctions[road.start], *road.bends, junctions[road.end]], road.radius)
+        centre = centre[_within(centre, SETBACK_M)]
+        for line, start, end in ((centre, road.start, road.end), (centre[::-1], road.end, road.start)):
+            lanes.append(resampled(shifted_right(line, LANE_OFFSET_M)))
+            leaves.append((start, number))
+            arrives.append(end)
+    count = len(lanes)
+    ways: list[list[int]] = [[] for _ in range(count)]
+    for k in range(count):
+        for j, (junction, number) in enumerate(leaves[:count]):
+            if junction == arrives[k] and number != k // 2:
+                ways[k].append(len(lanes))
+                lanes.append(connector(lanes[k], lanes[j]))
+                ways.append([j])
+        if not 1 <= len(ways[k]) <= MOST_WAYS:
+            raise InputError("roads", f"lane {k} has {len(ways[k])} ways to go on", f"join 2 to {MOST_WAYS + 1} roads")
+    return _network(lanes, ways, count)
+
+
+def rounded(corners: list[tuple[float, float]], radius: float) -> FloatArray:
+    """A line through the corners whose inner ones are arcs of `radius`, points a quarter of a metre apart, (n, 2)."""
+    line = [np.array(corners[0])]
+    for before, corner, after in zip(corners[:-2], corners[1:-1], corners[2:], strict=True):
+        p = np.array(corner)
+        a, b = _unit(np.array(before) - p), _unit(np.array(after) - p)
+        half = math.acos(float(np.clip(a @ b, -1.0, 1.0))) / 2.0  # half the angle between the legs
+        centre = p + _unit(a + b) * radius / math.sin(half)
+        start, end = p + a * radius / math.tan(half), p + b * radius / math.tan(half)
+        swept = math.pi - 2.0 * half
+        turn = math.copysign(1.0, float(a[1] * b[0] - a[0] * b[1]))
+        spoke = start - centre
+        for angle in np.linspace(0.0, swept * turn, max(2, round(radius * swept / 0.25))):
+            c, s = math.cos(angle), math.sin(angle)
+            line.append(centre + np.array([c * spoke[0] - s * spoke[1], s * spoke[0] + c * spoke[1]]))
+        line[-1] = end
+    line.append(np.array(corners[-1]))
+    return resampled(np.array(line), 0.25)
+
+
+def resampled(line: FloatArray, spacing: float = SPACING_M) -> FloatArray:
+    """The same line with equally spaced points, about `spacing` [m] apart, ends kept."""
+    run = _run(line)
+    even = np.linspace(0.0, run[-1], max(2, round(run[-1] / spacing) + 1))
+    return np.column_stack([np.interp(even, run, line[:, 0]), np.interp(even, run, line[:, 1])])
+
+
+def shifted_right(line: FloatArray, offset: float) -> FloatArray:
+    """The line moved to its right by `offset` [m]."""
+    direction = np.gradient(line, axis=0)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return line + offset * np.column_stack([direction[:, 1], -direction[:, 0]])
+
+
+def connector(arriving: FloatArray, leaving: FloatArray) -> FloatArray:
+    """The way through a junction: a cubic Bezier curve that leaves one lane and joins the other without a kink."""
+    p0, p3 = arriving[-1], leaving[0]
+    handle = HANDLE * float(np.linalg.norm(p3 - p0))
+    p1, p2 = p0 + handle * _unit(arriving[-1] - arriving[-2]), p3 - handle * _unit(leaving[1] - leaving[0])
+    u = np.linspace(0.0, 1.0, 200)[:, None]
+    return resampled((1 - u) ** 3 * p0 + 3 * (1 - u) ** 2 * u * p1 + 3 * (1 - u) * u**2 * p2 + u**3 * p3)
+
+
+def _unit(v: FloatArray) -> FloatArray:
+    unit: FloatArray = v / np.linalg.norm(v)
+    return unit
+
+
+def _run(line: FloatArray) -> FloatArray:
+    """Distance along a line at each of its points."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+
+
+def _within(line: FloatArray, setback: float) -> IntArray:
+    """Indices of the points that are at least `setback` from both ends."""
+    run = _run(line)
+    return np.flatnonzero((run >= setback) & (run <= run[-1] - setback))
+
+
+def _network(lanes: list[FloatArray], ways: list[list[int]], roads: int) -> Network:
+    size = np.array([len(lane) for lane in lanes])
+    spacing = np.array([_run(lane)[-1] / (len(lane) - 1) for lane in lanes])
+    onward = np.full((len(lanes), MOST_WAYS), -1)
+    for k, targets in enumerate(ways):
+        onward[k, : len(targets)] = targets
+    tables = [_lane_table(lane) for lane in lanes]
+    limits = [np.maximum(np.abs(table[:, L.CURVATURE]), STRAIGHTEST) ** -1 for table in tables]
+    for k in range(roads, len(lanes)):
+        limits[k] = np.minimum(limits[k], YIELD_M)
+    _plan(tables, limits, ways, spacing)
+    return Network(np.concatenate(tables), np.cumsum(size) - size, size, spacing, onward, roads)
+
+
+def _lane_table(lane: FloatArray) -> FloatArray:
+    """Points of one lane with heading and smoothed curvature; the profile is still empty."""
+    step = np.gradient(lane, axis=0)
+    heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+    width = int(SMOOTHING_M / SPACING_M)
+    padded = np.pad(np.gradient(heading) / np.linalg.norm(step, axis=1), width // 2, mode="edge")
+    curvature = np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
+    empty = np.full((len(lane), MOST_WAYS), np.inf)
+    return np.column_stack([lane, np.cos(heading), np.sin(heading), curvature, empty])
+
+
+def _plan(tables: list[FloatArray], limits: list[FloatArray], ways: list[list[int]], spacing: FloatArray) -> None:
+    """Fill the profiles from their ends backwards until nothing changes.
+
+    No point may need more braking than the budget leaves beside the cornering there.
+    """
+    while True:
+        before = [table[0, L.PROFILE :].copy() for table in tables]
+        for k, table in enumerate(tables):
+            for way, target in enumerate(ways[k]):
+                allowed = float(tables[target][0, L.PROFILE :].min())
+                for i in range(len(table) - 1, -1, -1):
+                    allowed = min(allowed, float(limits[k][i]))
+                    table[i, L.PROFILE + way] = allowed
+                    across = min(allowed * abs(float(table[i, L.CURVATURE])), 1.0)
+                    allowed += 2.0 * BRAKING * math.sqrt(1.0 - across * across) * spacing[k]
+        if all(np.array_equal(old, table[0, L.PROFILE :]) for old, table in zip(before, tables, strict=True)):
+            return

@@ -1,0 +1,1 @@
+"""Cost of each part on this machine; `make bench`."""
