@@ -1,0 +1,45 @@
+"""Fuzzy inference from the innovation mismatch to a bounded factor on the measurement noise.
+
+Legend
+    nu2         actual innovation variance, averaged over a window [unit^2]
+    s           theoretical innovation variance (state and measurement noise), same window [unit^2]
+    mismatch    nu2/s - 1 [1]
+    factor      R over its nominal value [1], within [LEAST_FACTOR, LARGEST_FACTOR]
+
+Where the actual variance exceeds the theoretical one, R grows: paper 004, equations 29 to 31, with the direction of the
+errata, and with bounds that the paper lacks.
+"""
+
+from __future__ import annotations
+
+import math
+
+from schemas.numeric import FloatArray, compiled
+
+LEAST_FACTOR = 0.3
+LARGEST_FACTOR = 10.0
+
+
+@compiled
+def infer(mismatch: float, inputs: FloatArray, outputs: FloatArray) -> float:
+    """Log multiplier [nat]: the outputs (5,) weighted by the triangular memberships of the mismatch at peaks inputs (5,).
+
+    Triangles that meet at each other's peaks make the weighted mean a straight line between neighbours.
+    """
+    last = inputs.shape[0] - 1
+    if mismatch <= inputs[0]:
+        return outputs[0]
+    for k in range(last):
+        if mismatch < inputs[k + 1]:
+            share = (mismatch - inputs[k]) / (inputs[k + 1] - inputs[k])
+            return (1.0 - share) * outputs[k] + share * outputs[k + 1]
+    return outputs[last]
+
+
+@compiled
+def adapted(factor: float, actual: float, theoretical: float, inputs: FloatArray, outputs: FloatArray) -> float:
+    """The next factor on R: factor*exp(infer(actual/theoretical - 1)), bounded."""
+    if not theoretical > 0.0:
+        return factor
+    step = infer(actual / theoretical - 1.0, inputs, outputs)
+    return min(max(factor * math.exp(step), LEAST_FACTOR), LARGEST_FACTOR)

@@ -1,0 +1,248 @@
+"""One sample of one vehicle: sums of the block, and at the block's end one turn of the mixture.
+
+Order at the end of a block: road change per metre and re-injection, measurement update of every node at the state of the
+block's beginning, reweighing with the evidence tempered by demand, adaptation of R, prediction to the block's end.
+Between ends of blocks the velocity is carried on by the same exact kinematics.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from edge_agent.adaptation.fuzzy import adapted
+from edge_agent.dynamics.parameters import P
+from edge_agent.estimators import flags
+from edge_agent.estimators.block import F, block_features
+from edge_agent.estimators.constants import C, X
+from edge_agent.estimators.memory import INPUTS, RING, H, Memory
+from edge_agent.estimators.mixture import moments, predict_node, reinject, update_node
+from edge_agent.estimators.nodes import change_road, quantile, reweigh
+from edge_agent.estimators.residuals import gained
+from edge_agent.estimators.sample import start, take_sample
+from schemas.numeric import FloatArray, compiled
+
+SLIDING_THETA = 3.0  # normalised slip beyond the peak of every passenger tyre's curve
+EXCITED_S = 1.0  # memory of the grip used
+
+
+class Design(NamedTuple):
+    """What does not change while driving: tables that the kernels read."""
+
+    constants: FloatArray  # (len(C),)
+    mu: FloatArray  # (K,)
+    prior: FloatArray  # (K,)
+    xi: FloatArray  # (points, n)
+    w_cov: FloatArray  # (points,)
+    inputs: FloatArray  # (5,) fuzzy sets
+    outputs: FloatArray  # (5,)
+    scales: FloatArray  # (2,) on nominal variances
+    adaptive: bool
+
+
+class Scratch(NamedTuple):
+    """Arrays that a kernel writes before it reads them."""
+
+    features: FloatArray
+    loads: FloatArray
+    spin: FloatArray
+    at_force: FloatArray
+    points: FloatArray
+    outcomes: FloatArray
+    innovation: FloatArray
+    theoretical: FloatArray
+    noise: FloatArray
+    process: FloatArray
+    gain: FloatArray
+    log_likelihood: FloatArray
+    plain: FloatArray
+    predicted: FloatArray
+    sums: FloatArray
+    scales: FloatArray
+    work: FloatArray
+
+
+@compiled
+def finish_block(memory: Memory, design: Design, scratch: Scratch, row: FloatArray, n: int) -> None:
+    """Close the block of vehicle n and begin the next at the same instant."""
+    held, constants = memory.held[n], design.constants
+    duration = held[H.TIME] - held[H.BLOCK_TIME]
+    speed = abs(memory.all_mean[n, X.VX])
+    scratch.scales[0] = design.scales[0] * memory.factor[n, 0]
+    scratch.scales[1] = design.scales[1] * memory.factor[n, 1]
+    health = block_features(
+        row, constants, scratch.scales, held, memory.side[n], memory.gain_sum[n], memory.sums[n], memory.counts[n], memory.start_omega[n],
+        memory.last_omega[n], memory.last_delta[n], duration, speed, scratch.loads, scratch.spin, scratch.features,
+    )  # fmt: skip
+    _road(memory, design, scratch, n, speed * duration)
+    _measure(memory, design, scratch, row, n, duration)
+    _predict(memory, design, scratch, n, duration, speed)
+    _conclude(memory, design, scratch, row, n, health)
+
+
+@compiled
+def _road(memory: Memory, design: Design, scratch: Scratch, n: int, metres: float) -> None:
+    hazard = 1.0 - math.exp(-metres * design.constants[C.HAZARD])
+    drift = min(metres * design.constants[C.DIFFUSION] * design.mu.shape[0], 0.5)
+    change_road(memory.weight[n], design.prior, hazard, drift, scratch.predicted)
+    for j in range(design.mu.shape[0]):
+        zeta = min(hazard * design.prior[j] / scratch.predicted[j], 1.0)
+        reinject(memory.mean[n, j], memory.root[n, j], zeta, memory.all_mean[n], memory.all_root[n], scratch.work)
+        memory.weight[n, j] = scratch.predicted[j]
+    change_road(memory.visit[n], design.prior, hazard, drift, scratch.predicted)
+    for j in range(design.mu.shape[0]):
+        memory.visit[n, j] = scratch.predicted[j]
+
+
+@compiled
+def _measure(memory: Memory, design: Design, scratch: Scratch, row: FloatArray, n: int, duration: float) -> None:
+    """Update all nodes, reweigh, adapt, and note NIS and the predictive log-likelihood."""
+    held, constants = memory.held[n], design.constants
+    inflation = max(constants[C.CORRELATION] / duration, 1.0)
+    count = design.mu.shape[0]
+    for g in range(4):
+        scratch.sums[g] = 0.0
+    best = top = -math.inf
+    nis = rows = 0.0
+    for j in range(count):
+        loglik, plain, square, used = update_node(
+            row, constants, design.mu[j], memory.mean[n, j], memory.root[n, j], scratch.features, inflation,
+            design.xi, design.w_cov, scratch.at_force, scratch.points, scratch.outcomes, scratch.innovation,
+            scratch.theoretical, scratch.noise, scratch.work,
+        )  # fmt: skip
+        scratch.log_likelihood[j], scratch.plain[j] = loglik, plain + math.log(memory.weight[n, j])
+        best, top = max(best, loglik), max(top, scratch.plain[j])
+        nis += memory.weight[n, j] * square
+        rows = used
+        for r in range(6):
+            if not math.isnan(scratch.innovation[r]):
+                group = 0 if r < 4 else 1
+                scratch.sums[group] += memory.weight[n, j] * scratch.innovation[r] ** 2
+                scratch.sums[2 + group] += memory.weight[n, j] * scratch.theoretical[r]
+    total = 0.0
+    for j in range(count):
+        total += math.exp(scratch.plain[j] - top)
+    held[H.LOG_LIKELIHOOD] = top + math.log(total) if rows > 0 else 0.0
+    held[H.NIS] = nis / rows if rows > 0 else 0.0
+    need = (constants[C.DEMAND_HALF] / max(scratch.features[F.DEMAND], 1e-3)) ** constants[C.DEMAND_POWER]
+    share = novelty(memory.usual[n], scratch.features, constants, duration) / (1.0 + need)
+    for j in range(count):
+        scratch.log_likelihood[j] = max(share * (scratch.log_likelihood[j] - best), -constants[C.LARGEST_LOSS])
+    reweigh(memory.weight[n], scratch.log_likelihood)
+    reweigh(memory.visit[n], scratch.log_likelihood)
+    keep = math.exp(-duration / constants[C.WINDOW])
+    for group in range(2):
+        if scratch.sums[2 + group] > 0.0:
+            memory.actual[n, group] = keep * memory.actual[n, group] + (1.0 - keep) * scratch.sums[group]
+            memory.theoretical[n, group] = keep * memory.theoretical[n, group] + (1.0 - keep) * scratch.sums[2 + group]
+            if design.adaptive:
+                memory.factor[n, group] = adapted(
+                    memory.factor[n, group], memory.actual[n, group], memory.theoretical[n, group],
+                    design.inputs, design.outputs,
+                )  # fmt: skip
+
+
+@compiled
+def novelty(usual: FloatArray, features: FloatArray, constants: FloatArray, duration: float) -> float:
+    """Share of the evidence that is new."""
+    keep = math.exp(-duration / constants[C.NOVEL_TIME])
+    square = 0.0
+    for r in range(6):
+        force = features[F.FORCE + r] if r < 4 else features[F.SIDE + r - 4]
+        if not math.isnan(force):
+            usual[r] = keep * usual[r] + (1.0 - keep) * force
+            square = max(square, (force - usual[r]) ** 2)
+    least = constants[C.NOVEL_LEAST]
+    return least + (1.0 - least) * square / (square + constants[C.NOVEL_HALF] ** 2)
+
+
+@compiled
+def _predict(memory: Memory, design: Design, scratch: Scratch, n: int, duration: float, speed: float) -> None:
+    held, constants, process = memory.held[n], design.constants, scratch.process
+    ax = abs(held[H.AX])
+    drift_x = constants[C.DRIFT_X] ** 2 + (constants[C.AX_SHARE] * ax) ** 2 + held[H.MISSING_AX]
+    drift_y = constants[C.DRIFT_Y] ** 2 + (constants[C.YAW_RATE_OFFSET] * speed) ** 2 + held[H.MISSING_AY]
+    process[X.VX], process[X.VY] = math.sqrt(drift_x * duration), math.sqrt(drift_y * duration)
+    spread_k = constants[C.STIFFNESS_STD] * math.sqrt(1.0 - math.exp(-2.0 * duration / constants[C.STIFFNESS_TIME]))
+    spread_l = math.sqrt(1.0 - math.exp(-2.0 * duration / constants[C.LEAK_TIME]))
+    process[X.LN_KR] = spread_k * constants[C.REAR_STD] / constants[C.STIFFNESS_STD]
+    process[X.LN_KX] = process[X.LN_KY] = spread_k
+    process[X.LEAK_Y] = constants[C.LEAK_STD] * spread_l
+    process[X.LEAK_X] = constants[C.LEAK_X_STD] * spread_l
+    process[X.BIAS_X] = process[X.BIAS_Y] = constants[C.BIAS_STD] * math.sqrt(
+        1.0 - math.exp(-2.0 * duration / constants[C.BIAS_TIME])
+    )
+    for k in range(8):
+        scratch.gain[k] = memory.gain[n, k // 2, k % 2]
+    cos, sin = math.cos(held[H.ANGLE]), math.sin(held[H.ANGLE])
+    for j in range(design.mu.shape[0]):
+        predict_node(
+            memory.mean[n, j], memory.root[n, j], constants, cos, sin, scratch.gain, process, duration, scratch.work
+        )
+    moments(memory.mean[n], memory.root[n], memory.weight[n], memory.all_mean[n], memory.all_root[n], scratch.work)
+
+
+@compiled
+def _conclude(memory: Memory, design: Design, scratch: Scratch, row: FloatArray, n: int, health: int) -> None:
+    """Quantiles, grip used in the last second, health; and the next block begins."""
+    held = memory.held[n]
+    held[H.MU] = quantile(design.mu, design.prior, memory.weight[n], 0.5)
+    held[H.MU_LOWER] = quantile(design.mu, design.prior, memory.weight[n], 0.05)
+    held[H.MU_UPPER] = quantile(design.mu, design.prior, memory.weight[n], 0.95)
+    place = int(held[H.RING_NEXT])
+    memory.ring_time[n, place], memory.ring_used[n, place] = held[H.TIME], scratch.features[F.DEMAND]
+    held[H.RING_NEXT] = (place + 1) % RING
+    used = 0.0
+    for k in range(RING):
+        if memory.ring_time[n, k] > held[H.TIME] - EXCITED_S:
+            used = max(used, memory.ring_used[n, k])
+    held[H.USED] = used
+    speed = max(abs(memory.all_mean[n, X.VX]), 1.0)
+    for wheel in range(4):
+        along = scratch.features[F.ROLL + wheel] - memory.all_mean[n, X.VX]
+        if row[P.SLOPE_X] * abs(along) / speed > SLIDING_THETA * held[H.MU]:
+            health |= flags.SLIDING
+    held[H.HEALTH] = health
+    begin_block(memory, n)
+
+
+@compiled
+def begin_block(memory: Memory, n: int) -> None:
+    """Empty the sums of vehicle n; the block begins at the last sample."""
+    held = memory.held[n]
+    held[H.BLOCK_TIME] = held[H.TIME]
+    for k in range(H.ANGLE, H.SAMPLES + 1):
+        held[k] = 0.0
+    memory.gain[n] = 0.0
+    memory.gain_sum[n] = 0.0
+    held[H.MISSING_AX] = held[H.MISSING_AY] = 0.0
+    held[H.START_YAW_RATE] = held[H.YAW_RATE]
+    for c in range(INPUTS):
+        memory.sums[n, c] = 0.0
+        memory.counts[n, c] = 0
+    for wheel in range(4):
+        memory.start_omega[n, wheel] = memory.last_omega[n, wheel]
+
+
+@compiled
+def step(
+    memory: Memory, design: Design, scratch: Scratch, row: FloatArray, n: int, time: float, sample: FloatArray
+) -> int:
+    """Take one sample (18,) of vehicle n; returns health flags of this sample alone."""
+    if not memory.started[n]:
+        return start(memory, design.constants, design.mu, design.prior, row, n, time, sample) | flags.RESET
+    health, whole = take_sample(memory, design.constants, design.prior, row, n, time, sample)
+    if whole:
+        finish_block(memory, design, scratch, row, n)
+    return health
+
+
+@compiled
+def velocity(memory: Memory, n: int) -> tuple[float, float]:
+    """(v_x, v_y) [m/s] of the mixture now."""
+    x, gain = memory.all_mean[n], memory.gain[n].ravel()
+    cos, sin = math.cos(memory.held[n, H.ANGLE]), math.sin(memory.held[n, H.ANGLE])
+    return (
+        cos * x[X.VX] + sin * x[X.VY] + gained(gain, 0, x, 0),
+        cos * x[X.VY] - sin * x[X.VX] + gained(gain, 0, x, 1),
+    )

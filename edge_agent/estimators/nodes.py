@@ -1,0 +1,107 @@
+"""The friction hypotheses: a fixed grid of nodes, its prior, road change, quantiles and evidence.
+
+Legend
+    mu          node values, equidistant in sqrt(mu)              (K,)
+    prior       mass of a uniform prior on [.05, 1.20] per node    (K,)
+    w           probabilities of the nodes                        (K,)
+    density     w/prior, the posterior over the uniform prior, linear between nodes
+    h           share of the mass that changes to anywhere, from the hazard per metre [1]
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from schemas.mugrid import LOWER, UPPER
+from schemas.numeric import FloatArray, compiled
+
+SMALLEST = 1e-12  # a probability that the re-injection of road change will raise again
+
+
+def node_table(count: int) -> tuple[FloatArray, FloatArray]:
+    """(mu, prior), (K,) each: middles in sqrt(mu) of K equal cells, and the uniform mass of each cell."""
+    edges = np.linspace(math.sqrt(LOWER), math.sqrt(UPPER), count + 1)
+    middle = 0.5 * (edges[:-1] + edges[1:])
+    return middle**2, np.diff(edges**2) / (UPPER - LOWER)
+
+
+@compiled
+def change_road(w: FloatArray, prior: FloatArray, hazard: float, drift: float, out: FloatArray) -> None:
+    """out = w after a change to anywhere with probability hazard and to a neighbour with probability about drift.
+
+    The exchange between neighbours is in detailed balance with the prior, which therefore stays what it is.
+    """
+    count = w.shape[0]
+    for j in range(count):
+        out[j] = w[j]
+    for j in range(count - 1):
+        least = min(prior[j], prior[j + 1])
+        flow = 0.5 * drift * least * (w[j] / prior[j] - w[j + 1] / prior[j + 1])
+        out[j] -= flow
+        out[j + 1] += flow
+    for j in range(count):
+        out[j] = max((1.0 - hazard) * out[j] + hazard * prior[j], SMALLEST)
+
+
+@compiled
+def reweigh(w: FloatArray, log_likelihood: FloatArray) -> None:
+    """w *= exp(log_likelihood), normalised; log_likelihood (K,) with maximum 0 or below."""
+    total = 0.0
+    for j in range(w.shape[0]):
+        w[j] = max(w[j] * math.exp(log_likelihood[j]), SMALLEST)
+        total += w[j]
+    for j in range(w.shape[0]):
+        w[j] /= total
+
+
+@compiled
+def quantile(mu: FloatArray, prior: FloatArray, w: FloatArray, q: float) -> float:
+    """The q-quantile of mu under the density that is linear between nodes and level beyond the outer ones."""
+    count = mu.shape[0]
+    total = 0.0
+    for j in range(count + 1):
+        total += _segment(mu, prior, w, j)
+    target = q * total
+    for j in range(count + 1):
+        mass = _segment(mu, prior, w, j)
+        if target <= mass or j == count:
+            left = LOWER if j == 0 else mu[j - 1]
+            right = UPPER if j == count else mu[j]
+            first = w[0] / prior[0] if j == 0 else w[j - 1] / prior[j - 1]
+            last = w[count - 1] / prior[count - 1] if j == count else w[j] / prior[j]
+            slope = (last - first) / (right - left)
+            root = math.sqrt(max(first * first + 2.0 * slope * target, 0.0))
+            return min(left + 2.0 * target / max(first + root, SMALLEST), right)
+        target -= mass
+    return UPPER
+
+
+@compiled
+def _segment(mu: FloatArray, prior: FloatArray, w: FloatArray, j: int) -> float:
+    """Mass between nodes j - 1 and j (with the ends of the range for nodes -1 and K)."""
+    count = mu.shape[0]
+    if j == 0:
+        return (mu[0] - LOWER) * w[0] / prior[0]
+    if j == count:
+        return (UPPER - mu[count - 1]) * w[count - 1] / prior[count - 1]
+    return 0.5 * (mu[j] - mu[j - 1]) * (w[j - 1] / prior[j - 1] + w[j] / prior[j])
+
+
+@compiled
+def evidence(mu: FloatArray, prior: FloatArray, w: FloatArray, centres: FloatArray, out: FloatArray) -> None:
+    """out = log(w/prior) at the centres (32,), linear between nodes, maximum 0."""
+    count = mu.shape[0]
+    top = -math.inf
+    j = 0
+    for i in range(centres.shape[0]):
+        while j < count - 1 and mu[j + 1] < centres[i]:
+            j += 1
+        k = min(j + 1, count - 1)
+        first, last = math.log(w[j] / prior[j]), math.log(w[k] / prior[k])
+        share = 0.0 if k == j else min(max((centres[i] - mu[j]) / (mu[k] - mu[j]), 0.0), 1.0)
+        out[i] = (1.0 - share) * first + share * last
+        top = max(top, out[i])
+    for i in range(centres.shape[0]):
+        out[i] -= top

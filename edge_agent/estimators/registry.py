@@ -1,0 +1,70 @@
+"""The estimators by name.
+
+`aco-fckf`, `fckf` and `ckf` are one filter: a Rao-Blackwellised mixture over friction with square-root cubature filters as
+its nodes. They differ in the fuzzy adaptation of the measurement noise: tuned by the ant colony, untuned, none. Departures
+from paper 004, whose family it is: kinematic prediction, wheel speed as a measurement, force from torque, residuals by
+total least squares, friction as a mixture instead of a state, stiffness and leak as states, bounded adaptation in the
+direction of the errata.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from edge_agent.adaptation.memberships import Memberships, load_memberships
+from edge_agent.dynamics.parameters import parameter_table
+from edge_agent.estimators.advance import Design
+from edge_agent.estimators.bank import EstimatorBank
+from edge_agent.estimators.constants import NODES, STATES, constant_row
+from edge_agent.estimators.nodes import node_table
+from edge_agent.filters.sigma import cubature
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+from schemas.vehicle import Vehicle
+
+ESTIMATORS = {
+    "aco-fckf": "default: friction mixture of cubature filters, fuzzy noise adaptation tuned by the ant colony",
+    "fckf": "the same with untuned memberships",
+    "ckf": "the same without adaptation",
+}
+TUNED = Path(__file__).parents[1] / "tuning" / "tuned" / "aco-fckf.json"
+
+
+def design_of(memberships: Memberships, *, adaptive: bool, constants: FloatArray | None = None) -> Design:
+    """The tables of a filter; `constants` (len(C),) replaces the table of constants in studies."""
+    mu, prior = node_table(NODES)
+    rule = cubature(STATES)
+    return Design(
+        constants=constant_row() if constants is None else constants,
+        mu=mu,
+        prior=prior,
+        xi=rule.xi,
+        w_cov=rule.w_cov,
+        inputs=np.array(memberships.inputs),
+        outputs=np.array(memberships.outputs),
+        scales=np.exp(np.array(memberships.ln_scales)),
+        adaptive=adaptive,
+    )
+
+
+def create(name: str, vehicles: Sequence[Vehicle], *, memberships: Memberships | None = None) -> EstimatorBank:
+    """A bank of estimators `name`, one per vehicle.
+
+    Args:
+        name: a key of ESTIMATORS.
+        vehicles: nominal vehicles, N of them.
+        memberships: replaces the estimator's own; for tuning and studies.
+
+    Raises:
+        InputError: the name is unknown, no vehicle is given, or the tuned memberships cannot be read.
+    """
+    if name not in ESTIMATORS:
+        raise InputError("estimator", f"{name!r} is unknown", f"choose one of {', '.join(ESTIMATORS)}")
+    if not vehicles:
+        raise InputError("vehicles", "none given", "give at least one vehicle")
+    if memberships is None:
+        memberships = load_memberships(TUNED) if name == "aco-fckf" else Memberships()
+    return EstimatorBank(parameter_table(vehicles), design_of(memberships, adaptive=name != "ckf"))

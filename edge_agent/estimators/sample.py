@@ -1,0 +1,263 @@
+"""Taking a sample in: refusal of the impossible, the yaw-rate filter, the kinematics and sums of the block.
+
+Missing readings and what replaces them: a_x by zero and a_y by r*v_x, both with a random walk to match; yaw rate by the
+difference of the rear wheels; steering by its last value; the rest is left out of the sums.
+"""
+
+from __future__ import annotations
+
+import math
+
+from edge_agent.dynamics.body import advance_velocity
+from edge_agent.dynamics.parameters import P
+from edge_agent.estimators import flags
+from edge_agent.estimators.constants import C, X
+from edge_agent.estimators.memory import INPUTS, G, H, Memory
+from edge_agent.estimators.nodes import quantile
+from schemas.numeric import FloatArray, compiled
+from schemas.signals import S
+
+# beyond these a reading is an error of the sensor, not of the driver
+LARGEST_ACCELERATION = 40.0  # [m/s^2]
+LARGEST_YAW_RATE = 6.0  # [rad/s]
+LARGEST_STEER = 1.3  # [rad]
+LARGEST_OMEGA = 500.0  # [rad/s]
+LARGEST_TORQUE = 50_000.0  # [N m]
+
+GAP_S = 0.5  # a longer silence starts the block anew
+POSITION_S = 1.5  # a longer silence of the receiver is told
+EARLY_S = 1e-6  # a block is whole although rounding made its last sample early
+YAW_WALK = 3.0  # [rad/s/s^.5] yaw acceleration of a lively car as a random walk
+YAW_STD = 0.002  # [rad/s] white noise of a gyroscope sample
+REAR_STD = 0.03  # [rad/s] yaw rate from the rear wheels: noise and slip difference
+LOST_AX = 2.0  # [m/s/s^.5] random walk without a_x
+LOST_AY = 0.7  # [m/s/s^.5] random walk without a_y or yaw rate
+GAP_ACCELERATION = 2.0  # [m/s^2] that may have acted during a silence
+FIRST_VX_STD, FIRST_VY_STD = 0.3, 0.3  # [m/s]
+UNKNOWN_VX_STD = 15.0  # [m/s] without any wheel speed
+START_LEAST_STD = 1e-3
+
+
+@compiled
+def limit(channel: int) -> float:
+    """Largest believable size of a reading on a channel before the position."""
+    if channel < S.YAW_RATE:
+        return LARGEST_ACCELERATION
+    if channel < S.DELTA:
+        return LARGEST_YAW_RATE
+    if channel < S.OMEGA:
+        return LARGEST_STEER
+    return LARGEST_OMEGA if channel < S.TORQUE else LARGEST_TORQUE
+
+
+@compiled
+def reading(sample: FloatArray, channel: int) -> float:
+    """The reading, or NaN where it is missing, infinite or unbelievable."""
+    value = sample[channel]
+    return value if abs(value) <= limit(channel) else math.nan
+
+
+@compiled
+def rolling_speed(row: FloatArray, sample: FloatArray) -> float:
+    """Second largest rolling speed [m/s] (two wheels may be locked, one may spin); NaN without any wheel."""
+    first = second = math.nan
+    for wheel in range(4):
+        speed = row[P.RADIUS] * reading(sample, S.OMEGA + wheel)
+        if math.isnan(speed):
+            continue
+        if math.isnan(first) or speed > first:
+            first, second = speed, first
+        elif math.isnan(second) or speed > second:
+            second = speed
+    return first if math.isnan(second) else second
+
+
+@compiled
+def start(
+    memory: Memory,
+    constants: FloatArray,
+    mu: FloatArray,
+    prior: FloatArray,
+    row: FloatArray,
+    n: int,
+    time: float,
+    sample: FloatArray,
+) -> int:
+    """Begin vehicle n at its first sample with a finite time."""
+    if not math.isfinite(time):
+        return flags.TIME_GAP
+    held = memory.held[n]
+    for k in range(held.shape[0]):
+        held[k] = 0.0
+    held[H.TIME] = held[H.BLOCK_TIME] = time
+    held[H.POSITION_TIME] = -math.inf
+    rate = reading(sample, S.YAW_RATE)
+    held[H.YAW_RATE] = held[H.START_YAW_RATE] = 0.0 if math.isnan(rate) else rate
+    held[H.YAW_RATE_VAR] = 1.0 if math.isnan(rate) else YAW_STD**2
+    for wheel in range(4):
+        memory.start_omega[n, wheel] = memory.last_omega[n, wheel] = reading(sample, S.OMEGA + wheel)
+        angle = reading(sample, S.DELTA + wheel)
+        memory.last_delta[n, wheel] = 0.0 if math.isnan(angle) else angle
+    speed = rolling_speed(row, sample)
+    known = not math.isnan(speed)
+    memory.all_mean[n, X.VX] = speed if known else 0.0
+    memory.all_mean[n, X.LEAK_Y], memory.all_mean[n, X.LEAK_X] = constants[C.LEAK_MEAN], constants[C.LEAK_X_MEAN]
+    root = memory.all_root[n]
+    root[X.VX, X.VX] = FIRST_VX_STD if known else UNKNOWN_VX_STD
+    root[X.VY, X.VY] = FIRST_VY_STD
+    root[X.LN_KX, X.LN_KX] = root[X.LN_KY, X.LN_KY] = constants[C.STIFFNESS_STD]
+    root[X.LEAK_Y, X.LEAK_Y], root[X.LEAK_X, X.LEAK_X] = constants[C.LEAK_STD], constants[C.LEAK_X_STD]
+    root[X.LN_KR, X.LN_KR] = constants[C.REAR_STD]
+    root[X.BIAS_X, X.BIAS_X] = root[X.BIAS_Y, X.BIAS_Y] = constants[C.BIAS_STD]
+    for j in range(prior.shape[0]):
+        memory.weight[n, j] = memory.visit[n, j] = prior[j]
+        memory.mean[n, j] = memory.all_mean[n]
+        memory.root[n, j] = root
+    held[H.MU] = quantile(mu, prior, prior, 0.5)
+    held[H.MU_LOWER] = quantile(mu, prior, prior, 0.05)
+    held[H.MU_UPPER] = quantile(mu, prior, prior, 0.95)
+    memory.gain[n] = 0.0
+    memory.gain_sum[n] = 0.0
+    memory.started[n] = True
+    return flags.OK
+
+
+@compiled
+def take_sample(
+    memory: Memory, constants: FloatArray, prior: FloatArray, row: FloatArray, n: int, time: float, sample: FloatArray
+) -> tuple[int, bool]:
+    """Add a sample to the block of vehicle n; returns its health flags and whether the block is whole."""
+    held = memory.held[n]
+    dt = time - held[H.TIME]
+    if not dt > 0.0:
+        return flags.TIME_GAP, False
+    health = _checks(memory, n, time, sample)
+    if dt > GAP_S:
+        return health | flags.TIME_GAP | _bridge(memory, constants, prior, row, n, time, sample), False
+    _yaw_rate(memory, row, n, dt, sample)
+    _kinematics(memory, n, dt, sample)
+    _add(memory, n, sample)
+    held[H.TIME] = time
+    return health, time - held[H.BLOCK_TIME] >= constants[C.BLOCK] - EARLY_S
+
+
+@compiled
+def _checks(memory: Memory, n: int, time: float, sample: FloatArray) -> int:
+    health = 0
+    for channel in range(INPUTS):
+        value = sample[channel]
+        if not math.isnan(value) and not abs(value) <= limit(channel):
+            health |= flags.OUTLIER
+    if math.isfinite(sample[S.LATITUDE]) and math.isfinite(sample[S.LONGITUDE]):
+        memory.held[n, H.POSITION_TIME] = time
+    if not time - memory.held[n, H.POSITION_TIME] <= POSITION_S:
+        health |= flags.NO_POSITION
+    if math.isnan(reading(sample, S.AX) + reading(sample, S.AY) + reading(sample, S.YAW_RATE)):
+        health |= flags.NO_INERTIAL
+    for wheel in range(4):
+        if math.isnan(reading(sample, S.OMEGA + wheel)):
+            health |= flags.NO_WHEEL_SPEED
+        if math.isnan(reading(sample, S.TORQUE + wheel)):
+            health |= flags.NO_TORQUE
+    return health
+
+
+@compiled
+def _yaw_rate(memory: Memory, row: FloatArray, n: int, dt: float, sample: FloatArray) -> None:
+    """Scalar Kalman filter: random walk, gyroscope, and the rear wheels where it is missing."""
+    held = memory.held[n]
+    variance = held[H.YAW_RATE_VAR] + YAW_WALK**2 * dt
+    value, noise = reading(sample, S.YAW_RATE), YAW_STD
+    if math.isnan(value):
+        left, right = reading(sample, S.OMEGA + 2), reading(sample, S.OMEGA + 3)
+        value, noise = row[P.RADIUS] * (right - left) / row[P.TRACK_REAR], REAR_STD
+    if math.isnan(value):
+        held[H.YAW_RATE_VAR] = min(variance, 1.0)
+        return
+    gain = variance / (variance + noise**2)
+    held[H.YAW_RATE] += gain * (value - held[H.YAW_RATE])
+    held[H.YAW_RATE_VAR] = gain * noise**2
+
+
+@compiled
+def _kinematics(memory: Memory, n: int, dt: float, sample: FloatArray) -> None:
+    """Velocity gained since the block began, in the axes of now: the exact solution for inputs constant over dt."""
+    held = memory.held[n]
+    rate = held[H.YAW_RATE]
+    ax, ay = reading(sample, S.AX), reading(sample, S.AY)
+    leak_x, leak_y = ax, ay
+    if math.isnan(ax):
+        ax = leak_x = 0.0
+        held[H.MISSING_AX] = LOST_AX**2
+    if math.isnan(ay) or math.isnan(reading(sample, S.YAW_RATE)):
+        held[H.MISSING_AY] = LOST_AY**2
+    if math.isnan(ay):
+        ay, leak_y = rate * memory.all_mean[n, X.VX], 0.0
+    held[H.AX], held[H.AY] = ax, ay
+    gain = memory.gain[n]
+    gain[G.INPUT] = advance_velocity(gain[G.INPUT, 0], gain[G.INPUT, 1], ax, ay, rate, dt)
+    gain[G.LEAK_X] = advance_velocity(gain[G.LEAK_X, 0], gain[G.LEAK_X, 1], leak_x, 0.0, rate, dt)
+    gain[G.LEAK_Y] = advance_velocity(gain[G.LEAK_Y, 0], gain[G.LEAK_Y, 1], 0.0, leak_y, rate, dt)
+    gain[G.UNIT] = advance_velocity(gain[G.UNIT, 0], gain[G.UNIT, 1], 1.0, 0.0, rate, dt)
+    held[H.ANGLE] += rate * dt
+    held[H.SUM_COS] += math.cos(held[H.ANGLE])
+    held[H.SUM_SIN] += math.sin(held[H.ANGLE])
+    memory.gain_sum[n] += gain
+    held[H.SAMPLES] += 1.0
+
+
+@compiled
+def _add(memory: Memory, n: int, sample: FloatArray) -> None:
+    for channel in range(INPUTS):
+        value = reading(sample, channel)
+        if not math.isnan(value):
+            memory.sums[n, channel] += value
+            memory.counts[n, channel] += 1
+    for wheel in range(4):
+        memory.last_omega[n, wheel] = reading(sample, S.OMEGA + wheel)
+        if memory.counts[n, S.DELTA + wheel] > 0:
+            memory.last_delta[n, wheel] = memory.sums[n, S.DELTA + wheel] / memory.counts[n, S.DELTA + wheel]
+            if wheel >= 2:
+                memory.held[n, H.REAR_STEERING] = 1.0
+
+
+@compiled
+def _bridge(
+    memory: Memory, constants: FloatArray, prior: FloatArray, row: FloatArray, n: int, time: float, sample: FloatArray
+) -> int:
+    """After a silence: the friction is forgotten over the metres driven meanwhile, the motion starts anew."""
+    held = memory.held[n]
+    gone = time - held[H.TIME]
+    hazard = 1.0 - math.exp(-abs(memory.all_mean[n, X.VX]) * gone * constants[C.HAZARD])
+    for j in range(prior.shape[0]):
+        memory.sums[n, 0] = 0.0
+        memory.weight[n, j] += hazard * (prior[j] - memory.weight[n, j])
+        memory.visit[n, j] += hazard * (prior[j] - memory.visit[n, j])
+    speed = rolling_speed(row, sample)
+    spread = min(GAP_ACCELERATION * gone, UNKNOWN_VX_STD)
+    if not math.isnan(speed):
+        memory.all_mean[n, X.VX], spread = speed, FIRST_VX_STD
+    memory.all_mean[n, X.VY] = 0.0
+    root = memory.all_root[n]
+    for i in range(root.shape[0]):
+        for axis in range(2):
+            root[i, axis] = 0.0
+    root[X.VX, X.VX], root[X.VY, X.VY] = spread, FIRST_VY_STD
+    for j in range(prior.shape[0]):
+        memory.mean[n, j] = memory.all_mean[n]
+        memory.root[n, j] = root
+    rate = reading(sample, S.YAW_RATE)
+    if not math.isnan(rate):
+        held[H.YAW_RATE], held[H.YAW_RATE_VAR] = rate, YAW_STD**2
+    held[H.TIME] = held[H.BLOCK_TIME] = time
+    for k in range(H.ANGLE, H.SAMPLES + 1):
+        held[k] = 0.0
+    memory.gain[n] = 0.0
+    memory.gain_sum[n] = 0.0
+    held[H.START_YAW_RATE] = held[H.YAW_RATE]
+    for channel in range(INPUTS):
+        memory.sums[n, channel] = 0.0
+        memory.counts[n, channel] = 0
+    for wheel in range(4):
+        memory.start_omega[n, wheel] = memory.last_omega[n, wheel] = reading(sample, S.OMEGA + wheel)
+    return flags.RESET

@@ -1,0 +1,93 @@
+"""Sigma rules: tables of points and weights that prove themselves when built.
+
+Legend
+    n           dimension of the state
+    xi          points of the rule for a standard normal variable         (points, n)
+    w_mean      weights of the mean                                       (points,)
+    w_cov       weights of the covariance                                 (points,)
+
+A rule integrates moments of the standard normal exactly: sum w = 1, sum w*xi = 0, sum w*xi*xi' = I.
+The points of a state with mean m and sqrt_cov L are m + L*xi.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+
+EXACTNESS = 1e-9  # moments may miss by this much; alpha = 1e-3 costs six of the sixteen digits
+
+
+@dataclass(frozen=True)
+class SigmaRule:
+    """Points and weights of one rule; refuses to exist where its moments are wrong.
+
+    Raises:
+        InputError: shapes do not agree, a moment up to the second is not exact, or a covariance weight is negative
+            (a square-root filter has no use for one).
+    """
+
+    name: str
+    xi: FloatArray
+    w_mean: FloatArray
+    w_cov: FloatArray
+
+    def __post_init__(self) -> None:
+        points, n = self.xi.shape
+        if self.w_mean.shape != (points,) or self.w_cov.shape != (points,):
+            raise InputError(self.name, "one weight per point is wanted", "give weights of shape (points,)")
+        if np.any(self.w_cov < 0.0):
+            raise InputError(
+                self.name, "a covariance weight is negative, which has no square root", "raise alpha, beta or kappa"
+            )
+        first = self.w_mean @ self.xi
+        second = (self.w_cov[:, None] * self.xi).T @ self.xi
+        for moment, value, expected in (
+            ("zeroth", np.sum(self.w_mean), 1.0),
+            ("first", first, np.zeros(n)),
+            ("second", second, np.eye(n)),
+        ):
+            if not np.allclose(value, expected, rtol=0.0, atol=EXACTNESS):
+                raise InputError(self.name, f"the {moment} moment is not integrated exactly", "correct the constants")
+
+    @property
+    def dimension(self) -> int:
+        """n, the dimension of the state."""
+        return int(self.xi.shape[1])
+
+
+def unscented(n: int, alpha: float, beta: float, kappa: float) -> SigmaRule:
+    """The scaled unscented rule (Julier 2002); a centre without any weight is left out.
+
+    lambda = alpha^2*(n + kappa) - n; points 0 and +-sqrt(n + lambda)*e_i;
+    w_mean_0 = lambda/(n + lambda), w_cov_0 = w_mean_0 + 1 - alpha^2 + beta, others 1/(2*(n + lambda)).
+    """
+    scale = alpha**2 * (n + kappa)
+    if n < 1 or scale <= 0.0:
+        raise InputError("unscented", "n and alpha^2*(n + kappa) must be positive", "raise n, alpha or kappa")
+    spread = np.sqrt(scale) * np.eye(n)
+    side = np.full(2 * n, 0.5 / scale)
+    centre_mean = (scale - n) / scale
+    centre_cov = centre_mean + 1.0 - alpha**2 + beta
+    name = f"unscented({alpha:g}, {beta:g}, {kappa:g})"
+    if centre_mean == 0.0 and centre_cov == 0.0:
+        return SigmaRule(name, np.vstack([spread, -spread]), side, side)
+    return SigmaRule(
+        name,
+        np.vstack([np.zeros((1, n)), spread, -spread]),
+        np.concatenate([[centre_mean], side]),
+        np.concatenate([[centre_cov], side]),
+    )
+
+
+def cubature(n: int) -> SigmaRule:
+    """The third-degree spherical-radial rule (Arasaratnam and Haykin 2009): +-sqrt(n)*e_i with weights 1/(2n)."""
+    if n < 1:
+        raise InputError("cubature", "n must be at least 1", "give the dimension of the state")
+    spread = np.sqrt(float(n)) * np.eye(n)
+    weight = np.full(2 * n, 0.5 / n)
+    return SigmaRule("cubature", np.vstack([spread, -spread]), weight, weight)

@@ -1,0 +1,180 @@
+"""Square-root predict and update on small arrays, for use inside larger compiled kernels.
+
+Legend
+    x, m        state, its mean                                            (n,)
+    L           sqrt_cov, lower triangular, covariance P = L*L'             (n, n)
+    X           weighted centred deviations of state points                 (n, points)
+    Z           weighted centred deviations of measurement points           (k, points)
+    nu          innovation, measured minus predicted; NaN = row not there    (k,)
+    r           standard deviations of the measurement noise, independent    (k,)
+    S           innovation covariance Z*Z' + diag(r^2)                       (k, k)
+
+Everything is an orthogonal transformation of an array of factors (Householder): no covariance is ever subtracted, so none
+can lose its sign. Kernels write into arrays of the caller; they allocate nothing.
+"""
+
+from __future__ import annotations
+
+import math
+
+from schemas.numeric import FloatArray, compiled
+
+LOG_TWO_PI = math.log(2.0 * math.pi)
+
+
+@compiled
+def triangularize(a: FloatArray, rows: int, columns: int) -> None:
+    """Replace a[:rows, :columns] by its lower-triangular factor with the same a*a', diagonal not negative.
+
+    Householder reflections from the right; entries right of the diagonal become zero. columns >= rows.
+    """
+    for i in range(rows):
+        square = 0.0
+        for j in range(i + 1, columns):
+            square += a[i, j] * a[i, j]
+        if square > 0.0:
+            head = a[i, i]
+            norm = math.sqrt(head * head + square)
+            pivot = head - norm if head <= 0.0 else -square / (head + norm)
+            gain = 2.0 / (square + pivot * pivot)
+            for k in range(i + 1, rows):
+                dot = a[k, i] * pivot
+                for j in range(i + 1, columns):
+                    dot += a[k, j] * a[i, j]
+                dot *= gain
+                a[k, i] -= dot * pivot
+                for j in range(i + 1, columns):
+                    a[k, j] -= dot * a[i, j]
+            a[i, i] = norm
+            for j in range(i + 1, columns):
+                a[i, j] = 0.0
+        elif a[i, i] < 0.0:
+            for k in range(i, rows):
+                a[k, i] = -a[k, i]
+
+
+@compiled
+def sigma_points(mean: FloatArray, sqrt_cov: FloatArray, xi: FloatArray, points: FloatArray) -> None:
+    """points[j] = mean + sqrt_cov @ xi[j]; mean (n,), sqrt_cov (n, n), xi and points (points, n)."""
+    count, n = xi.shape
+    for p in range(count):
+        for i in range(n):
+            total = mean[i]
+            for j in range(i + 1):
+                total += sqrt_cov[i, j] * xi[p, j]
+            points[p, i] = total
+
+
+@compiled
+def weighted_mean(points: FloatArray, w_mean: FloatArray, mean: FloatArray) -> None:
+    """mean = sum of w_mean[j]*points[j], taken as the first point plus deviations so that large offsets lose no digits."""
+    count, n = points.shape
+    for i in range(n):
+        total = 0.0
+        for p in range(count):
+            total += w_mean[p] * (points[p, i] - points[0, i])
+        mean[i] = points[0, i] + total
+
+
+@compiled
+def deviations(points: FloatArray, mean: FloatArray, w_cov: FloatArray, out: FloatArray, row: int) -> None:
+    """out[row + i, j] = sqrt(w_cov[j])*(points[j, i] - mean[i]): the factor of a covariance from centred deviations."""
+    count, n = points.shape
+    for p in range(count):
+        root = math.sqrt(w_cov[p])
+        for i in range(n):
+            out[row + i, p] = root * (points[p, i] - mean[i])
+
+
+@compiled
+def predict(
+    points: FloatArray,
+    w_mean: FloatArray,
+    w_cov: FloatArray,
+    sqrt_noise: FloatArray,
+    mean: FloatArray,
+    sqrt_cov: FloatArray,
+    work: FloatArray,
+) -> None:
+    """Mean and sqrt_cov of propagated points (points, n) with process noise factor sqrt_noise (n, n).
+
+    Writes mean (n,) and sqrt_cov (n, n); work is (n, points + n) or larger.
+    """
+    count, n = points.shape
+    weighted_mean(points, w_mean, mean)
+    deviations(points, mean, w_cov, work, 0)
+    for i in range(n):
+        for j in range(n):
+            work[i, count + j] = sqrt_noise[i, j]
+    triangularize(work, n, count + n)
+    for i in range(n):
+        for j in range(n):
+            sqrt_cov[i, j] = work[i, j] if j <= i else 0.0
+
+
+@compiled
+def update(
+    mean: FloatArray,
+    sqrt_cov: FloatArray,
+    state_deviations: FloatArray,
+    measured_deviations: FloatArray,
+    innovation: FloatArray,
+    noise_std: FloatArray,
+    work: FloatArray,
+) -> tuple[int, float, float]:
+    """Measurement update in place; rows whose innovation is NaN are skipped.
+
+    Args:
+        mean: m, (n,), changed. sqrt_cov: L, (n, n), changed.
+        state_deviations: X, (n, points). measured_deviations: Z, (k, points).
+        innovation: nu, (k,). noise_std: r, (k,).
+        work: (k + n, points + k) or larger.
+
+    Returns:
+        rows used, the log-likelihood of the innovation [nat] and nu' S^-1 nu.
+
+    The array [[Z, diag(r)], [X, 0]] becomes [[S^1/2, 0], [P_xz*S^-T/2, L_new]].
+    """
+    n, points = state_deviations.shape
+    used = 0
+    for k in range(innovation.shape[0]):
+        if not math.isnan(innovation[k]):
+            used += 1
+    if used == 0:
+        return 0, 0.0, 0.0
+    row = 0
+    for k in range(innovation.shape[0]):
+        if math.isnan(innovation[k]):
+            continue
+        for p in range(points):
+            work[row, p] = measured_deviations[k, p]
+        for j in range(used):
+            work[row, points + j] = 0.0
+        work[row, points + row] = noise_std[k]
+        row += 1
+    for i in range(n):
+        for p in range(points):
+            work[used + i, p] = state_deviations[i, p]
+        for j in range(used):
+            work[used + i, points + j] = 0.0
+    triangularize(work, used + n, points + used)
+    log_likelihood, square, row = -0.5 * used * LOG_TWO_PI, 0.0, 0
+    for k in range(innovation.shape[0]):
+        if math.isnan(innovation[k]):
+            continue
+        white = innovation[k]
+        for j in range(row):
+            white -= work[row, j] * work[j, points + used - 1]
+        white /= work[row, row]
+        log_likelihood -= math.log(work[row, row])
+        square += white * white
+        work[row, points + used - 1] = (
+            white  # right of the diagonal all is zero by now: room for the whitened innovation
+        )
+        for i in range(n):
+            mean[i] += work[used + i, row] * white
+        row += 1
+    for i in range(n):
+        for j in range(n):
+            sqrt_cov[i, j] = work[used + i, used + j] if j <= i else 0.0
+    return used, log_likelihood - 0.5 * square, square

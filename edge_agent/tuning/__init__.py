@@ -1,0 +1,1 @@
+"""Tuning of the fuzzy memberships: ant colony, random control, objective, tuned files with provenance."""

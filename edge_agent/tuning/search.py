@@ -1,0 +1,131 @@
+"""What the two searches share: a graph of positions, a result, a history.
+
+A search looks for the best vector of one value per vertex, each from its own short list of positions.
+It knows nothing of filters: the objective is any function of that vector, larger is better.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from schemas.errors import InputError
+from schemas.numeric import BoolArray, FloatArray, IntArray
+
+Objective = Callable[[FloatArray], float]
+Admissible = Callable[[FloatArray], bool]
+
+# Draws before an ant accepts a path that was already walked; a converged colony would else draw for ever.
+REDRAWS = 32
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One line of a search's history: values of the objective, larger is better."""
+
+    iteration: int
+    best: float  # best value so far
+    mean: float  # mean of the finite values of this iteration
+    evaluations: int  # distinct vectors evaluated so far
+
+
+Progress = Callable[[Iteration], None]
+
+
+@dataclass(frozen=True)
+class Result:
+    """The best vector (V,) of a search, its value, and how the search came there."""
+
+    best: FloatArray
+    value: float
+    history: tuple[Iteration, ...]
+
+    @property
+    def evaluations(self) -> int:
+        """Distinct vectors that the objective was asked for."""
+        return self.history[-1].evaluations
+
+
+@dataclass(frozen=True)
+class Graph:
+    """V vertices with up to K positions each, as rectangles: `positions` (V, K) and `reachable` (V, K)."""
+
+    positions: FloatArray
+    reachable: BoolArray
+
+    @classmethod
+    def of(cls, choices: Sequence[FloatArray]) -> "Graph":
+        """Build from one array of positions per vertex; raises InputError where a vertex has none."""
+        if not choices or any(len(choice) == 0 for choice in choices):
+            raise InputError("choices", "a vertex has no position", "give every vertex at least one")
+        widest = max(len(choice) for choice in choices)
+        positions = np.full((len(choices), widest), np.nan)
+        for row, choice in zip(positions, choices, strict=True):
+            row[: len(choice)] = choice
+        return cls(positions, np.isfinite(positions))
+
+    def vector(self, path: IntArray) -> FloatArray:
+        """The values (V,) at a path of position indices (V,)."""
+        return self.positions[np.arange(len(path)), path]
+
+
+@dataclass
+class Ledger:
+    """Remembers every walked path, so that no evaluation is spent twice and the best is never lost."""
+
+    objective: Objective
+    graph: Graph
+    admissible: Admissible
+    values: dict[bytes, float] = field(default_factory=dict)
+    best_path: IntArray | None = None
+    best_value: float = -np.inf
+    history: list[Iteration] = field(default_factory=list)
+
+    def draw(self, sample: Callable[[], IntArray]) -> IntArray:
+        """An admissible path from `sample`, a new one if the draws allow; InputError if none is admissible."""
+        fallback: IntArray | None = None
+        for _ in range(REDRAWS):
+            path = sample()
+            if path.tobytes() in self.values:
+                fallback = path
+            elif self.admissible(self.graph.vector(path)):
+                return path
+        if fallback is None:
+            raise InputError("choices", f"none of {REDRAWS} drawn vectors is admissible", "narrow the choices")
+        return fallback
+
+    def evaluate(self, path: IntArray) -> float:
+        """The objective at a path, asked for once; a value that is not a number counts as the worst."""
+        key = path.tobytes()
+        if key not in self.values:
+            value = float(self.objective(self.graph.vector(path)))
+            self.values[key] = value if np.isfinite(value) else -np.inf
+            if self.best_path is None or self.values[key] > self.best_value:
+                self.best_path, self.best_value = path, self.values[key]
+        return self.values[key]
+
+    def record(self, values: Sequence[float], progress: Progress | None) -> None:
+        """Close an iteration: append it to the history and tell `progress`."""
+        finite = [value for value in values if np.isfinite(value)]
+        mean = float(np.mean(finite)) if finite else -np.inf
+        self.history.append(Iteration(len(self.history) + 1, self.best_value, mean, len(self.values)))
+        if progress is not None:
+            progress(self.history[-1])
+
+    def result(self) -> Result:
+        """What was found; InputError before the first evaluation."""
+        if self.best_path is None:
+            raise InputError("ants, iterations", "nothing was evaluated", "use at least one of each")
+        return Result(self.graph.vector(self.best_path), self.best_value, tuple(self.history))
+
+
+def everything(_vector: FloatArray) -> bool:
+    """The admissible set without limits."""
+    return True
+
+
+def nearest(graph: Graph, vector: FloatArray) -> IntArray:
+    """Indices (V,) of the positions nearest to a vector (V,)."""
+    distance = np.abs(graph.positions - np.asarray(vector)[:, None])
+    indices: IntArray = np.argmin(np.where(graph.reachable, distance, np.inf), axis=1)
+    return indices

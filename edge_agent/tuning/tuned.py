@@ -1,0 +1,130 @@
+"""Tuned memberships as files: what was found, how it compares, and the command that finds it again."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from edge_agent.adaptation.memberships import Memberships
+from schemas.config import explain
+from schemas.errors import InputError
+
+FOLDER: Final = Path(__file__).parent / "tuned"
+WAYS: Final = ("default", "random", "colony")  # untuned memberships, the control, the ant colony
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1)]
+
+
+class Record(BaseModel):
+    """Base of the parts of a file: unknown names are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Score(Record):
+    """How one set of memberships does on one set of drives."""
+
+    interval_score: Annotated[Finite, Field(description="of the 90 % friction interval, less is better [1]")]
+    coverage: Annotated[Finite, Field(description="share of true frictions inside it [1]")]
+    log_likelihood: Annotated[Finite, Field(description="of the innovations, more is better [nat/s]")]
+    nis_ratio: Annotated[Finite, Field(description="normalised innovation squared over its expectation [1]")]
+
+
+class Comparison(Record):
+    """One row of the table: the drives that were searched on, and drives that were not."""
+
+    train: Score
+    held_out: Score
+
+
+class Budget(Record):
+    """What the search was allowed, and how many vectors each way evaluated."""
+
+    ants: Count
+    iterations: Count
+    evaluations: dict[str, Count]
+
+
+class Provenance(Record):
+    """Enough to find the same numbers again."""
+
+    command: str
+    seed: Annotated[int, Field(ge=0)]
+    date: str
+    commit: str
+    machine: str
+    versions: dict[str, str]
+    budget: Budget
+
+
+class Document(Record):
+    """The file as it lies on the disk."""
+
+    estimator: str
+    memberships: dict[str, list[Finite]]
+    objective: str
+    scores: dict[str, Comparison]
+    provenance: Provenance
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """A file whose memberships have been accepted."""
+
+    memberships: Memberships
+    document: Document
+
+
+def parse(text: str | bytes, where: str) -> Tuned:
+    """The tuned memberships in a document.
+
+    Raises:
+        InputError: a field is missing, unknown, not a finite number, or a vertex is out of order or out of range.
+    """
+    try:
+        document = Document.model_validate_json(text)
+    except ValidationError as error:
+        raise explain(error, where) from error
+    for way in WAYS:
+        if way not in document.scores:
+            raise InputError(f"scores.{way}", "is missing", f"write the {where} with edge-agent tune")
+    known = set(Memberships().to_json())
+    if unknown := sorted(set(document.memberships) - known):
+        raise InputError(f"memberships.{unknown[0]}", "is unknown", f"use {', '.join(sorted(known))}")
+    return Tuned(Memberships.from_json(document.memberships), document)
+
+
+def load(path: Path | str) -> Tuned:
+    """Read a tuned file; InputError names the field that is wrong, or the file if it cannot be read."""
+    try:
+        text = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError("memberships", f"cannot read {path} ({error.strerror})", "name a tuned file") from error
+    return parse(text, f"tuned file {path}")
+
+
+def shipped(estimator: str) -> Memberships:
+    """The memberships that come with the package for an estimator.
+
+    Raises:
+        InputError: there are none for that estimator.
+    """
+    return load(FOLDER / f"{estimator}.json").memberships
+
+
+def save(path: Path, document: Document) -> None:
+    """Write a document after reading it back, so that no file is written that `load` would refuse."""
+    text = json.dumps(document.model_dump(), indent=1, ensure_ascii=False) + "\n"
+    parse(text, f"tuned file {path}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(
+            "out", f"cannot write {path} ({error.strerror})", "name a file in a writable folder"
+        ) from error
