@@ -1,0 +1,58 @@
+"""`edge-agent`: simulate, replay, run, fleet, tune.
+
+Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. What a command needs is imported when
+it is chosen, so that help is quick.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import logging
+import sys
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+BAD_INPUT: Final = 2
+
+
+class Command(NamedTuple):
+    """A subcommand: its module has `add_arguments(parser)` and `run(args) -> int`."""
+
+    name: str
+    module: str
+    help: str
+
+
+COMMANDS: Final = (
+    Command("simulate", "edge_agent.cli.simulate", "write the signal log of a manoeuvre, with truth"),
+    Command("replay", "edge_agent.cli.replay", "estimate a recorded drive, and publish it on request"),
+    Command("run", "edge_agent.cli.run", "one vehicle, live, in real time"),
+    Command("fleet", "edge_agent.cli.fleet", "many simulated vehicles in real time, each with its own session"),
+    Command("tune", "edge_agent.tuning.cli", "tune the fuzzy memberships by ant colony"),
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command line; returns the exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    parser = argparse.ArgumentParser(
+        prog="edge-agent", description="Friction and motion of a vehicle from its sensors."
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    chosen = next((argument for argument in arguments if not argument.startswith("-")), None)
+    for command in COMMANDS:
+        sub = commands.add_parser(command.name, help=command.help, description=command.help)
+        if command.name == chosen:
+            module = importlib.import_module(command.module)
+            module.add_arguments(sub)
+            sub.set_defaults(run=module.run)
+    args = parser.parse_args(arguments)
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    from schemas.errors import InputError
+
+    try:
+        return int(args.run(args))
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_INPUT

@@ -1,0 +1,112 @@
+"""What the commands share: estimators by name, the closing of a publisher, signals, vehicle names."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from schemas.config import NAME_PATTERN, AgentConfig
+from schemas.errors import InputError
+from schemas.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+    from edge_agent.agent import Progress
+    from edge_agent.estimators import EstimatorBank
+    from edge_agent.publisher import Publisher
+
+
+def bank_of(estimator: str, vehicles: Sequence[Vehicle]) -> EstimatorBank:
+    """The estimator bank of a name.
+
+    Raises:
+        InputError: no such estimator.
+    """
+    from edge_agent.estimators import create
+
+    return create(estimator, vehicles)
+
+
+def checked_name(name: str) -> str:
+    """A name that may stand in a key.
+
+    Raises:
+        InputError: it may not.
+    """
+    if not re.fullmatch(NAME_PATTERN, name):
+        raise InputError(
+            "name", f"{name!r} is no vehicle name", "give --name, 3 to 63 of a-z, 0-9 and -, a letter first"
+        )
+    return name
+
+
+def publisher_of(names: Sequence[str], config: AgentConfig, estimator: str) -> Publisher:
+    """A started publisher on the configured spool.
+
+    Raises:
+        InputError: Zenoh refuses its settings, or the spool is in use or unusable.
+    """
+    from edge_agent.publisher import Publisher
+    from edge_agent.spool import Spool
+    from schemas.transport import configuration
+
+    configuration(config.zenoh)  # a bad setting is to be an error here, not in a thread
+    spool = Spool(config.spool, capacity_bytes=round(config.spool_mb * 1e6), first_resend_s=config.resend_s)
+    publisher = Publisher(names, spool, config, estimator)
+    publisher.start()
+    return publisher
+
+
+@contextmanager
+def stop_on_signal() -> Iterator[threading.Event]:
+    """An event that SIGTERM and Ctrl-C set; a second signal ends the process at once."""
+    stop = threading.Event()
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+
+    def on_signal(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 the signal interface hands it over
+        stop.set()
+        signal.signal(number, signal.SIG_DFL)
+
+    for number in before:
+        signal.signal(number, on_signal)
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def leave(publisher: Publisher, progress: Progress, drain_s: float) -> None:
+    """Wait for acknowledgements, close, print the counts as one line of JSON on stdout.
+
+    What is unsettled stays in the spool for the next start. A session that hangs on a frozen router would keep the
+    interpreter from ending, so the process is then ended from here.
+    """
+    from edge_agent.agent import summary
+
+    clean = publisher.close(drain_s)
+    if not clean:
+        print("warning: a session did not close; leaving it behind", file=sys.stderr, flush=True)
+    print(json.dumps(summary(progress, publisher)), flush=True)
+    if not clean:
+        os._exit(0)
+
+
+def status(progress: Progress, publisher: Publisher) -> None:
+    """One line on how it goes, on stderr."""
+    counts = publisher.counts
+    late = f", behind real time by {progress.lag_s:.1f} s at the most" if progress.behind else ""
+    print(
+        f"{progress.signals_s:7.1f} s  {publisher.links} sessions, {sum(counts.published.values())} records published, "
+        f"{sum(counts.acknowledged.values())} acknowledged, {publisher.unsettled()} unsettled{late}",
+        file=sys.stderr,
+        flush=True,
+    )

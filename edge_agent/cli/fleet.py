@@ -1,0 +1,36 @@
+"""`edge-agent fleet`: simulated vehicles in real time, each with its own session and name, one estimator bank."""
+
+from __future__ import annotations
+
+import argparse
+from functools import partial
+from pathlib import Path
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--vehicles", type=int, default=36, help="how many (default 36)")
+    parser.add_argument("--scenario", default="demo", help="where they drive (default demo)")
+    parser.add_argument("--estimator", help="estimator by name (default: the configuration's)")
+    parser.add_argument("--config", type=Path, help="agent configuration (JSON)")
+    parser.add_argument("--truth", type=Path, help="what they truly drove over, one row per cell visit (Parquet)")
+    parser.add_argument("--rate", type=float, default=100.0, help="samples per second (default 100)")
+    parser.add_argument("--seed", type=int, default=0, help="of the simulation (default 0)")
+    parser.add_argument("--duration", type=float, default=float("inf"), help="[s]; else until stopped")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Drive until the duration has passed or a signal comes; write the truth before leaving."""
+    from edge_agent.cli.live import drive_live
+    from edge_agent.estimates_file import writable
+    from edge_agent.simulation import SimulatedFleet
+    from edge_agent.sources.simulated import blocks
+    from edge_agent.truth import TruthRecorder
+    from schemas.config import AgentConfig, load
+
+    config = load(args.config, AgentConfig)
+    fleet = SimulatedFleet(args.scenario, args.vehicles, args.seed, args.rate)
+    recorder = TruthRecorder(tuple(fleet.names)) if args.truth and writable("truth", args.truth) else None
+    source = blocks(fleet, args.rate, recorder)
+    told = partial(recorder.write, args.truth) if recorder is not None else lambda: None
+    return drive_live(fleet.vehicles, fleet.names, source, config, args.estimator, args.duration, told)

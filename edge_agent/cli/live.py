@@ -1,0 +1,45 @@
+"""What `run` and `fleet` share: bank, pipeline and publisher around the live loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+
+import numpy as np
+
+from edge_agent.agent import ENDED_DRAIN_S, STOPPED_DRAIN_S, drive
+from edge_agent.cli.common import bank_of, leave, publisher_of, status, stop_on_signal
+from edge_agent.pipeline import Pipeline
+from edge_agent.sources import Block
+from schemas.config import AgentConfig
+from schemas.signals import CHANNELS
+from schemas.vehicle import Vehicle
+
+
+def _warm_up(estimator: str, vehicle: Vehicle, config: AgentConfig) -> None:
+    """Load or compile the kernels before the clock runs, on a vehicle that is thrown away."""
+    t, time = np.zeros((1, 1)), np.zeros((1, 1), dtype=np.int64)
+    signals = np.full((1, 1, len(CHANNELS)), np.nan)
+    Pipeline(bank_of(estimator, [vehicle]), 1, config).step(Block(t, time, signals))
+
+
+def drive_live(
+    vehicles: Sequence[Vehicle],
+    names: Sequence[str],
+    blocks: Iterator[Block],
+    config: AgentConfig,
+    estimator: str | None,
+    duration_s: float,
+    at_end: Callable[[], None] = lambda: None,
+) -> int:
+    """Drive in real time, do what is due `at_end`, take leave; prints a line of counts and returns 0."""
+    chosen = estimator or config.estimator
+    _warm_up(chosen, vehicles[0], config)
+    pipeline = Pipeline(bank_of(chosen, vehicles), len(vehicles), config)
+    publisher = publisher_of(names, config, chosen)
+    report = partial(status, publisher=publisher)
+    with stop_on_signal() as stop:
+        progress = drive(blocks, pipeline, publisher, stop, report, duration_s=duration_s)
+        at_end()
+        leave(publisher, progress, STOPPED_DRAIN_S if stop.is_set() else ENDED_DRAIN_S)
+    return 0

@@ -1,0 +1,91 @@
+"""`edge-agent replay`: a recorded drive through an estimator, as fast as it goes; onto the map with --publish."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from edge_agent.estimates_file import EstimatesFile
+    from edge_agent.estimators import EstimatorBank
+    from edge_agent.sources.replay import Log
+    from schemas.config import AgentConfig
+
+DRAIN_S = 30.0  # for a busy service; what is not settled by then stays in the spool
+NS = 1_000_000_000
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("log", type=Path, help="signal log (Parquet)")
+    parser.add_argument("--vehicle", type=Path, required=True, help="vehicle file (JSON)")
+    parser.add_argument("--estimator", help="estimator by name (default: the configuration's, aco-fckf)")
+    parser.add_argument("--out", type=Path, required=True, help="estimates to write (Parquet)")
+    parser.add_argument("--publish", action="store_true", help="send observations and states, wait for acknowledgement")
+    parser.add_argument("--config", type=Path, help="agent configuration (JSON), for --publish")
+    parser.add_argument("--name", help="name to publish under (default: the vehicle file's)")
+    parser.add_argument("--start", help="time of t = 0, ISO 8601 (default: the log's, else such that it ends now)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Replay; 0 when everything was written, and acknowledged if it was to be published, else 1."""
+    from edge_agent.cli.common import bank_of
+    from edge_agent.estimates_file import EstimatesFile
+    from edge_agent.sources.replay import read_log
+    from schemas.config import AgentConfig, load
+    from schemas.vehicle import load_vehicle
+
+    config = load(args.config, AgentConfig)
+    estimator = args.estimator or config.estimator
+    vehicle = load_vehicle(args.vehicle)
+    bank = bank_of(estimator, [vehicle])
+    log = read_log(args.log)
+    start_ns = _start(args.start, log)
+    with EstimatesFile(args.out) as file:
+        if args.publish:
+            return _published(args.name or vehicle.name, log, start_ns, bank, estimator, config, file)
+        for block in log.blocks(start_ns):
+            file.write(block.t, bank.advance(block.t, block.signals))
+    return 0
+
+
+def _published(
+    name: str, log: Log, start_ns: int, bank: EstimatorBank, estimator: str, config: AgentConfig, file: EstimatesFile
+) -> int:
+    from edge_agent.agent import Progress
+    from edge_agent.cli.common import checked_name, leave, publisher_of
+    from edge_agent.pipeline import Pipeline
+
+    pipeline = Pipeline(bank, 1, config)
+    publisher = publisher_of([checked_name(name)], config, estimator)
+    progress = Progress(signals_s=float(log.t[-1] - log.t[0]))
+    try:
+        for block in log.blocks(start_ns):
+            estimates, *records = pipeline.step(block)
+            file.write(block.t, estimates)
+            publisher.offer(*records)
+            progress.blocks += 1
+        if (last := pipeline.finish()) is not None:
+            publisher.offer(last)
+    finally:
+        leave(publisher, progress, DRAIN_S)
+    return 1 if publisher.unsettled() else 0
+
+
+def _start(given: str | None, log: Log) -> int:
+    """The ns UTC of t = 0."""
+    from schemas.errors import InputError
+
+    if given is None:
+        return log.start_ns if log.start_ns is not None else time.time_ns() - round(float(log.t[-1]) * NS)
+    try:
+        moment = datetime.fromisoformat(given)
+    except ValueError as error:
+        raise InputError("start", f"{given!r} is no time", "write it like 2026-01-31T07:00:00Z") from error
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=UTC)
+    since = moment - datetime(1970, 1, 1, tzinfo=UTC)
+    return (since.days * 86_400 + since.seconds) * NS + since.microseconds * 1_000

@@ -1,0 +1,54 @@
+"""`edge-agent simulate`: the signal log of a manoeuvre."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("manoeuvre", nargs="?", help="name of the manoeuvre; --list shows them")
+    parser.add_argument("--list", action="store_true", help="list the manoeuvres and leave")
+    parser.add_argument("--mu", type=float, help="peak friction of the road; else the manoeuvre's own")
+    parser.add_argument("--speed", type=float, help="[m/s]; else the manoeuvre's own")
+    parser.add_argument("--duration", type=float, help="[s]; else the manoeuvre's own")
+    parser.add_argument("--rate", type=float, default=100.0, help="samples per second (default 100)")
+    parser.add_argument("--seed", type=int, default=0, help="of the sensor errors (default 0)")
+    parser.add_argument("--sensors", choices=("mems", "ideal"), default="mems", help="quality (default mems)")
+    parser.add_argument("--out", type=Path, help="signal log to write (Parquet)")
+    parser.add_argument("--vehicle-out", type=Path, help="vehicle file to write (JSON)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Simulate, or list the manoeuvres."""
+    import pyarrow.parquet as pq
+
+    from edge_agent.estimates_file import writable
+    from edge_agent.simulation import MANOEUVRES, simulate_manoeuvre
+    from schemas.errors import InputError
+
+    if args.list:
+        for name, manoeuvre in MANOEUVRES.items():
+            print(f"{name:<24} {manoeuvre.about}")
+        return 0
+    if args.manoeuvre is None:
+        raise InputError("manoeuvre", "is not given", "name one (--list shows them)")
+    if args.out is None:
+        raise InputError("out", "is not given", "name the log to write with --out")
+    log, vehicle = simulate_manoeuvre(
+        args.manoeuvre,
+        mu=args.mu,
+        speed=args.speed,
+        seed=args.seed,
+        rate_hz=args.rate,
+        duration_s=args.duration,
+        sensors=args.sensors,
+    )
+    pq.write_table(log, writable("out", args.out))
+    if args.vehicle_out is not None:
+        writable("vehicle-out", args.vehicle_out).write_text(
+            vehicle.model_dump_json(indent=1, exclude_none=True) + "\n"
+        )
+    print(f"{args.out}: {log.num_rows} samples of {args.manoeuvre}")
+    return 0

@@ -1,0 +1,79 @@
+"""Estimates of one vehicle as the Parquet of the contract, one row per sample."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+from schemas.signals import per_wheel
+from schemas.tables import ESTIMATES_SCHEMA
+
+if TYPE_CHECKING:
+    from edge_agent.estimators import Estimates
+
+WHEEL_COLUMNS = tuple(f"{wheel}{end}" for wheel in per_wheel("mu") for end in ("", "_lower", "_upper"))
+
+
+def writable(field: str, path: Path) -> Path:
+    """The path, whose folder now exists.
+
+    Raises:
+        InputError: it is a folder, or its folder cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        reason = "is a folder" if path.is_dir() else "" if os.access(path.parent, os.W_OK) else "no permission"
+    except OSError as error:
+        reason = error.strerror or str(error)
+    if reason:
+        raise InputError(field, f"cannot write {path} ({reason})", "name a file in a writable folder")
+    return path
+
+
+class EstimatesFile:
+    """Writes estimates block by block; the file appears under its name when it is whole."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._part = path, writable("out", path).with_name(path.name + ".part")
+        self._writer = pq.ParquetWriter(self._part, ESTIMATES_SCHEMA)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._writer.close()
+        if kind is None:
+            self._part.replace(self._path)
+        else:
+            self._part.unlink(missing_ok=True)
+
+    def write(self, t: FloatArray, estimates: Estimates) -> None:
+        """Add a block: t (T, 1) and the estimates of a bank of one vehicle."""
+        self._writer.write_table(table(t, estimates))
+
+
+def table(t: FloatArray, estimates: Estimates) -> pa.Table:
+    """Estimates (T, 1) as a table of ESTIMATES_SCHEMA; the columns per wheel are null where the bank has one mu."""
+    wheels = estimates.mu_wheel
+    columns: list[Any] = []
+    for field in ESTIMATES_SCHEMA:
+        if field.name == "t":
+            columns.append(pa.array(t[:, 0], field.type))
+        elif field.name not in WHEEL_COLUMNS:
+            columns.append(pa.array(getattr(estimates, field.name)[:, 0], field.type))
+        elif wheels is None:
+            columns.append(pa.nulls(len(t), field.type))
+        else:
+            wheel, end = divmod(WHEEL_COLUMNS.index(field.name), 3)
+            columns.append(pa.array(np.ascontiguousarray(wheels[:, 0, wheel, end]), field.type))
+    return pa.Table.from_arrays(columns, schema=ESTIMATES_SCHEMA)

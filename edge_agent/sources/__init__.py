@@ -1,0 +1,27 @@
+"""Where signals come from: a recorded log, or a simulated fleet. A source gives blocks of samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.numeric import FloatArray, IntArray
+
+NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Block:
+    """Samples of N vehicles: t (T, N) [s], the same instants as time (T, N) [ns UTC], signals (T, N, channels)."""
+
+    t: FloatArray
+    time: IntArray
+    signals: FloatArray
+
+
+def absolute(t: FloatArray, start_ns: int) -> IntArray:
+    """Seconds since the start as ns UTC, rounded to the ns; same shape."""
+    whole = t.astype(np.int64)
+    time: IntArray = start_ns + whole * NS + np.rint((t - whole) * NS).astype(np.int64)
+    return time

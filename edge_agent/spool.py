@@ -1,0 +1,303 @@
+"""Batches on disk until they are acknowledged: the agent's half of "nothing lost, nothing twice".
+
+A batch is committed here before it is put on the network and leaves only when the service has settled it.
+A batch is named by its stream (vehicle, boot, kind, region) and its `seq`, dense from 1 in each stream;
+`boot` is random per start, so that a restarted agent opens new streams and never reuses a name.
+Batches that an earlier start left behind are resent under their old name.
+
+Bounded: when the payloads exceed the capacity the oldest states go first, then the oldest observations,
+and both are counted. SQLite in WAL mode with a sync per commit; the exclusive lock of the database file is
+held as long as the spool is open, so that one file never serves two agents.
+Time is monotonic seconds and comes in as an argument.
+"""
+
+from __future__ import annotations
+
+import heapq
+import random
+import secrets
+import sqlite3
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+from schemas.errors import InputError
+from schemas.wire import Kind
+
+BOOT_LIMIT = 2**63  # boot fits a signed 64-bit column
+FIRST_RESEND_S = 2.0  # a service writes a segment each second: an answer younger than this is on its way
+LONGEST_RESEND_S = 6.0  # after an outage everything is offered again within this time
+JITTER = 0.25  # share of the delay, either way: agents that lost one router do not return in step
+DEFAULT_CAPACITY_BYTES = 256 * 2**20  # some days of one vehicle at a batch per second and kind
+EVICTION_ORDER = (Kind.STATE, Kind.OBSERVATION)  # an old state is worth least, an observation most
+
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS batch (
+    id INTEGER PRIMARY KEY AUTOINCREMENT,
+    vehicle TEXT NOT NULL, boot INTEGER NOT NULL, kind TEXT NOT NULL, region INTEGER NOT NULL, seq INTEGER NOT NULL,
+    records INTEGER NOT NULL, payload BLOB NOT NULL,
+    UNIQUE (vehicle, boot, kind, region, seq)
+);
+CREATE INDEX IF NOT EXISTS batch_age ON batch (kind, id);
+"""
+
+
+class Stream(NamedTuple):
+    """What `seq` counts in: one vehicle, one start, one kind of record, one region (z10 quadint)."""
+
+    vehicle: str
+    boot: int
+    kind: Kind
+    region: int
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A batch that has no name yet; `encode(seq, first_held)` gives its payload."""
+
+    vehicle: str
+    kind: Kind
+    region: int
+    records: int
+    encode: Callable[[int, int], bytes]
+
+
+@dataclass(frozen=True)
+class Held:
+    """A batch that is on disk and not settled."""
+
+    key: int
+    stream: Stream
+    seq: int
+    records: int
+    payload: bytes
+
+
+@dataclass
+class SpoolCounts:
+    """Records that went through, by what became of them."""
+
+    stored: int = 0
+    settled: int = 0
+    evicted: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(EVICTION_ORDER, 0))
+
+
+@dataclass
+class _Entry:
+    stream: Stream
+    seq: int
+    records: int
+    size: int
+    attempts: int = 0
+
+
+@dataclass
+class _Sequence:
+    """Seqs of one stream: the next to give and those still held."""
+
+    next: int = 1
+    first: int = 1
+    held: dict[int, int] = field(default_factory=dict)
+
+    def first_held(self) -> int:
+        """Lowest seq still held, or the next one when nothing is; settled seqs are stepped over once."""
+        while self.first < self.next and self.first not in self.held:
+            self.first += 1
+        return self.first
+
+
+class Spool:
+    """One agent process' unsettled batches. Raises InputError when the file is another agent's or no spool."""
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        capacity_bytes: int = DEFAULT_CAPACITY_BYTES,
+        first_resend_s: float = FIRST_RESEND_S,
+        boot: int | None = None,
+    ) -> None:
+        self.boot = boot if boot is not None else secrets.randbelow(BOOT_LIMIT - 1) + 1
+        self.capacity_bytes = capacity_bytes
+        self.first_resend_s = first_resend_s
+        self.counts = SpoolCounts()
+        self._random = random.Random(self.boot)
+        self._entries: dict[int, _Entry] = {}
+        self._streams: dict[Stream, _Sequence] = {}
+        self._later: list[tuple[float, int]] = []
+        self._ready: list[int] = []
+        self._bytes = 0
+        self._leaving: list[int] = []
+        self._database = _open(path)
+        self._recall()
+
+    def _recall(self) -> None:
+        """Take up what an earlier start left; all of it is due at once."""
+        rows = self._database.execute(
+            "SELECT id, vehicle, boot, kind, region, seq, records, LENGTH(payload) FROM batch ORDER BY id"
+        )
+        for key, vehicle, boot, kind, region, seq, records, size in rows:
+            self._hold(key, _Entry(Stream(vehicle, boot, Kind(kind), region), seq, records, size))
+            self._ready.append(key)
+        self._evict()
+
+    def _hold(self, key: int, entry: _Entry) -> None:
+        self._entries[key] = entry
+        sequence = self._streams.setdefault(entry.stream, _Sequence())
+        sequence.held[entry.seq] = key
+        sequence.next = max(sequence.next, entry.seq + 1)
+        self._bytes += entry.size
+
+    def _forget(self, key: int) -> _Entry:
+        entry = self._entries.pop(key)
+        sequence = self._streams[entry.stream]
+        del sequence.held[entry.seq]
+        if not sequence.held and entry.stream.boot != self.boot:
+            del self._streams[entry.stream]
+        self._bytes -= entry.size
+        self._leaving.append(key)
+        return entry
+
+    @property
+    def batches(self) -> int:
+        """Batches held."""
+        return len(self._entries)
+
+    def records(self, vehicles: Collection[str], kind: Kind | None = None) -> int:
+        """Records in the held batches of some vehicles, of one kind or of all."""
+        held = list(self._entries.values())
+        return sum(e.records for e in held if e.stream.vehicle in vehicles and kind in (None, e.stream.kind))
+
+    @property
+    def bytes(self) -> int:
+        """Payload bytes held."""
+        return self._bytes
+
+    def store(self, drafts: Sequence[Draft], now: float) -> list[Held]:
+        """Name the drafts and commit them in one transaction; nothing changes when the commit fails.
+
+        Raises sqlite3.Error when the disk refuses.
+        """
+        ahead: dict[Stream, int] = {}
+        with self._database:
+            self._delete_leaving()
+            held = [self._insert(draft, ahead) for draft in drafts]
+        self._leaving.clear()
+        for batch in held:
+            self._hold(batch.key, _Entry(batch.stream, batch.seq, batch.records, len(batch.payload)))
+            self._postpone(batch.key, now)
+            self.counts.stored += batch.records
+        self._evict()
+        return [batch for batch in held if batch.key in self._entries]
+
+    def _insert(self, draft: Draft, ahead: dict[Stream, int]) -> Held:
+        stream = Stream(draft.vehicle, self.boot, draft.kind, draft.region)
+        known = self._streams.get(stream, _Sequence())
+        seq = ahead.get(stream, known.next)
+        payload = draft.encode(seq, known.first_held())
+        row = (*stream, seq, draft.records, payload)
+        cursor = self._database.execute(
+            "INSERT INTO batch (vehicle, boot, kind, region, seq, records, payload) VALUES (?, ?, ?, ?, ?, ?, ?)", row
+        )
+        ahead[stream] = seq + 1
+        key = cursor.lastrowid
+        if key is None:
+            raise sqlite3.DatabaseError("an insert gave no row id")
+        return Held(key, stream, seq, draft.records, payload)
+
+    def _postpone(self, key: int, now: float) -> None:
+        entry = self._entries[key]
+        delay = min(max(LONGEST_RESEND_S, self.first_resend_s), self.first_resend_s * 2.0 ** min(entry.attempts, 16))
+        entry.attempts += 1
+        heapq.heappush(self._later, (now + delay * self._random.uniform(1 - JITTER, 1 + JITTER), key))
+
+    def _evict(self) -> None:
+        """Keep within the capacity: oldest state first, then oldest observation."""
+        gone: list[int] = []
+        excess = self._bytes - self.capacity_bytes
+        for kind in EVICTION_ORDER:
+            for key, entry in self._entries.items():
+                if excess <= 0:
+                    break
+                if entry.stream.kind == kind:
+                    gone.append(key)
+                    excess -= entry.size
+        for key in gone:
+            entry = self._forget(key)
+            self.counts.evicted[entry.stream.kind] += entry.records
+
+    def _delete_leaving(self) -> None:
+        self._database.executemany("DELETE FROM batch WHERE id = ?", [(key,) for key in self._leaving])
+
+    def tidy(self) -> None:
+        """Take what has left off the disk too, without waiting for the next `store`. Raises sqlite3.Error."""
+        if self._leaving:
+            with self._database:
+                self._delete_leaving()
+            self._leaving.clear()
+
+    def settle(self, stream: Stream, ranges: Iterable[tuple[int, int]]) -> int:
+        """Drop the batches of inclusive seq ranges; returns the records settled. Unknown seqs are ignored.
+
+        The rows go with the next `store` or `tidy`, so that an acknowledgement costs no sync of its own; a batch that
+        a crash brings back is sent again, and the service knows it.
+        """
+        sequence = self._streams.get(stream)
+        if sequence is None:
+            return 0
+        keys = {key for first, last in ranges for key in _within(sequence.held, first, last)}
+        records = sum(self._forget(key).records for key in keys)
+        self.counts.settled += records
+        return records
+
+    def due(self, now: float, limit: int) -> list[Held]:
+        """At most `limit` batches whose time to be offered again has come, oldest first; each is postponed."""
+        while self._later and self._later[0][0] <= now:
+            heapq.heappush(self._ready, heapq.heappop(self._later)[1])
+        keys: list[int] = []
+        while self._ready and len(keys) < limit:
+            key = heapq.heappop(self._ready)
+            if key in self._entries:
+                keys.append(key)
+        for key in keys:
+            self._postpone(key, now)
+        return [self._read(key) for key in keys]
+
+    def _read(self, key: int) -> Held:
+        entry = self._entries[key]
+        (payload,) = self._database.execute("SELECT payload FROM batch WHERE id = ?", (key,)).fetchone()
+        return Held(key, entry.stream, entry.seq, entry.records, payload)
+
+    def close(self) -> None:
+        """Release the file. Raises sqlite3.Error when the disk refuses the last deletions."""
+        try:
+            self.tidy()
+        finally:
+            self._database.close()
+
+
+def _within(held: dict[int, int], first: int, last: int) -> list[int]:
+    """Keys of the held seqs in [first, last], without walking a hostile range."""
+    if last - first < len(held):
+        return [held[seq] for seq in range(first, last + 1) if seq in held]
+    return [key for seq, key in held.items() if first <= seq <= last]
+
+
+def _open(path: Path) -> sqlite3.Connection:
+    database: sqlite3.Connection | None = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        database = sqlite3.connect(path, timeout=0.0, check_same_thread=False)
+        database.execute("PRAGMA locking_mode = EXCLUSIVE")
+        database.execute("PRAGMA journal_mode = WAL")
+        database.execute("PRAGMA synchronous = FULL")
+        database.executescript(f"BEGIN EXCLUSIVE; {_SCHEMA} COMMIT;")
+    except (sqlite3.Error, OSError) as error:
+        if database is not None:
+            database.close()
+        if isinstance(error, sqlite3.OperationalError) and "locked" in str(error):
+            raise InputError("spool", f"{path} is used by another agent", "give each agent its own") from error
+        problem = f"{path} cannot be opened ({error})"
+        raise InputError("spool", problem, "name a writable place, or move the file aside") from error
+    return database

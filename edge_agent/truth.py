@@ -1,0 +1,83 @@
+"""What a simulated fleet really drove over: one row per true visit of a cell, to hold the map against."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from schemas import grid
+from schemas.numeric import FloatArray, IntArray
+from schemas.tables import F64, I8, I64, NS, Field, arrow_schema
+
+TRUTH: Final = (
+    Field("vehicle", pa.string(), "-", "name of the simulated vehicle"),
+    Field("enter_time", NS, "ns since 1970, UTC", "first sample in the cell"),
+    Field("leave_time", NS, "ns since 1970, UTC", "last sample in the cell"),
+    Field("cell", I64, "quadint z21", "true cell"),
+    Field("sector", I8, "0 east, 1 north, 2 west, 3 south", "true heading sector"),
+    Field("mu", F64, "-", "peak adhesion under the wheels, mean of wheels and samples"),
+    Field("utilisation", F64, "-", "largest share of the grip used, any wheel"),
+)
+
+
+@dataclass
+class _Visit:
+    cell: int
+    sector: int
+    enter: int
+    leave: int = 0
+    samples: int = 0
+    mu: float = 0.0
+    utilisation: float = 0.0
+
+
+@dataclass
+class TruthRecorder:
+    """Gathers the true visits of the named vehicles, block by block."""
+
+    names: tuple[str, ...]
+    rows: list[tuple[str, _Visit]] = field(default_factory=list)
+    _open: dict[int, _Visit] = field(default_factory=dict)
+
+    def add(
+        self, time: IntArray, position: tuple[FloatArray, FloatArray], yaw: FloatArray, mu: FloatArray, used: FloatArray
+    ) -> None:
+        """One block: time [ns], latitude, longitude [deg], yaw [rad] (T, N); mu and used share per wheel (T, N, 4)."""
+        cells, sectors = grid.cell_of(*position), grid.sector_of(yaw)
+        mean, largest = mu.mean(axis=-1), used.max(axis=-1)
+        changes = (np.diff(cells, axis=0) != 0) | (np.diff(sectors, axis=0) != 0)
+        for n in range(len(self.names)):
+            edges = [0, *(np.flatnonzero(changes[:, n]) + 1).tolist(), len(time)]
+            for first, last in pairwise(edges):
+                visit = self._visit(n, int(cells[first, n]), int(sectors[first, n]), int(time[first, n]))
+                visit.leave = int(time[last - 1, n])
+                visit.samples += last - first
+                visit.mu += float(mean[first:last, n].sum())
+                visit.utilisation = max(visit.utilisation, float(largest[first:last, n].max()))
+
+    def _visit(self, n: int, cell: int, sector: int, time: int) -> _Visit:
+        visit = self._open.get(n)
+        if visit is None or (visit.cell, visit.sector) != (cell, sector):
+            visit = self._open[n] = _Visit(cell, sector, time)
+            self.rows.append((self.names[n], visit))
+        return visit
+
+    def write(self, path: Path) -> None:
+        """Write all visits as Parquet, those under way included."""
+        visits = [visit for _, visit in self.rows]
+        columns: dict[str, list[str] | list[int] | list[float]] = {
+            "vehicle": [name for name, _ in self.rows],
+            "enter_time": [v.enter for v in visits],
+            "leave_time": [v.leave for v in visits],
+            "cell": [v.cell for v in visits],
+            "sector": [v.sector for v in visits],
+            "mu": [v.mu / v.samples for v in visits],
+            "utilisation": [v.utilisation for v in visits],
+        }
+        pq.write_table(pa.Table.from_pydict(columns, schema=arrow_schema(*TRUTH)), path)

@@ -1,0 +1,146 @@
+"""Drives over the ground, made-up estimates and logs for tests of the rim: what it reads, nothing of a filter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from edge_agent.observer import Open, Records, observe
+from edge_agent.sources import Block, absolute
+from edge_agent.visits import Located, Track, locate
+from schemas import mugrid
+from schemas.config import AgentConfig
+from schemas.numeric import FloatArray
+from schemas.signals import CHANNELS, S
+
+LATITUDE, LONGITUDE = 57.70, 11.97
+METRE = 1.0 / 111_320.0  # degrees of latitude
+START_NS = 1_767_225_600_000_000_000  # 2026-01-01
+
+
+@dataclass(frozen=True)
+class MadeUp:
+    """Estimates that follow from nothing."""
+
+    vx: FloatArray
+    vy: FloatArray
+    yaw_rate: FloatArray
+    sideslip: FloatArray
+    mu: FloatArray
+    mu_lower: FloatArray
+    mu_upper: FloatArray
+    mu_utilised: FloatArray
+    health: NDArray[np.int32]
+    evidence: FloatArray | None
+
+    def part(self, rows: slice) -> MadeUp:
+        """The same for some samples."""
+        return MadeUp(*(None if (v := getattr(self, f.name)) is None else v[rows] for f in fields(self)))
+
+
+def estimates(samples: int, vehicles: int, seed: int = 0, mu: float | None = None, used: float = 0.1) -> MadeUp:
+    """Random, or of one mu with a narrow interval; evidence everywhere."""
+    rng, shape = np.random.default_rng(seed), (samples, vehicles)
+    middle = rng.uniform(0.1, 1.0, shape) if mu is None else np.full(shape, mu)
+    health = rng.integers(0, 4, shape).astype(np.int32)
+    evidence = -rng.exponential(2.0, (*shape, mugrid.BINS))
+    motion = [rng.normal(10.0, 1.0, shape) for _ in range(4)]
+    return MadeUp(*motion, middle, middle - 0.05, middle + 0.05, np.full(shape, used), health, evidence)
+
+
+def ground(east: FloatArray, north: FloatArray, yaw: FloatArray, *, rate_hz: float = 10.0, fix_every: int = 1) -> Block:
+    """A block of vehicles at (east, north) [m] heading for yaw, shape (T, N), with a fix every few samples."""
+    shape = east.shape
+    t = np.repeat(np.arange(shape[0])[:, None] / rate_hz, shape[1], axis=1)
+    signals = np.full((*shape, len(CHANNELS)), np.nan)
+    signals[..., S.LATITUDE] = LATITUDE + north * METRE
+    signals[..., S.LONGITUDE] = LONGITUDE + east * METRE / np.cos(np.radians(LATITUDE))
+    signals[..., S.YAW] = yaw
+    hidden = np.arange(shape[0]) % fix_every != 0
+    signals[hidden, :, S.LATITUDE :] = np.nan
+    return Block(t, absolute(t, START_NS), signals)
+
+
+def wanderers(samples: int, vehicles: int, seed: int = 0) -> Block:
+    """Vehicles that turn at random, lose their fixes now and then, some without yaw."""
+    rng = np.random.default_rng(seed)
+    yaw = np.cumsum(rng.normal(0.0, 0.1, (samples, vehicles)), axis=0)
+    step = rng.uniform(0.0, 3.0, (samples, vehicles))
+    block = ground(np.cumsum(step * np.cos(yaw), axis=0), np.cumsum(step * np.sin(yaw), axis=0), yaw)
+    lost = rng.random((samples, vehicles)) < 0.3
+    lost[samples // 2 : samples // 2 + 15, 0] = True
+    block.signals[lost, S.LATITUDE : S.LONGITUDE + 1] = np.nan
+    block.signals[:, ::3, S.YAW] = np.nan
+    return block
+
+
+@dataclass
+class Watch:
+    """Track and open visits of a test's vehicles."""
+
+    track: Track
+    open: Open
+    config: AgentConfig
+
+    @staticmethod
+    def of(vehicles: int, config: AgentConfig | None = None) -> Watch:
+        """Nothing seen yet."""
+        return Watch(Track.start(vehicles), Open.start(vehicles), config or AgentConfig())
+
+    def step(self, block: Block, told: MadeUp) -> tuple[Located, Records, Records]:
+        """One block."""
+        self.track, located = locate(self.track, block.t, block.signals)
+        self.open, observations, states = observe(self.open, block.time, located, told, self.config)
+        return located, observations, states
+
+
+def part(block: Block, rows: slice) -> Block:
+    """Some samples of a block."""
+    return Block(block.t[rows], block.time[rows], block.signals[rows])
+
+
+def a_log(samples: int) -> dict[str, Any]:
+    """Columns of a log at 100 Hz with every channel, of random numbers; rolling straight ahead would look like this."""
+    rng = np.random.default_rng(4)
+    columns: dict[str, Any] = {name: rng.normal(0.0, 0.1, samples) for name in CHANNELS}
+    columns |= {name: rng.normal(30.0, 0.1, samples) for name in CHANNELS if name.startswith("omega")}
+    columns |= {"latitude": np.full(samples, LATITUDE), "longitude": np.full(samples, LONGITUDE)}
+    return {"t": np.arange(samples) / 100.0} | columns
+
+
+def _written(**changes: object) -> Callable[[Path], None]:
+    """Writes a log of five samples with some columns replaced, or left out where the change is None."""
+
+    def write(path: Path) -> None:
+        columns = {name: column for name, column in (a_log(5) | changes).items() if column is not None}
+        pq.write_table(pa.table(columns), path)
+
+    return write
+
+
+_LOST = np.full(5, np.nan)
+# what is wrong with a log -> how to write such a one, and the error that it gives
+BAD_LOGS: dict[str, tuple[Callable[[Path], None], str]] = {
+    "no such file": (lambda path: None, "^log: .* does not exist; give"),
+    "empty file": (lambda path: path.write_bytes(b""), "^log: .* is not a Parquet file .*; write the log as Parquet"),
+    "not Parquet": (lambda path: path.write_text("t,ax\n0,1\n"), "^log: .* is not a Parquet file"),
+    "no rows": (lambda path: pq.write_table(pa.table(a_log(0)), path), "^log: .* has no rows; "),
+    "no time": (_written(t=None), "^t: the log has neither t nor timestamp; add"),
+    "no ax": (_written(ax=None), "^ax: the log has no such column; add"),
+    "no omega_rr": (_written(omega_rr=None), "^omega_rr: the log has no such column; add"),
+    "no steering": (_written(delta_fl=None, delta_fr=None), "^delta_fl: .* no such column; add it or delta_fr"),
+    "yaw_rate all NaN": (_written(yaw_rate=_LOST), "^yaw_rate: has no reading in any row; record"),
+    "omega_fl all null": (_written(omega_fl=pa.nulls(5, pa.float64())), "^omega_fl: has no reading in any row; record"),
+    "steering all NaN": (_written(delta_fl=_LOST, delta_fr=_LOST), "^delta_fl: has no reading in any row; record"),
+    "time goes back": (_written(t=np.array([0.0, 0.01, 0.02, 0.015, 0.03])), "^t: goes back at row 3; sort the log"),
+    "time missing": (_written(t=np.array([0.0, np.nan, 0.02, 0.03, 0.04])), "^t: row 1 has no time; give"),
+    "text for a number": (_written(ay=["a"] * 5), "^ay: is string, not a number; write"),
+    "text for a time": (_written(t=None, timestamp=["a"] * 5), "^timestamp: is string, not a time; write"),
+}  # fmt: skip
