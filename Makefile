@@ -31,7 +31,7 @@ bench: setup  ## cost of each part, side by side; writes .bench/figures.json
 	$(BIN)/python -m tests.benchmarks
 
 tune: setup  ## the ant colony over the memberships; writes the shipped file anew
-	$(BIN)/edge-agent tune
+	$(BIN)/edge-agent tune --out edge_agent/tuning/tuned/aco-fckf.json
 
 proto: setup  ## generate the message module from the .proto
 	$(BIN)/python -m grpc_tools.protoc -I schemas/proto --python_out=schemas/proto --pyi_out=schemas/proto gripmap.proto

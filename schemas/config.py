@@ -43,7 +43,7 @@ class AgentConfig(Settings):
     spool_mb: Positive = Field(
         default=256.0, description="[MB] at the most; oldest state goes first, then observations"
     )
-    resend_s: Positive = Field(default=2.0, description="first wait before a batch is sent again; doubles up to 60 s")
+    resend_s: Positive = Field(default=2.0, description="first wait before a batch is sent again; doubles up to 6 s")
     tyre_season: int = Field(default=0, ge=0, le=3, description="0 unknown, 1 summer, 2 winter, 3 all-season")
 
 
