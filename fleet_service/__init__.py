@@ -1,0 +1,1 @@
+"""The fleet service: many vehicles' evidence in, one map of grip out."""

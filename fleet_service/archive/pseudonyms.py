@@ -1,0 +1,75 @@
+"""Keyed hashes of vehicle names, with a key per month: destroying a month's key forgets who drove in it.
+
+The month is that of a batch's first record, so that a batch that is sent again has the same pseudonym.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+from datetime import UTC, datetime
+from hashlib import blake2b
+from pathlib import Path
+from typing import Final
+
+from fleet_service.archive.files import sync_directory
+
+KEY_BYTES: Final = 32
+_DIGEST_BYTES: Final = 8  # 64 bits: a collision among 10⁶ vehicles has probability 3e-8
+_DAY_NS: Final = 86_400_000_000_000
+
+
+def number(pseudonym: str) -> int:
+    """A pseudonym as a signed 64-bit number."""
+    return int.from_bytes(bytes.fromhex(pseudonym), signed=True)
+
+
+class Pseudonyms:
+    """Names to pseudonyms.
+
+    Args:
+        folder: where the keys lie, one file of mode 600 per month; a missing key is made.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._keys: dict[str, bytes] = {}
+        self._known: dict[tuple[str, str], str] = {}
+        self._month_of_day: dict[int, str] = {}
+
+    def of(self, vehicle: str, time: int) -> str:
+        """Pseudonym (16 hexadecimal digits) of a vehicle at a time [ns].
+
+        Raises:
+            OSError: a key can neither be read nor written.
+        """
+        month = self._month(time // _DAY_NS)
+        pseudonym = self._known.get((month, vehicle))
+        if pseudonym is None:
+            digest = blake2b(vehicle.encode(), key=self._key(month), digest_size=_DIGEST_BYTES)
+            pseudonym = self._known[month, vehicle] = digest.hexdigest()
+        return pseudonym
+
+    def _month(self, day: int) -> str:
+        month = self._month_of_day.get(day)
+        if month is None:
+            month = self._month_of_day[day] = f"{datetime.fromtimestamp(day * 86400, UTC):%Y-%m}"
+        return month
+
+    def _key(self, month: str) -> bytes:
+        if month not in self._keys:
+            path = self._folder / f"{month}.key"
+            if not path.exists():
+                self._make(path)
+            self._keys[month] = path.read_bytes()
+        return self._keys[month]
+
+    def _make(self, path: Path) -> None:
+        self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        draft = path.with_suffix(".tmp")
+        with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
+            file.write(secrets.token_bytes(KEY_BYTES))
+            file.flush()
+            os.fsync(file.fileno())
+        draft.rename(path)
+        sync_directory(self._folder)

@@ -1,0 +1,111 @@
+"""`fleet-service run | query | watch`. Heavy imports wait until a command needs them, so that help comes at once."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+from schemas.errors import InputError
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command.
+
+    Returns:
+        0, or 2 after a one-line error that names the field and the fix.
+    """
+    arguments = _parser().parse_args(argv)
+    try:
+        return int(arguments.command(arguments))
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except BrokenPipeError:  # the reader of our output left: nobody to tell
+        sys.stderr.close()
+        return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser("fleet-service", description="One live map of grip from many vehicles.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    run = commands.add_parser("run", help="take observations in, serve the map, keep the archive")
+    run.add_argument("--config", metavar="FILE", help="JSON; every setting has a default")
+    run.add_argument("--archive", metavar="DIR", type=Path, required=True, help="one service per archive")
+    run.set_defaults(command=_run)
+
+    query = commands.add_parser("query", help="ask the map once")
+    query.add_argument("--bbox", metavar="W,S,E,N", help="degrees; without it, everything")
+    query.add_argument("--route", metavar="LON,LAT|LON,LAT", help="the cells ahead, in their order")
+    query.add_argument("--min-vehicles", metavar="K", help="only cells of K vehicles or more")
+    query.add_argument("--at", metavar="TIME", help="the map as it was, e.g. 2026-01-31T07:00:00Z")
+    query.add_argument("--basis", metavar="borrowed", help="also cells that only neighbours speak for")
+    query.add_argument("--format", metavar="arrow|geojson|json", help="arrow (default) prints a table")
+    query.add_argument("--out", metavar="FILE", type=Path, help="write the answer there")
+    _connection(query)
+    query.set_defaults(command=_query)
+
+    watch = commands.add_parser("watch", help="print tiles and alerts as they change, until Ctrl-C")
+    watch.add_argument("--bbox", metavar="W,S,E,N", help="only tiles that touch this box")
+    _connection(watch)
+    watch.set_defaults(command=_watch)
+    return parser
+
+
+def _connection(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--connect", metavar="ENDPOINT", help="router, e.g. tcp/127.0.0.1:7447")
+    parser.add_argument("--config", metavar="FILE", help="JSON with a `zenoh` section, as for run")
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from fleet_service.service import Service
+    from schemas.config import ServiceConfig, load
+
+    stop = stop_on_signals()
+    config = load(arguments.config, ServiceConfig)
+    try:
+        service = Service(config, arguments.archive, lambda line: print(line, flush=True))
+    except OSError as error:
+        problem = f"cannot use {error.filename} ({error.strerror})"
+        raise InputError("archive", problem, "give a folder you may read and write") from error
+    service.run(stop)
+    return 0
+
+
+def _query(arguments: argparse.Namespace) -> int:
+    from fleet_service import client
+
+    asked = {name: getattr(arguments, name) for name in ("bbox", "route", "min_vehicles", "at", "basis", "format")}
+    parameters = {name: value for name, value in asked.items() if value is not None}
+    answer = client.ask(client.settings(arguments.connect, arguments.config), parameters)
+    if arguments.out is not None:
+        client.write(answer, arguments.out)
+    else:
+        print(client.text(answer))
+    return 0
+
+
+def _watch(arguments: argparse.Namespace) -> int:
+    from fleet_service import client
+
+    stop = stop_on_signals()
+    client.watch(
+        client.settings(arguments.connect, arguments.config), arguments.bbox, stop, lambda s: print(s, flush=True)
+    )
+    return 0
+
+
+def stop_on_signals() -> threading.Event:
+    """An event that SIGTERM and Ctrl-C set."""
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    return stop
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,156 @@
+"""A client of the map: ask once, or watch. What the commands `query` and `watch` do."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import pyarrow as pa
+import zenoh
+
+from schemas import grid, keys, query, tables, transport, wire
+from schemas.config import ServiceConfig, ZenohSettings, load
+from schemas.errors import InputError
+from schemas.query import Format
+
+TIMEOUT_S: Final = 10.0
+SHOWN: Final = ("latitude", "longitude", "sector", "mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehicles",
+                "observations", "age_s")  # fmt: skip
+_HEADING: Final = ("east", "north", "west", "south")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """All replies to one query, joined; `table` for arrow, else `document`."""
+
+    table: pa.Table | None
+    document: dict[str, object] | None
+
+
+def settings(connect: str | None, config: Path | str | None) -> ZenohSettings:
+    """Connection from the command line: the configuration's, with `connect` in place of its endpoints."""
+    found = load(config, ServiceConfig).zenoh
+    return found if connect is None else found.model_copy(update={"connect": [connect]})
+
+
+def ask(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
+    """Ask all services for the map.
+
+    Raises:
+        InputError: the query is refused, here or by a service, or no router answers.
+    """
+    form = query.parse(parameters).format
+    selector = f"{keys.ROOT}/map/**" + ("?" + ";".join(f"{k}={v}" for k, v in parameters.items()) if parameters else "")
+    payloads = []
+    with _session(connection) as session:
+        for reply in session.get(selector, timeout=TIMEOUT_S):
+            if reply.ok is None:
+                problem = reply.err.payload.to_string() if reply.err else "no reply"
+                field, _, rest = problem.partition(": ")
+                raise InputError(field if rest else "query", rest or problem, "see above")
+            payloads.append((str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
+    return _joined(form, [payload for _, payload in sorted(payloads)])
+
+
+def _session(connection: ZenohSettings) -> zenoh.Session:
+    try:
+        return zenoh.open(transport.configuration(connection))
+    except zenoh.ZError as error:
+        raise InputError("connect", f"no router at {connection.connect}", "start one, or name its endpoint") from error
+
+
+def _joined(form: Format, payloads: list[bytes]) -> Answer:
+    if form is Format.ARROW:
+        parts = [pa.ipc.open_stream(payload).read_all() for payload in payloads]
+        return Answer(pa.concat_tables(parts) if parts else tables.MAP_SCHEMA.empty_table(), None)
+    documents = [json.loads(payload) for payload in payloads]
+    if form is Format.JSON:
+        return Answer(None, {"tiles": documents})
+    features = [feature for document in documents for feature in document["features"]]
+    return Answer(None, {"type": "FeatureCollection", "features": features})
+
+
+def write(answer: Answer, path: Path) -> None:
+    """Write an answer: an Arrow stream, or JSON.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    try:
+        if answer.table is None:
+            path.write_text(json.dumps(answer.document))
+        else:
+            with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_stream(sink, answer.table.schema) as writer:
+                writer.write_table(answer.table)
+    except OSError as error:
+        raise InputError("out", f"cannot write {path} ({error.strerror})", "name a file you may write") from error
+
+
+def text(answer: Answer) -> str:
+    """An answer for the terminal."""
+    if answer.table is None:
+        return json.dumps(answer.document, indent=1)
+    lines = ["  ".join(f"{name:>12}" for name in SHOWN)]
+    for row in answer.table.select(SHOWN).to_pylist():
+        row["sector"] = _HEADING[row["sector"]]
+        lines.append("  ".join(f"{_shown(name, row[name]):>12}" for name in SHOWN))
+    return "\n".join([*lines, f"{answer.table.num_rows} cells"])
+
+
+def _shown(name: str, value: object) -> str:
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:.6f}" if name in ("latitude", "longitude") else f"{value:.2f}"
+
+
+def watch(connection: ZenohSettings, bbox: str | None, stop: threading.Event, say: Callable[[str], None]) -> None:
+    """Say a line per changed tile and per alert until `stop` is set; waits for a router.
+
+    Raises:
+        InputError: the box cannot be read.
+    """
+    box = query.parse({} if bbox is None else {"bbox": bbox}).bbox
+
+    def near(key: str) -> int | None:
+        tile = keys.parse(key).place
+        if tile is None or box is None:
+            return tile
+        west, south, east, north = grid.bounds(tile, grid.TILE_ZOOM)
+        return tile if east > box[0] and north > box[1] and west < box[2] and south < box[3] else None
+
+    def changed(sample: zenoh.Sample) -> None:
+        tile = near(str(sample.key_expr))
+        if tile is not None:
+            say(_tile_line(tile, pa.ipc.open_stream(sample.payload.to_bytes()).read_all()))
+
+    def alerted(sample: zenoh.Sample) -> None:
+        if near(str(sample.key_expr)) is not None:
+            say(_alert_line(wire.decode_alert(sample.payload.to_bytes())))
+
+    session = transport.open_session(connection, stop)
+    if session is None:
+        return
+    with session:
+        session.declare_subscriber(f"{keys.ROOT}/map/**", changed)
+        session.declare_subscriber(f"{keys.ROOT}/alert/**", alerted)
+        say("watching")
+        stop.wait()
+
+
+def _tile_line(tile: int, table: pa.Table) -> str:
+    measured = sum(basis == "measured" for basis in table["basis"].to_pylist())
+    slippery = int((table["p_slippery"].to_numpy() > 0.5).sum())
+    name = grid.quadkey(tile, grid.TILE_ZOOM)
+    return f"tile {name}: {table.num_rows} cells, {measured} measured, {slippery} likely slippery"
+
+
+def _alert_line(alert: wire.Alert) -> str:
+    word = "RAISED" if alert.raised else "cleared"
+    return (
+        f"alert {word} at {alert.latitude:.6f}, {alert.longitude:.6f} heading {_HEADING[alert.sector]}: "
+        f"mu {alert.mu:.2f} [{alert.mu_lower:.2f}, {alert.mu_upper:.2f}], {alert.vehicles} vehicles; {alert.reason}"
+    )

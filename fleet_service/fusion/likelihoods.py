@@ -1,0 +1,83 @@
+"""What one visit says about μ: from a likelihood, a posterior with interval, or the grip used. Vectorised, pure.
+
+Legend
+    ℓ    log-likelihood on the friction grid, maximum 0        (n, 32), nats
+    μ̂    posterior median that a sender gave                    (n,)
+    u    grip used, "μ is at least this"                        (n,)
+    Φ    standard normal distribution function
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr
+
+from fleet_service.fusion import constants as c
+from schemas import mugrid
+from schemas.numeric import BoolArray, ByteArray, FloatArray
+
+_QUANTILE_95 = 1.6448536269514722  # of the standard normal: what lies between median and 95 %
+
+
+def evidence(columns: Mapping[str, NDArray[Any]], told: BoolArray) -> ByteArray:
+    """Log-likelihood of each visit in steps of 1/16 nat below its maximum, (n, 32).
+
+    Args:
+        columns: `log_likelihood` (n, 32); `mu`, `mu_lower`, `mu_upper`, `mu_utilised`, each (n,), NaN where absent.
+        told: (n,) whether the sender gave a likelihood.
+
+    A likelihood that falls towards the upper end is a value, any other a bound; see `levelled`. A posterior counts as a
+    value where `mu_utilised ≥ 0.6·mu`; otherwise, and where there is no `mu`, only "at least mu_utilised" remains.
+    A visit with none of them is flat.
+    """
+    sent = columns["log_likelihood"]
+    out = levelled(sent - sent.min(axis=1, keepdims=True), columns["mu_utilised"])
+    rest = np.flatnonzero(~told)
+    if len(rest):
+        mu, lower, upper, used = (
+            columns[n][rest].astype(np.float64) for n in ("mu", "mu_lower", "mu_upper", "mu_utilised")
+        )
+        value = used >= c.VALUE_UTILISATION * mu  # False where either is NaN
+        log_likelihood = np.where(value[:, None], posterior(mu, lower, upper), at_least(used))
+        out[rest] = mugrid.encode_log_likelihood(log_likelihood)
+    return out
+
+
+def levelled(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
+    """Likelihoods (n, 32) that claim no more than the grip used (n,) supports.
+
+    A bound is made flat above `used`. A value keeps its fall above its maximum and its rise below `used`; what it
+    claims in between, that there is more grip than was used, counts CURVE_SHARE. Where `used` is NaN nothing changes.
+    """
+    known = ~np.isnan(used)
+    level = np.nan_to_num(used)
+    above = level[:, None] <= mugrid.CENTRES
+    bound = steps[:, -1] < c.VALUE_DROP_STEPS
+    place = np.clip(np.searchsorted(mugrid.EDGES, level) - 1, 0, mugrid.BINS - 1)[:, None]
+    floor = np.take_along_axis(np.minimum.accumulate(steps, axis=1), place, axis=1)
+    flat = np.where(above, 0, np.maximum(steps, floor) - floor)
+    between = above & (np.arange(mugrid.BINS) < steps.argmin(axis=1)[:, None])
+    value = np.where(between, np.rint(c.CURVE_SHARE * steps), steps)
+    return np.where(known[:, None], np.where(bound[:, None], flat, value), steps).astype(np.uint8)
+
+
+def at_least(used: FloatArray) -> FloatArray:
+    """ℓ(μ) = ln Φ((μ - u) / σ_u): rises to u and is flat above; flat everywhere where u is NaN. (n, 32)."""
+    return log_ndtr((mugrid.CENTRES - np.nan_to_num(used, nan=-np.inf)[:, None]) / c.UTILISED_STD)
+
+
+def posterior(mu: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
+    """ℓ of a median with 5 % and 95 % bounds: a normal with one standard deviation to each side. (n, 32)."""
+    below = _std(mu - lower)[:, None]
+    above = _std(upper - mu)[:, None]
+    distance = mugrid.CENTRES - np.nan_to_num(mu)[:, None]
+    return -0.5 * np.square(distance / np.where(distance < 0, below, above))
+
+
+def _std(to_bound: FloatArray) -> FloatArray:
+    std = np.nan_to_num(to_bound / _QUANTILE_95, nan=c.POSTERIOR_STD)
+    return np.maximum(std, c.POSTERIOR_STD_LEAST)

@@ -1,0 +1,178 @@
+"""The archive: order of fsync, rename and acknowledgement; faults of the disk; lock; pseudonyms."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+
+from fleet_service.archive import segments
+from fleet_service.archive.files import lock
+from fleet_service.archive.pseudonyms import Pseudonyms, number
+from fleet_service.engine import Engine
+from fleet_service.ingest import Message
+from schemas import tables, wire
+from schemas.config import ServiceConfig
+from schemas.errors import InputError
+from schemas.wire import Kind
+from tests.fleet_service.examples import SECOND, batch, key
+
+MONTH = 31 * 86_400 * SECOND
+
+
+def sent(vehicle: str, seq: int, told: bool = True) -> Message:
+    one = batch(vehicle, seq, time.time_ns() - SECOND, [0.8, 0.7], told=told)
+    return Message(Kind.OBSERVATION, key(vehicle), wire.encode(one), wire.ENCODING[Kind.OBSERVATION])
+
+
+def settled(acks: list[tuple[str, bytes]]) -> dict[str, list[tuple[int, int]]]:
+    return {vehicle: [r for s in wire.decode_ack(ack)[1] for r in s.durable] for vehicle, ack in acks}
+
+
+@pytest.fixture
+def engine(tmp_path: Path) -> Iterator[Engine]:
+    """On an empty archive."""
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        yield engine
+
+
+def test_an_acknowledgement_follows_fsync_rename_and_fsync_of_the_folder(
+    engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    order: list[str] = []
+    fsync, rename = os.fsync, Path.rename
+
+    def seen_fsync(handle: int) -> None:
+        order.append("folder" if os.path.isdir(f"/proc/self/fd/{handle}") else "file")  # noqa: PTH112
+        fsync(handle)
+
+    def seen_rename(path: Path, target: Path) -> Path:
+        order.append("rename")
+        return rename(path, target)
+
+    engine.take([sent("sim-001", 1)], time.time_ns())
+    monkeypatch.setattr(os, "fsync", seen_fsync)
+    monkeypatch.setattr(Path, "rename", seen_rename)
+    acks = engine.flush()
+    order.append("ack")
+    assert order == ["file", "rename", "folder", "ack"]
+    assert settled(acks) == {"sim-001": [(1, 1)]}
+
+
+def test_nothing_is_acknowledged_while_the_disk_fails_and_all_of_it_afterwards(engine: Engine, tmp_path: Path) -> None:
+    shutil.move(tmp_path / "inbox", tmp_path / "gone")
+    engine.take([sent("sim-001", 1)], time.time_ns())
+    assert engine.flush() == []
+    engine.take([sent("sim-001", 2), sent("sim-001", 1)], time.time_ns())
+    assert engine.flush() == []
+    assert engine.counts["segment_failures"] == 2
+    shutil.move(tmp_path / "gone", tmp_path / "inbox")
+    assert settled(engine.flush()) == {"sim-001": [(1, 2)]}
+    assert sum(pq.read_table(path).num_rows for path in segments.paths(tmp_path, Kind.OBSERVATION)) == 4
+
+
+def test_a_second_service_on_an_archive_refuses_to_start(engine: Engine, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="^archive: .* belongs to a running service; "):
+        lock(tmp_path)
+    engine.close()
+    lock(tmp_path).close()
+
+
+def test_a_damaged_segment_is_set_aside_and_the_others_are_read(engine: Engine, tmp_path: Path) -> None:
+    for seq in (1, 2, 3):
+        engine.take([sent("sim-001", seq)], time.time_ns())
+        engine.flush()
+    engine.close()
+    damaged = segments.paths(tmp_path, Kind.OBSERVATION)[1]
+    damaged.write_bytes(damaged.read_bytes()[:-20])
+    with closing(Engine(ServiceConfig(), tmp_path)) as again:
+        assert again.fusion.live.visits[0] == 4
+        assert damaged.with_name(damaged.name + ".bad").exists()
+        again.take([sent("sim-001", seq) for seq in (1, 2, 3)], time.time_ns())
+        assert again.counts[Kind.OBSERVATION] == 2
+        assert again.counts["duplicates"] == 2
+
+
+def test_what_a_died_service_had_half_written_is_removed(engine: Engine, tmp_path: Path) -> None:
+    engine.close()
+    draft = tmp_path / "inbox" / "shard-0-0000000001-00000001.parquet.tmp"
+    draft.write_bytes(b"PAR1 half")
+    Engine(ServiceConfig(), tmp_path).close()
+    assert not draft.exists()
+
+
+def test_no_segment_name_is_used_twice(tmp_path: Path) -> None:
+    for seq in range(1, 4):
+        engine = Engine(ServiceConfig(), tmp_path)
+        engine.take([sent("sim-001", seq)], time.time_ns())
+        engine.flush()
+        engine.close()
+    assert len(segments.paths(tmp_path, Kind.OBSERVATION)) == 3
+
+
+def test_rows_read_back_are_the_rows_written(engine: Engine, tmp_path: Path) -> None:
+    engine.take([sent("sim-001", 1), sent("sim-002", 1, told=False)], time.time_ns())
+    engine.flush()
+    (table,) = segments.read(tmp_path, Kind.OBSERVATION)
+    rows = segments.rows_of(table)
+    assert rows["told"].tolist() == [True, True, False, False]
+    assert not rows["log_likelihood"][2:].any()
+    again = segments.rows_of(segments.table_of(Kind.OBSERVATION, rows))
+    assert again.keys() == rows.keys()
+    for name, column in rows.items():
+        np.testing.assert_array_equal(again[name], column)
+
+
+def test_other_tools_read_the_segments(engine: Engine, tmp_path: Path) -> None:
+    engine.take([sent("sim-001", 1), sent("sim-002", 1, told=False)], time.time_ns())
+    engine.flush()
+    pattern = str(tmp_path / "inbox" / "*.parquet")
+    with duckdb.connect() as db:
+        query = "select count(*), count(distinct vehicle), count(log_likelihood), min(mu) from read_parquet(?)"
+        assert db.execute(query, [pattern]).fetchone() == (4, 2, 2, pytest.approx(0.7))
+    (path,) = segments.paths(tmp_path, Kind.OBSERVATION)
+    assert list(pd.read_parquet(path).columns) == tables.OBSERVATION_ARCHIVE.names
+
+
+def test_a_pseudonym_holds_for_its_month_and_across_restarts_and_not_beyond(tmp_path: Path) -> None:
+    now = time.time_ns()
+    first, again = Pseudonyms(tmp_path), Pseudonyms(tmp_path)
+    name = first.of("sim-001", now)
+    assert again.of("sim-001", now) == name
+    assert first.of("sim-002", now) != name
+    assert first.of("sim-001", now - 2 * MONTH) != name
+    assert -(2**63) <= number(name) < 2**63
+
+
+def test_keys_are_for_the_service_alone_and_a_destroyed_one_forgets(tmp_path: Path) -> None:
+    now = time.time_ns()
+    name = Pseudonyms(tmp_path).of("sim-001", now)
+    (path,) = tmp_path.glob("*.key")
+    assert path.stat().st_mode & 0o777 == 0o600
+    path.unlink()
+    assert Pseudonyms(tmp_path).of("sim-001", now) != name
+
+
+def test_a_late_observation_is_archived_with_its_mark_and_not_fused(engine: Engine, tmp_path: Path) -> None:
+    now = time.time_ns()
+    old = batch("sim-002", 1, now - 1000 * SECOND, [0.3])
+    engine.take([sent("sim-001", 1)], now)
+    engine.take([Message(Kind.OBSERVATION, key("sim-002"), wire.encode(old), "")], now)
+    assert settled(engine.flush()) == {"sim-001": [(1, 1)], "sim-002": [(1, 1)]}
+    assert engine.counts["late"] == 1
+    (table,) = segments.read(tmp_path, Kind.OBSERVATION)
+    assert sorted(zip(table["late"].to_pylist(), table["weight"].to_pylist(), strict=True)) == [
+        (False, 0.75), (False, 0.75), (True, 0.0),
+    ]  # fmt: skip
+    engine.close()
+    with closing(Engine(ServiceConfig(), tmp_path)) as again:
+        np.testing.assert_array_equal(again.fusion.live.visits[: again.fusion.size], [2])

@@ -1,0 +1,86 @@
+"""Fixtures: a router of this process, a running service, a client."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import zenoh
+from hypothesis import settings
+
+from deploy.router import open_router
+from fleet_service.service import Service
+from schemas.config import ServiceConfig, ZenohSettings
+from schemas.transport import open_session
+from tests.waiting import until
+
+settings.register_profile("compiled", deadline=None)  # the first example waits for the compiler
+settings.load_profile("compiled")
+
+PUT_S = 0.1
+
+
+@dataclass
+class Running:
+    """A service in a thread of this process."""
+
+    service: Service
+    lines: list[str]
+    thread: threading.Thread
+    stop: threading.Event
+
+    def end(self) -> None:
+        self.stop.set()
+        self.thread.join(10.0)
+        assert not self.thread.is_alive(), "the service does not leave"
+
+
+@pytest.fixture(scope="session")
+def router() -> Iterator[ZenohSettings]:
+    """How to reach a router of this process."""
+    session, endpoints = open_router(listen="tcp/127.0.0.1:0")
+    with session:
+        yield ZenohSettings(connect=endpoints)
+
+
+@pytest.fixture
+def session(router: ZenohSettings) -> Iterator[zenoh.Session]:
+    """A client's session."""
+    opened = open_session(router)
+    assert opened is not None
+    with opened:
+        yield opened
+
+
+@contextmanager
+def running(router: ZenohSettings, root: Path, **changed: object) -> Iterator[Running]:
+    """A service on an archive; ends with the block."""
+    config = ServiceConfig(zenoh=router, put_s=PUT_S, segment_s=0.1, **changed)  # type: ignore[arg-type]
+    lines: list[str] = []
+    service = Service(config, root, lines.append)
+    stop = threading.Event()
+    thread = threading.Thread(target=service.run, args=(stop,))
+    thread.start()
+    run = Running(service, lines, thread, stop)
+    try:
+        until(lambda: any(line.startswith("ready") for line in lines))
+        yield run
+    finally:
+        run.end()
+
+
+@pytest.fixture
+def service(router: ZenohSettings, tmp_path: Path) -> Iterator[Running]:
+    """A service on an empty archive."""
+    with running(router, tmp_path / "archive") as run:
+        yield run
+
+
+@pytest.fixture
+def start(router: ZenohSettings) -> Callable[..., object]:
+    """Start a service on a given archive: `with start(root): ...`."""
+    return lambda root, **changed: running(router, root, **changed)

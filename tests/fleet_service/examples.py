@@ -1,0 +1,100 @@
+"""Observations and batches made by hand, and what a cell believes after them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fleet_service.fusion import Fusion, Observations, evidence
+from fleet_service.fusion.belief import SLIPPERY_SHARE
+from schemas import grid, keys, mugrid, wire
+from schemas.numeric import FloatArray
+from schemas.wire import Batch, Kind
+
+LATITUDE, LONGITUDE = 57.7, 11.97
+CELL = int(grid.cell_of(LATITUDE, LONGITUDE))
+REGION = int(grid.region_of(CELL))
+TILE = int(grid.tile_of(CELL))
+START = 1_700_000_000 * 10**9  # ns
+SECOND = 10**9
+STD = 0.06  # of a good visit's value
+
+
+def value(mu: Sequence[float] | FloatArray, std: float = STD) -> FloatArray:
+    """Log-likelihoods of visits that saw μ, (n, 32)."""
+    return -0.5 * np.square((mugrid.CENTRES - np.asarray(mu, float)[:, None]) / std)
+
+
+def at_least(used: Sequence[float] | FloatArray) -> FloatArray:
+    """Log-likelihoods of visits that only used so much, (n, 32)."""
+    return np.where(np.asarray(used, float)[:, None] > mugrid.CENTRES, -8.0, 0.0)
+
+
+def observations(
+    seconds: Sequence[float] | FloatArray,
+    vehicles: Sequence[int] | FloatArray,
+    log_likelihood: FloatArray,
+    cell: int | Sequence[int] = CELL,
+    second: int = -1,
+) -> Observations:
+    """Visits at START + seconds; place in the stream follows the order."""
+    n = len(seconds)
+    whole = np.zeros(n, np.int64)
+    time = START + (np.asarray(seconds, float) * SECOND).astype(np.int64)
+    vehicle = np.asarray(vehicles, np.int64)
+    return Observations(
+        time, whole + cell, np.zeros(n, np.int8), np.full(n, second, np.int8), vehicle, vehicle * 7 + 1, whole + REGION,
+        np.arange(n), mugrid.encode_log_likelihood(log_likelihood),
+    )  # fmt: skip
+
+
+def posterior_evidence(mu: float, lower: float, upper: float, used: float) -> FloatArray:
+    """Log-likelihood (32,) of a sender without one."""
+    names = ("mu", "mu_lower", "mu_upper", "mu_utilised")
+    columns = dict(zip(names, (np.array([v]) for v in (mu, lower, upper, used)), strict=True))
+    columns["log_likelihood"] = np.zeros((1, mugrid.BINS), np.uint8)
+    return mugrid.decode_log_likelihood(evidence(columns, np.array([False])))[0]
+
+
+def belief(fusion: Fusion, cell: int = CELL, sector: int = 0, now: int | None = None) -> FloatArray:
+    """Belief of one cell (32,) at its last observation, or at `now`."""
+    slot = fusion.slots_of(np.array([cell]), np.array([sector]))
+    assert slot[0] >= 0, "nobody was there"
+    return fusion.beliefs(slot, int(fusion.live.time[slot[0]]) if now is None else now)[0]
+
+
+def interval(p: FloatArray) -> tuple[float, float]:
+    """5 % and 95 % quantile."""
+    return float(mugrid.quantiles(p, 0.05)), float(mugrid.quantiles(p, 0.95))
+
+
+def slippery(p: FloatArray) -> float:
+    """P(μ < 0.4)."""
+    return float(p @ SLIPPERY_SHARE)
+
+
+def batch(
+    vehicle: str, seq: int, now: int, mu: Sequence[float], /, *, told: bool = True, used: float = 0.5, **changed: object
+) -> Batch:
+    """A batch of visits in one cell, one second apart and ending at `now`; `changed` overrides its columns."""
+    n = len(mu)
+    leave = now - np.arange(n)[::-1] * SECOND
+    columns: dict[str, np.ndarray] = {  # type: ignore[type-arg]
+        "enter_time": leave - SECOND, "leave_time": leave, "latitude": np.full(n, LATITUDE),
+        "longitude": np.full(n, LONGITUDE), "cell": np.full(n, CELL), "sector": np.zeros(n, np.int8),
+        "yaw": np.zeros(n, np.float32), "position_std": np.ones(n, np.float32), "speed": np.full(n, 15.0, np.float32),
+        "mu": np.array(mu, np.float32), "mu_lower": np.array(mu, np.float32) - 0.1,
+        "mu_upper": np.array(mu, np.float32) + 0.1, "mu_utilised": np.full(n, used, np.float32),
+    }  # fmt: skip
+    if told:
+        columns["log_likelihood"] = mugrid.encode_log_likelihood(value(mu))
+    columns.update({name: np.asarray(column) for name, column in changed.items()})
+    columns = {name: column.astype(wire.column_types(Kind.OBSERVATION)[name]) for name, column in columns.items()}
+    boot = 1 + sum(vehicle.encode())
+    return Batch(Kind.OBSERVATION, vehicle, boot, REGION, seq, 1, columns, "ckf")
+
+
+def key(vehicle: str) -> str:
+    """The observation key of a vehicle in the region of the examples."""
+    return keys.observation_key(REGION, vehicle)

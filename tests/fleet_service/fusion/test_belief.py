@@ -1,0 +1,95 @@
+"""Theorems of one cell's belief: what time and votes can and cannot do to it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet_service.fusion import belief as b
+from fleet_service.fusion import constants as c
+from schemas import mugrid
+
+_rising = st.lists(st.floats(0.0, 1.0), min_size=32, max_size=32).map(np.sort).filter(lambda p: p.sum() > 0.1)
+_steps = st.lists(st.integers(0, 255), min_size=32, max_size=32).map(lambda e: np.array(e, np.uint8))
+
+
+@given(_steps, st.floats(0.0, 1e6), st.floats(0.15, 1.0), st.floats(0.0, 1.0))
+def test_a_belief_stays_a_probability_whatever_time_and_votes_do(
+    evidence: np.ndarray, seconds: float, contamination: float, power: float
+) -> None:
+    p, vote = mugrid.PRIOR.copy(), np.empty(32)
+    for _ in range(3):
+        b.forget(p, seconds)
+        b.spread(evidence, b.kind_of(evidence), vote)
+        b.vote(p, vote, contamination, power)
+    assert p.min() >= 0.0
+    assert p.sum() == pytest.approx(1.0, abs=1e-12)
+
+
+@given(st.floats(0.0, 1e7))
+def test_time_leaves_the_prior_where_it_is(seconds: float) -> None:
+    p = mugrid.PRIOR.copy()
+    b.forget(p, seconds)
+    np.testing.assert_allclose(p, mugrid.PRIOR, atol=1e-15)
+
+
+@given(_rising, st.floats(0.0, 1e5))
+def test_time_keeps_a_rising_belief_rising(p: np.ndarray, seconds: float) -> None:
+    p = p / p.sum()
+    b.forget(p, seconds)
+    assert np.diff(p).min() >= -1e-12
+
+
+@given(_steps.filter(lambda e: int(e[-1]) - int(e.min()) < 16), st.integers(1, 30))
+def test_no_number_of_bounds_lowers_the_upper_end(evidence: np.ndarray, votes: int) -> None:
+    p, vote = mugrid.PRIOR.copy(), np.empty(32)
+    assert b.kind_of(evidence) == b.BOUND
+    b.spread(evidence, b.BOUND, vote)
+    for _ in range(votes):
+        b.vote(p, vote, c.CONTAMINATION, 1.0)
+        b.forget(p, 60.0)
+    assert mugrid.quantiles(p, 0.95) >= mugrid.quantiles(mugrid.PRIOR, 0.95) - 1e-9
+
+
+@pytest.mark.parametrize("seconds", [60.0, 1800.0, 20_000.0])
+def test_drift_keeps_the_mean_and_adds_its_variance(seconds: float) -> None:
+    p = np.zeros(32)
+    p[16] = 1.0
+    b.forget(p, seconds)
+    change = -np.expm1(-seconds / c.CHANGE_S)
+    drifted = (p - change / 32) / (1.0 - change)
+    mean = drifted @ mugrid.CENTRES
+    variance = drifted @ (mugrid.CENTRES - mean) ** 2
+    assert mean == pytest.approx(mugrid.CENTRES[16], abs=1e-9)
+    assert variance == pytest.approx(c.DRIFT_PER_ROOT_HOUR**2 * seconds / 3600.0, rel=1e-6)
+
+
+def test_the_bias_kernel_is_a_probability_for_every_road() -> None:
+    kernel = b.bias_kernel()
+    np.testing.assert_allclose(kernel.sum(axis=1), 1.0, atol=1e-14)
+    middle = kernel[20] @ mugrid.CENTRES
+    spread = np.sqrt(kernel[20] @ (mugrid.CENTRES - middle) ** 2)
+    assert spread == pytest.approx(np.hypot(c.BIAS_RELATIVE * mugrid.CENTRES[20], c.BIAS_ABSOLUTE), rel=0.02)
+
+
+def test_one_vote_moves_the_odds_by_a_bounded_factor() -> None:
+    evidence = np.full(32, 255, np.uint8)
+    evidence[4] = 0
+    vote, p = np.empty(32), mugrid.PRIOR.copy()
+    b.spread(evidence, b.VALUE, vote)
+    b.vote(p, vote, c.CONTAMINATION, 1.0)
+    assert p.max() / p.min() < 32 / c.CONTAMINATION
+
+
+def test_a_vote_of_no_weight_or_no_power_changes_nothing() -> None:
+    evidence = np.arange(32, dtype=np.uint8) * 8
+    vote = np.empty(32)
+    b.spread(evidence, b.VALUE, vote)
+    for contamination, power in ((1.0, 1.0), (c.CONTAMINATION, 0.0)):
+        p = np.linspace(1.0, 2.0, 32)
+        p /= p.sum()
+        before = p.copy()
+        b.vote(p, vote, contamination, power)
+        np.testing.assert_allclose(p, before, atol=1e-15)

@@ -1,0 +1,140 @@
+"""The commands as a person types them."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+import zenoh
+
+from deploy.router import open_router
+from fleet_service.cli import main
+from schemas import wire
+from schemas.config import ZenohSettings
+from schemas.transport import open_session
+from tests.fleet_service.conftest import Running, running
+from tests.fleet_service.examples import CELL, SECOND, batch, key
+from tests.fleet_service.test_service import Fleet
+from tests.waiting import until
+
+COMMAND = [sys.executable, "-m", "fleet_service.cli"]
+
+
+@pytest.fixture
+def fed(service: Running, session: zenoh.Session) -> Fleet:
+    """A service with three cars on ice."""
+    fleet = Fleet(session).meet()
+    fleet.settle(*(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(3)))
+    return fleet
+
+
+def ask(router: ZenohSettings, *words: str) -> int:
+    return main(["query", "--connect", router.connect[0], *words])
+
+
+@pytest.mark.usefixtures("fed")
+def test_query_prints_a_table_or_json_and_writes_files(
+    router: ZenohSettings, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert ask(router) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split()[:4] == ["latitude", "longitude", "sector", "mu"]
+    assert "measured" in lines[1]
+    assert lines[-1] == "1 cells"
+    assert ask(router, "--format", "geojson", "--bbox", "11,57,12,58", "--min-vehicles", "2") == 0
+    assert json.loads(capsys.readouterr().out)["features"][0]["properties"]["cell"] == CELL
+    assert ask(router, "--format", "json", "--out", str(tmp_path / "a.json")) == 0
+    assert json.loads((tmp_path / "a.json").read_text())["tiles"][0]["cells"][0]["vehicles"] == 3
+    assert ask(router, "--out", str(tmp_path / "a.arrow")) == 0
+    with pa.OSFile(str(tmp_path / "a.arrow")) as file:
+        assert pa.ipc.open_stream(file).read_all()["cell"].to_pylist() == [CELL]
+
+
+@pytest.mark.parametrize(
+    ("words", "start"),
+    [
+        (["--bbox", "1,2,3"], "error: bbox: "),
+        (["--format", "xml"], "error: format: "),
+        (["--route", "0,0|90,0"], "error: route: "),
+        (["--config", "nowhere.json"], "error: config: "),
+        (["--out", "/nowhere/at/all"], "error: out: "),
+    ],
+)
+@pytest.mark.usefixtures("service")
+def test_a_bad_query_is_one_line_that_names_the_field_and_exit_code_2(
+    router: ZenohSettings, capsys: pytest.CaptureFixture[str], words: list[str], start: str
+) -> None:
+    assert ask(router, *words) == 2
+    err = capsys.readouterr().err
+    assert err.startswith(start)
+    assert err.count("\n") == 1
+
+
+def test_a_missing_router_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["query", "--connect", "tcp/127.0.0.1:1"]) == 2
+    assert capsys.readouterr().err.startswith("error: connect: no router at ")
+
+
+def test_a_taken_archive_is_said(tmp_path: Path, router: ZenohSettings, capsys: pytest.CaptureFixture[str]) -> None:
+    with running(router, tmp_path):
+        handlers = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)]
+        try:
+            assert main(["run", "--archive", str(tmp_path)]) == 2
+        finally:
+            for number, handler in zip((signal.SIGTERM, signal.SIGINT), handlers, strict=True):
+                signal.signal(number, handler)
+    assert capsys.readouterr().err.startswith("error: archive: ")
+
+
+def test_run_and_watch_as_processes_from_start_to_signal(
+    router: ZenohSettings, session: zenoh.Session, tmp_path: Path
+) -> None:
+    config = tmp_path / "service.json"
+    config.write_text(json.dumps({"zenoh": {"connect": router.connect}, "put_s": 0.1}))
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    run = subprocess.Popen([*COMMAND, "run", "--config", config, "--archive", tmp_path / "archive"], **pipes)
+    watch = subprocess.Popen([*COMMAND, "watch", "--config", config, "--bbox", "11,57,13,59"], **pipes)
+    with run, watch:
+        assert run.stdout is not None
+        assert watch.stdout is not None
+        assert run.stdout.readline() == "ready: shard-0, 0 cells from the archive\n"
+        assert watch.stdout.readline() == "watching\n"
+        fleet = Fleet(session).meet()
+        fleet.settle(*(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(4)))
+        lines = iter(watch.stdout.readline, "")
+        assert any(line.startswith("alert RAISED at 57.69") for line in lines)
+        assert any(line.startswith("tile 12003202") and "likely slippery" in line for line in lines)
+        for process in (run, watch):
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(10) == 0
+            assert process.stderr is not None
+            assert process.stderr.read() == ""
+        assert "status: 4 observations" in run.stdout.read()
+
+
+def test_the_service_waits_for_a_router_and_survives_its_restart(tmp_path: Path) -> None:
+    router, endpoints = open_router(listen="tcp/127.0.0.1:0")
+    settings = ZenohSettings(connect=endpoints, config={"connect/retry": {"period_init_ms": 50, "period_max_ms": 100}})
+    with running(settings, tmp_path) as run:
+        router.close()
+        router, _ = open_router(listen=endpoints[0])
+        with router:
+            client = open_session(settings)
+            assert client is not None
+            with client:
+                fleet = Fleet(client)
+                sent = batch("sim-001", 1, time.time_ns() - SECOND, [0.8])
+
+                def acknowledged() -> bool:
+                    client.put(key("sim-001"), wire.encode(sent), encoding=wire.ENCODING[sent.kind])
+                    return 1 in fleet.durable["sim-001"]
+
+                until(acknowledged)
+            run.end()
+    assert run.service.engine.fusion.live.visits[0] == 1

@@ -1,0 +1,149 @@
+"""From wheels to map: recorded drives, the agent, a router, the service, and a client that knows only Zenoh."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import zenoh
+
+from deploy.router import open_router
+from edge_agent.cli import main as edge_agent
+from fleet_service.service import Service
+from schemas import mugrid
+from schemas.config import ServiceConfig, ZenohSettings
+from schemas.transport import open_session
+from tests.waiting import until
+
+VEHICLES = ("anna", "bert", "cleo")
+ICE = 0.25
+
+
+class System:
+    """A router and a service in this process, and the folder with what they and the agents leave."""
+
+    def __init__(self, folder: Path, endpoint: str) -> None:
+        self.folder, self.endpoint = folder, endpoint
+        self.said: list[str] = []
+        self.agent = folder / "agent.json"
+        zenoh_settings = {"connect": [endpoint]}
+        self.agent.write_text(json.dumps({"zenoh": zenoh_settings, "spool": str(folder / "spool.sqlite")}))
+        self.config = ServiceConfig(zenoh=ZenohSettings(connect=[endpoint]), segment_s=0.1, put_s=0.1)
+        self.start()
+
+    def start(self) -> None:
+        """Start a service on the archive, as a restart would."""
+        self._stop = threading.Event()
+        service = Service(self.config, self.folder / "archive", self.said.append)
+        self._thread = threading.Thread(target=service.run, args=(self._stop,))
+        before = len(self.said)
+        self._thread.start()
+        until(lambda: any(line.startswith("ready") for line in self.said[before:]))
+
+    def stop(self) -> None:
+        """Let the service flush, acknowledge and leave."""
+        self._stop.set()
+        self._thread.join(30)
+        assert not self._thread.is_alive()
+
+    def drive(self, vehicle: str, manoeuvre: str, mu: float, seed: int) -> None:
+        """Record a drive and publish it as `vehicle`."""
+        log, file, out = (self.folder / f"{vehicle}-{n}" for n in ("log.parquet", "vehicle.json", "estimates.parquet"))
+        words = [
+            "simulate",
+            manoeuvre,
+            "--mu",
+            str(mu),
+            "--seed",
+            str(seed),
+            "--out",
+            str(log),
+            "--vehicle-out",
+            str(file),
+        ]
+        assert edge_agent(words) == 0
+        words = ["replay", str(log), "--vehicle", str(file), "--out", str(out), "--publish", "--name", vehicle]
+        assert edge_agent([*words, "--config", str(self.agent)]) == 0
+
+    def ask(self, parameters: str = "format=json") -> list[dict[str, object]]:
+        """The map's cells as a client without our code gets them."""
+        session = open_session(ZenohSettings(connect=[self.endpoint]))
+        assert session is not None
+        with session:
+            replies = list(session.get(f"gripmap/v1/map/**?{parameters}"))
+        cells: list[dict[str, object]] = []
+        for reply in replies:
+            assert reply.ok is not None, reply.err and reply.err.payload.to_string()
+            answer = json.loads(reply.ok.payload.to_string())
+            cells += answer["cells"] if isinstance(answer, dict) else answer
+        return cells
+
+
+@pytest.fixture
+def system(tmp_path: Path) -> Iterator[System]:
+    router, endpoints = open_router(listen="tcp/127.0.0.1:0")
+    with router:
+        running = System(tmp_path, endpoints[0])
+        try:
+            yield running
+        finally:
+            running.stop()
+
+
+def test_slippery_drives_become_a_slippery_map_that_survives_a_restart(system: System) -> None:
+    for seed, vehicle in enumerate(VEHICLES):
+        system.drive(vehicle, "braking", ICE, seed)
+    cells = system.ask("format=json;min_vehicles=2")
+    assert cells
+    excited = [cell for cell in cells if cell["basis"] == "measured"]
+    assert excited
+    assert np.mean([cell["mu_lower"] <= ICE <= cell["mu_upper"] for cell in excited]) >= 0.8  # type: ignore[operator]
+    assert min(float(str(cell["mu_upper"])) for cell in excited) < 0.5
+    rows = archived(system.folder)
+    assert len(set(rows)) == len(rows)
+    system.stop()
+    system.start()
+    again = {(c["cell"], c["sector"]): c for c in system.ask("format=json;min_vehicles=2")}
+    for cell in cells:
+        found = again[cell["cell"], cell["sector"]]
+        assert found["vehicles"] == cell["vehicles"]
+        assert found["mu"] == pytest.approx(cell["mu"], abs=0.01)  # a second or two of forgetting
+
+
+def archived(folder: Path) -> list[tuple[object, ...]]:
+    """Identities of all archived observations."""
+    rows: list[tuple[object, ...]] = []
+    for path in sorted((folder / "archive" / "inbox").glob("*.parquet")):
+        table = pq.read_table(path)
+        if "log_likelihood" in table.column_names:
+            columns = ("vehicle", "boot", "region", "seq", "row")
+            rows += list(zip(*(table[name].to_pylist() for name in columns), strict=True))
+    return rows
+
+
+def test_a_straight_drive_leaves_bounds_and_the_prior_s_upper_end(system: System) -> None:
+    system.drive("anna", "straight", 0.8, 0)
+    cells = system.ask()
+    assert cells
+    assert {cell["basis"] for cell in cells} == {"bound"}
+    widths = [float(str(cell["mu_upper"])) - float(str(cell["mu_lower"])) for cell in cells]
+    assert min(widths) >= 0.8 * float(mugrid.quantiles(mugrid.PRIOR, 0.95) - mugrid.quantiles(mugrid.PRIOR, 0.05))
+
+
+def test_garbage_is_refused_and_the_service_goes_on(system: System) -> None:
+    session = open_session(ZenohSettings(connect=[system.endpoint]))
+    assert session is not None
+    with session:
+        publisher = session.declare_publisher("gripmap/v1/obs/1200/320/230/mallory")
+        until(lambda: publisher.matching_status.matching)
+        publisher.put(b"\xff\x00garbage", encoding=zenoh.Encoding("application/protobuf"))
+        errors = [r.err.payload.to_string() for r in session.get("gripmap/v1/map/**?bbox=1,2,3") if r.err is not None]
+        assert errors
+        assert all(error.startswith("bbox: ") for error in errors)
+    system.drive("anna", "braking", 0.8, 0)
+    assert system.ask()
