@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import functools
+import hashlib
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import ParamSpec, TypeAlias, TypeVar, cast
 
 import numba
@@ -25,4 +29,21 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
     Without fast-math and threads the result of a row does not depend on how many rows there are,
     which is what makes a bank of N = 1 and of N = thousands bit-equal.
     """
+    if "NUMBA_CACHE_DIR" not in os.environ:
+        numba.config.CACHE_DIR = _kernel_cache(function.__module__.partition(".")[0])  # type: ignore[attr-defined]
     return cast(Callable[P, R], numba.njit(cache=True, error_model="numpy")(function))
+
+
+@functools.cache
+def _kernel_cache(package: str) -> str:
+    """Folder of a package's compiled kernels, in the user's cache, named by a digest of the sources.
+
+    Numba's own cache looks only at the file of a kernel and not at those that it calls or takes constants from, and
+    would go on with what was compiled before a change. Old folders may be deleted at any time.
+    """
+    root, digest = Path(__file__).parents[1], hashlib.blake2b(digest_size=8)
+    for folder in (root / "schemas", root / package):
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(path.read_bytes())
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return str(cache / "gripmap" / f"{package}-{digest.hexdigest()}")

@@ -39,7 +39,7 @@ def draw(comparison: Comparison, path: Path) -> None:
     """Three panels: the truth, the map (median), and how wide the map's interval is."""
     shapes = quarters(comparison)
     lower, mu, upper = (comparison.cells[name].to_numpy() for name in ("mu_lower", "mu", "mu_upper"))
-    figure = Figure(figsize=(16, 6), layout="constrained")
+    figure = Figure(figsize=(17, 5.4), layout="constrained")
     panels = figure.subplots(1, 3, sharex=True, sharey=True)
     bound = ~comparison.measured
     _panel(panels[0], shapes, comparison.truth, "truth", COLOURS, (0.1, 1.0))

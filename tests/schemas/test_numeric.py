@@ -1,0 +1,44 @@
+"""Compiled kernels are those of the sources as they are now."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+CALLER = """from kernels.inner import inner
+from schemas.numeric import compiled
+
+@compiled
+def outer(x: float) -> float:
+    return inner(x) + 1.0
+"""
+INNER = """from schemas.numeric import compiled
+
+@compiled
+def inner(x: float) -> float:
+    return {factor} * x
+"""
+
+
+def run(folder: Path, factor: str) -> str:
+    """What outer(1.0) gives in a new process, with `inner` multiplying by `factor`."""
+    package = folder / "kernels"
+    (package / "inner.py").write_text(INNER.format(factor=factor))
+    source = Path(__file__).parents[2] / "schemas"
+    if not (folder / "schemas").exists():
+        (folder / "schemas").symlink_to(source, target_is_directory=True)
+    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    environment |= {"XDG_CACHE_HOME": str(folder / "cache"), "PYTHONPATH": str(folder)}
+    words = [sys.executable, "-c", "from kernels.outer import outer; print(outer(1.0))"]
+    return subprocess.run(words, env=environment, cwd=folder, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def test_a_change_in_a_called_kernel_is_seen_by_its_callers(tmp_path: Path) -> None:
+    (tmp_path / "kernels").mkdir()
+    (tmp_path / "kernels" / "__init__.py").touch()
+    (tmp_path / "kernels" / "outer.py").write_text(CALLER)
+    assert run(tmp_path, "2.0") == "3.0"
+    assert run(tmp_path, "5.0") == "6.0"
+    assert len(list((tmp_path / "cache" / "gripmap").glob("kernels-*"))) == 2
