@@ -16,7 +16,7 @@ import math
 
 from schemas.numeric import FloatArray, compiled
 
-LEAST_FACTOR = 0.3
+LEAST_FACTOR = 0.8
 LARGEST_FACTOR = 10.0
 
 

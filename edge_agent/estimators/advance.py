@@ -16,7 +16,7 @@ from edge_agent.estimators import flags
 from edge_agent.estimators.block import F, block_features
 from edge_agent.estimators.constants import C, X
 from edge_agent.estimators.memory import INPUTS, RING, H, Memory
-from edge_agent.estimators.mixture import moments, predict_node, reinject, update_node
+from edge_agent.estimators.mixture import moments, predict_node, recall_lost, reinject, update_node
 from edge_agent.estimators.nodes import change_road, quantile, reweigh
 from edge_agent.estimators.residuals import gained
 from edge_agent.estimators.sample import start, take_sample
@@ -47,6 +47,7 @@ class Scratch(NamedTuple):
     loads: FloatArray
     spin: FloatArray
     at_force: FloatArray
+    slopes: FloatArray
     points: FloatArray
     outcomes: FloatArray
     innovation: FloatArray
@@ -107,27 +108,31 @@ def _measure(memory: Memory, design: Design, scratch: Scratch, row: FloatArray, 
     for j in range(count):
         loglik, plain, square, used = update_node(
             row, constants, design.mu[j], memory.mean[n, j], memory.root[n, j], scratch.features, inflation,
-            design.xi, design.w_cov, scratch.at_force, scratch.points, scratch.outcomes, scratch.innovation,
-            scratch.theoretical, scratch.noise, scratch.work,
+            design.xi, design.w_cov, scratch.at_force, scratch.slopes, scratch.points, scratch.outcomes, scratch.innovation[j],
+            scratch.theoretical[j], scratch.noise, scratch.work,
         )  # fmt: skip
         scratch.log_likelihood[j], scratch.plain[j] = loglik, plain + math.log(memory.weight[n, j])
         best, top = max(best, loglik), max(top, scratch.plain[j])
         nis += memory.weight[n, j] * square
         rows = used
         for r in range(6):
-            if not math.isnan(scratch.innovation[r]):
+            if not math.isnan(scratch.innovation[j, r]):
                 group = 0 if r < 4 else 1
-                scratch.sums[group] += memory.weight[n, j] * scratch.innovation[r] ** 2
-                scratch.sums[2 + group] += memory.weight[n, j] * scratch.theoretical[r]
+                scratch.sums[group] += memory.weight[n, j] * scratch.innovation[j, r] ** 2
+                scratch.sums[2 + group] += memory.weight[n, j] * scratch.theoretical[j, r]
     total = 0.0
     for j in range(count):
         total += math.exp(scratch.plain[j] - top)
     held[H.LOG_LIKELIHOOD] = top + math.log(total) if rows > 0 else 0.0
     held[H.NIS] = nis / rows if rows > 0 else 0.0
     need = (constants[C.DEMAND_HALF] / max(scratch.features[F.DEMAND], 1e-3)) ** constants[C.DEMAND_POWER]
-    share = novelty(memory.usual[n], scratch.features, constants, duration) / (1.0 + need)
+    share = 1.0 / (1.0 + need)
     for j in range(count):
-        scratch.log_likelihood[j] = max(share * (scratch.log_likelihood[j] - best), -constants[C.LARGEST_LOSS])
+        loss = scratch.log_likelihood[j] - best
+        beyond = min(loss + constants[C.PLAUSIBLE], 0.0)
+        loss = max(loss, -constants[C.PLAUSIBLE])
+        scratch.log_likelihood[j] = max(share * loss + beyond, -constants[C.LARGEST_LOSS])
+    recall_lost(memory.mean[n], memory.root[n], memory.weight[n], constants)
     reweigh(memory.weight[n], scratch.log_likelihood)
     reweigh(memory.visit[n], scratch.log_likelihood)
     keep = math.exp(-duration / constants[C.WINDOW])
@@ -143,31 +148,17 @@ def _measure(memory: Memory, design: Design, scratch: Scratch, row: FloatArray, 
 
 
 @compiled
-def novelty(usual: FloatArray, features: FloatArray, constants: FloatArray, duration: float) -> float:
-    """Share of the evidence that is new."""
-    keep = math.exp(-duration / constants[C.NOVEL_TIME])
-    square = 0.0
-    for r in range(6):
-        force = features[F.FORCE + r] if r < 4 else features[F.SIDE + r - 4]
-        if not math.isnan(force):
-            usual[r] = keep * usual[r] + (1.0 - keep) * force
-            square = max(square, (force - usual[r]) ** 2)
-    least = constants[C.NOVEL_LEAST]
-    return least + (1.0 - least) * square / (square + constants[C.NOVEL_HALF] ** 2)
-
-
-@compiled
 def _predict(memory: Memory, design: Design, scratch: Scratch, n: int, duration: float, speed: float) -> None:
     held, constants, process = memory.held[n], design.constants, scratch.process
     ax = abs(held[H.AX])
-    drift_x = constants[C.DRIFT_X] ** 2 + (constants[C.AX_SHARE] * ax) ** 2 + held[H.MISSING_AX]
-    drift_y = constants[C.DRIFT_Y] ** 2 + (constants[C.YAW_RATE_OFFSET] * speed) ** 2 + held[H.MISSING_AY]
+    drift_x = constants[C.DRIFT_X] ** 2 + (constants[C.LEAK_WANDER] * ax) ** 2 + held[H.MISSING_AX]
+    drift_y = constants[C.DRIFT_Y] ** 2 + (constants[C.GYRO_WANDER] * speed) ** 2 + held[H.MISSING_AY]
     process[X.VX], process[X.VY] = math.sqrt(drift_x * duration), math.sqrt(drift_y * duration)
     spread_k = constants[C.STIFFNESS_STD] * math.sqrt(1.0 - math.exp(-2.0 * duration / constants[C.STIFFNESS_TIME]))
     spread_l = math.sqrt(1.0 - math.exp(-2.0 * duration / constants[C.LEAK_TIME]))
-    process[X.LN_KR] = spread_k * constants[C.REAR_STD] / constants[C.STIFFNESS_STD]
+    process[X.STEER] = spread_k * constants[C.STEER_STD] / constants[C.STIFFNESS_STD]
     process[X.LN_KX] = process[X.LN_KY] = spread_k
-    process[X.LEAK_Y] = constants[C.LEAK_STD] * spread_l
+    process[X.LEAK_Y] = constants[C.LEAK_Y_STD] * spread_l
     process[X.LEAK_X] = constants[C.LEAK_X_STD] * spread_l
     process[X.BIAS_X] = process[X.BIAS_Y] = constants[C.BIAS_STD] * math.sqrt(
         1.0 - math.exp(-2.0 * duration / constants[C.BIAS_TIME])

@@ -63,7 +63,6 @@ def _kinematics(held: FloatArray, gain_sum: FloatArray, features: FloatArray) ->
     for k in range(4):
         features[F.GAIN + 2 * k] = gain_sum[k, 0] * share
         features[F.GAIN + 2 * k + 1] = gain_sum[k, 1] * share
-    features[F.YAW_RATE] = held[H.YAW_RATE]
 
 
 @compiled
@@ -157,7 +156,8 @@ def _noise(
         features[F.NOISE + wheel] = math.sqrt(variance * scales[0])
     for axle in range(2):
         side = features[F.SIDE + axle]
-        angle = row[P.SLOPE_Y] * constants[C.ANGLE_STD]
+        turning = constants[C.GYRO_STD] * (row[P.TO_FRONT] if axle == 0 else row[P.TO_REAR]) / speed
+        angle = row[P.SLOPE_Y] * math.hypot(constants[C.ANGLE_STD], turning)
         share = constants[C.AXLE_SHARE] * side
         bend = constants[C.BEND_SHARE] * side * side
         change = side - before[axle]
@@ -191,6 +191,7 @@ def block_features(
     loads and spin, (4,), are scratch: wheel loads [N] and wheel accelerations [rad/s^2].
     """
     _kinematics(held, gain_sum, features)
+    features[F.YAW_RATE] = mean_or(sums, counts, S.YAW_RATE, held[H.YAW_RATE])
     ax, ay = mean_or(sums, counts, S.AX, 0.0), mean_or(sums, counts, S.AY, 0.0)
     fl, fr, rl, rr = wheel_loads(row, ax, ay)
     loads[0], loads[1], loads[2], loads[3] = fl, fr, rl, rr

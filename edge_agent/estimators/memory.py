@@ -39,8 +39,7 @@ class H(IntEnum):
     MU_UPPER = 19
     LOG_LIKELIHOOD = 20
     USED = 21
-    NOVELTY = 22
-    REAR_STEERING = 23  # 1 once a rear steering angle has been seen
+    REAR_STEERING = 22  # 1 once a rear steering angle has been seen
 
 
 class G(IntEnum):
@@ -73,7 +72,6 @@ class Memory(NamedTuple):
     actual: FloatArray  # (N, 2) windowed innovation variances
     theoretical: FloatArray  # (N, 2)
     factor: FloatArray  # (N, 2) adapted over nominal R
-    usual: FloatArray  # (N, 6) FORCE of the wheels and SIDE of the axles, smoothed [1]
     side: FloatArray  # (N, 2) SIDE of the axles in the block before [1]
     ring_time: FloatArray  # (N, 64) [s]
     ring_used: FloatArray  # (N, 64)
@@ -100,7 +98,6 @@ def new_memory(count: int) -> Memory:
         actual=np.zeros((count, 2)),
         theoretical=np.zeros((count, 2)),
         factor=np.ones((count, 2)),
-        usual=np.zeros((count, 6)),
         side=np.full((count, 2), np.nan),
         ring_time=np.full((count, RING), -np.inf),
         ring_used=np.zeros((count, RING)),

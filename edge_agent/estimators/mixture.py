@@ -14,8 +14,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from edge_agent.estimators.block import F
 from edge_agent.estimators.constants import C, X
+from edge_agent.estimators.nodes import SMALLEST
 from edge_agent.estimators.residuals import ROWS, gained, residuals, slips_at_force
 from edge_agent.filters.squareroot import deviations, sigma_points, triangularize, update
 from schemas.numeric import FloatArray, compiled
@@ -82,6 +85,7 @@ def update_node(
     xi: FloatArray,
     w_cov: FloatArray,
     scratch: FloatArray,
+    slopes: FloatArray,
     points: FloatArray,
     outcomes: FloatArray,
     innovation: FloatArray,
@@ -99,7 +103,8 @@ def update_node(
     slips_at_force(mu, constants[C.SHAPE], mean[X.LEAK_Y], features, scratch)
     sigma_points(mean, root, xi, points)
     for p in range(count):
-        residuals(row, constants, mu, points[p], features, scratch, outcomes[p])
+        residuals(row, constants, mu, points[p], mean, features, scratch, outcomes[p], slopes)
+    residuals(row, constants, mu, mean, mean, features, scratch, noise, slopes)
     plain = square = 0.0
     for r in range(ROWS):
         average = 0.0
@@ -113,7 +118,8 @@ def update_node(
         innovation[r] = -average
         own = features[F.NOISE + r]
         theoretical[r] = variance + own * own
-        noise[r] = own * math.sqrt(inflation)
+        excess = average * average / constants[C.HUBER] ** 2 - variance
+        noise[r] = math.sqrt(max(own * own * inflation, excess))
         if not math.isnan(average):
             ratio = average * average / theoretical[r]
             square += ratio
@@ -122,13 +128,54 @@ def update_node(
     used, log_likelihood, whitened = update(
         mean, root, scratch_states(work, n, count), outcomes.T, innovation, noise, work[n:]
     )
+    keep_within(mean, constants)
     occam = 0.0
     line = n
     for r in range(ROWS):
-        if not math.isnan(innovation[r]):
-            occam += constants[C.OCCAM_X if r < 4 else C.OCCAM_Y] * math.log(work[line, line - n])
-            line += 1
+        if math.isnan(innovation[r]):
+            continue
+        if r < 4:
+            occam -= constants[C.SLIDING_PRICE] / inflation * min(math.log(slopes[r] / constants[C.FLAT]), 0.0)
+        else:
+            occam += constants[C.AXLE_PRICE] * math.log(work[line, line - n])
+        line += 1
     return -0.5 * whitened - occam, plain, square, used
+
+
+@compiled
+def keep_within(mean: FloatArray, constants: FloatArray) -> None:
+    """Keep stiffness, leaks and offsets of a node (n,) within what a vehicle can have."""
+    far = constants[C.FARTHEST]
+    for i in range(X.LN_KX, mean.shape[0]):
+        middle, spread = prior_of(i, constants)
+        mean[i] = min(max(mean[i], middle - far * spread), middle + far * spread)
+
+
+@compiled
+def recall_lost(mean: FloatArray, root: FloatArray, weight: FloatArray, constants: FloatArray) -> None:
+    """Give nodes (K, n) that have lost the motion the state of the most probable one, and no weight."""
+    best = int(np.argmax(weight))
+    for j in range(mean.shape[0]):
+        astray = max(
+            abs(mean[j, X.VX] - mean[best, X.VX]) / constants[C.LOST_X],
+            abs(mean[j, X.VY] - mean[best, X.VY]) / constants[C.LOST_Y],
+        )
+        if astray > 1.0:
+            mean[j] = mean[best]
+            root[j] = root[best]
+            weight[j] = SMALLEST
+
+
+@compiled
+def prior_of(state: int, constants: FloatArray) -> tuple[float, float]:
+    """Prior (mean, std) of a state that is a property of vehicle or sensor."""
+    if state == X.LEAK_Y:
+        return constants[C.LEAK_Y_MEAN], constants[C.LEAK_Y_STD]
+    if state == X.LEAK_X:
+        return constants[C.LEAK_X_MEAN], constants[C.LEAK_X_STD]
+    if state == X.BIAS_X or state == X.BIAS_Y:
+        return 0.0, constants[C.BIAS_STD]
+    return 0.0, constants[C.STEER_STD] if state == X.STEER else constants[C.STIFFNESS_STD]
 
 
 @compiled
@@ -163,8 +210,8 @@ def predict_node(
     mean[X.VY] = turn_cos * vy - turn_sin * vx + gained(gain, 0, mean, 1)
     mean[X.LN_KX] *= keep_k
     mean[X.LN_KY] *= keep_k
-    mean[X.LN_KR] *= keep_k
-    mean[X.LEAK_Y] = constants[C.LEAK_MEAN] + keep_l * (mean[X.LEAK_Y] - constants[C.LEAK_MEAN])
+    mean[X.STEER] *= keep_k
+    mean[X.LEAK_Y] = constants[C.LEAK_Y_MEAN] + keep_l * (mean[X.LEAK_Y] - constants[C.LEAK_Y_MEAN])
     mean[X.LEAK_X] = constants[C.LEAK_X_MEAN] + keep_l * (mean[X.LEAK_X] - constants[C.LEAK_X_MEAN])
     mean[X.BIAS_X] *= keep_b
     mean[X.BIAS_Y] *= keep_b
@@ -175,7 +222,7 @@ def predict_node(
         work[X.VY, j] = turn_cos * b - turn_sin * a + gained(gain, 0, column, 1) - gain[1]
         work[X.LN_KX, j] = keep_k * root[X.LN_KX, j]
         work[X.LN_KY, j] = keep_k * root[X.LN_KY, j]
-        work[X.LN_KR, j] = keep_k * root[X.LN_KR, j]
+        work[X.STEER, j] = keep_k * root[X.STEER, j]
         work[X.LEAK_Y, j] = keep_l * root[X.LEAK_Y, j]
         work[X.LEAK_X, j] = keep_l * root[X.LEAK_X, j]
         work[X.BIAS_X, j] = keep_b * root[X.BIAS_X, j]

@@ -25,6 +25,7 @@ from edge_agent.estimators.constants import C, X
 from schemas.numeric import FloatArray, compiled
 
 ROWS = 6
+FLATTEST = 0.03  # a sliding wheel's slip is not quite arbitrary: its inertia holds it for a block
 SLOW_M_S = 0.5  # slip's denominator is kept above it
 
 
@@ -52,6 +53,25 @@ def gained(gains: FloatArray, first: int, x: FloatArray, axis: int) -> float:
         - x[X.BIAS_X] * unit_x
         - x[X.BIAS_Y] * unit_y
     )
+
+
+@compiled
+def steepness(g_x: float, g_y: float, theta: float, ratio: float, shape: float) -> float:
+    """Change of the force along by the linear force along, at least FLATTEST: 1 at small slip, 0 on the flat."""
+    square = g_x * g_x + g_y * g_y
+    if square < TINY:
+        return 1.0
+    b = theta / shape
+    bend = math.cos(shape * math.atan(b)) / (1.0 + b * b)
+    return max((bend * g_x * g_x + ratio * g_y * g_y) / square, FLATTEST)
+
+
+@compiled
+def told(value: float, mean: float, force: float, telling: float) -> float:
+    """A log stiffness drawn towards its mean where the force is too small to tell it from noise of the slip."""
+    if math.isnan(force):
+        return mean
+    return mean + (value - mean) * force * force / (force * force + telling * telling)
 
 
 @compiled
@@ -89,20 +109,32 @@ def residuals(
     constants: FloatArray,
     mu: float,
     x: FloatArray,
+    mean: FloatArray,
     features: FloatArray,
     at_force: FloatArray,
     out: FloatArray,
+    slopes: FloatArray,
 ) -> None:
     """out (6,) = e of each row at state x (n,) of the beginning of the block; NaN where its readings are missing."""
     cos, sin = features[F.COS], features[F.SIN]
     leak, rate, shape = x[X.LEAK_Y], features[F.YAW_RATE], constants[C.SHAPE]
     vx = cos * x[X.VX] + sin * x[X.VY] + gained(features, F.GAIN, x, 0)
     vy = cos * x[X.VY] - sin * x[X.VX] + gained(features, F.GAIN, x, 1)
-    slope_x = row[P.SLOPE_X] * math.exp(x[X.LN_KX])
-    slope_y = row[P.SLOPE_Y] * math.exp(x[X.LN_KY])
     for axle in range(2):
-        if axle == 1:
-            slope_y *= math.exp(x[X.LN_KR])
+        offset = x[X.STEER] if axle == 0 else 0.0
+        first = 2 * axle
+        ln_kx = told(
+            x[X.LN_KX],
+            mean[X.LN_KX],
+            max(abs(features[F.FORCE + first]), abs(features[F.FORCE + first + 1])),
+            constants[C.TELLING_X],
+        )
+        ln_ky = told(x[X.LN_KY], mean[X.LN_KY], features[F.SIDE + axle], constants[C.TELLING_Y])
+        slope_x, slope_y = row[P.SLOPE_X] * math.exp(ln_kx), row[P.SLOPE_Y] * math.exp(ln_ky)
+        scale_x, scale_y = (
+            math.exp(-constants[C.STIFFNESS_SHARE_X] * ln_kx),
+            math.exp(-constants[C.STIFFNESS_SHARE_Y] * ln_ky),
+        )
         side_model = side_slip = 0.0
         for wheel in range(2 * axle, 2 * axle + 2):
             px, py = wheel_position(row, wheel)
@@ -113,12 +145,19 @@ def residuals(
             rolling = features[F.ROLL + wheel]
             known = not math.isnan(rolling)
             g_x = slope_x * (rolling - along) / speed if known else features[F.FORCE + wheel]
-            g_y = -slope_y * across / speed
+            g_y = slope_y * (offset - across / speed)
             theta = math.hypot(g_x, g_y) / mu
             ratio = magic_formula(theta, shape, 0.0) / theta if theta > TINY else 1.0
+            slopes[wheel] = steepness(g_x, g_y, theta, ratio, shape) if known else 1.0
             share = features[F.LOAD + wheel]
             side_model += share * ratio * g_y
             side_slip += share * g_y
-            out[wheel] = distance(at_force[wheel] - g_x, features[F.FORCE + wheel] - ratio * g_x) if known else math.nan
+            out[wheel] = (
+                scale_x * distance(at_force[wheel] - g_x, features[F.FORCE + wheel] - ratio * g_x)
+                if known
+                else math.nan
+            )
         side = features[F.SIDE + axle] + leak * features[F.SIDE_LEAK + axle]
-        out[4 + axle] = math.nan if math.isnan(side) else distance(at_force[4 + axle] - side_slip, side - side_model)
+        out[4 + axle] = (
+            math.nan if math.isnan(side) else scale_y * distance(at_force[4 + axle] - side_slip, side - side_model)
+        )

@@ -101,13 +101,13 @@ def start(
     speed = rolling_speed(row, sample)
     known = not math.isnan(speed)
     memory.all_mean[n, X.VX] = speed if known else 0.0
-    memory.all_mean[n, X.LEAK_Y], memory.all_mean[n, X.LEAK_X] = constants[C.LEAK_MEAN], constants[C.LEAK_X_MEAN]
+    memory.all_mean[n, X.LEAK_Y], memory.all_mean[n, X.LEAK_X] = constants[C.LEAK_Y_MEAN], constants[C.LEAK_X_MEAN]
     root = memory.all_root[n]
     root[X.VX, X.VX] = FIRST_VX_STD if known else UNKNOWN_VX_STD
     root[X.VY, X.VY] = FIRST_VY_STD
     root[X.LN_KX, X.LN_KX] = root[X.LN_KY, X.LN_KY] = constants[C.STIFFNESS_STD]
-    root[X.LEAK_Y, X.LEAK_Y], root[X.LEAK_X, X.LEAK_X] = constants[C.LEAK_STD], constants[C.LEAK_X_STD]
-    root[X.LN_KR, X.LN_KR] = constants[C.REAR_STD]
+    root[X.LEAK_Y, X.LEAK_Y], root[X.LEAK_X, X.LEAK_X] = constants[C.LEAK_Y_STD], constants[C.LEAK_X_STD]
+    root[X.STEER, X.STEER] = constants[C.STEER_STD]
     root[X.BIAS_X, X.BIAS_X] = root[X.BIAS_Y, X.BIAS_Y] = constants[C.BIAS_STD]
     for j in range(prior.shape[0]):
         memory.weight[n, j] = memory.visit[n, j] = prior[j]

@@ -125,9 +125,7 @@ class SimulatedFleet:
         network, origin = self.scenario.network, self.scenario.origin
         lanes = (network.points, network.first, network.size, network.spacing, network.ways)
         timing = (1.0 / self.rate_hz, substeps_of(self.rate_hz))
-        records = run(
-            self._states, self._parameters, lanes, self.scenario.table, self._keys, self._next, steps, timing
-        )
+        records = run(self._states, self._parameters, lanes, self.scenario.table, self._keys, self._next, steps, timing)
         place = np.array([origin.latitude, origin.longitude, *origin.per_metre])
         signals = sense(records, self._errors, self._wander, place, self._noise, self._next, self.rate_hz)
         t = np.repeat((np.arange(self._next, self._next + steps) / self.rate_hz)[:, None], len(self.names), axis=1)

@@ -42,8 +42,16 @@ class TrueVehicle:
         return np.array([*nominal, *own, self.drag, self.rolling, self.slip_limit, self.brake_front, self.power])
 
 
-def car(name: str, mass: float, yaw_inertia: float, axles: tuple[float, float], tracks: tuple[float, float],
-        cg_height: float, radius: float, drive_front: float) -> Vehicle:
+def car(
+    name: str,
+    mass: float,
+    yaw_inertia: float,
+    axles: tuple[float, float],
+    tracks: tuple[float, float],
+    cg_height: float,
+    radius: float,
+    drive_front: float,
+) -> Vehicle:
     """A vehicle whose tyres have the usual stiffness for its load: 20 per unit slip and 17 per radian."""
     load = mass * GRAVITY / 4.0
     return Vehicle(

@@ -168,6 +168,8 @@ class Fusion:
         both = np.flatnonzero(o.second >= 0)
         rows = np.concatenate([np.arange(len(o.time)), both])
         keys = np.concatenate([o.cell, o.cell[both]]) * grid.SECTORS + np.concatenate([o.sector, o.second[both]])
+        order = np.argsort(o.time[rows], kind="stable")  # in the order of time nothing has to be folded again
+        rows, keys = rows[order], keys[order]
         slots = self._slots_for(keys)
         if self._entries.unused[0] < len(rows):
             places = max(2 * len(self._entries.free), self.waiting + len(rows))
