@@ -92,6 +92,7 @@ def parse(parameters: Mapping[str, str]) -> MapQuery:
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False)[0]
         name = str(first["loc"][0])
-        unknown = first["type"] == "extra_forbidden"
-        problem = "is no parameter" if unknown else f"{str(first['input'])[:60]!r} is not usable ({first['msg']})"
+        unknown, own = first["type"] == "extra_forbidden", first["type"] == "value_error"
+        because = f" ({first['msg'].removeprefix('Value error, ')})" if own else ""
+        problem = "is no parameter" if unknown else f"{parameters[name][:60]!r} is not usable{because}"
         raise InputError(name, problem, _FIXES.get(name, f"use {', '.join(MapQuery.model_fields)}")) from error

@@ -16,24 +16,24 @@ import math
 
 from schemas.numeric import FloatArray, compiled
 
-LEAST_FACTOR = 0.8
+LEAST_FACTOR = 0.8  # R holds model error too, which a calm stretch does not disprove
 LARGEST_FACTOR = 10.0
 
 
 @compiled
 def infer(mismatch: float, inputs: FloatArray, outputs: FloatArray) -> float:
-    """Log multiplier [nat]: the outputs (5,) weighted by the triangular memberships of the mismatch at peaks inputs (5,).
+    """Log multiplier [nat]: outputs (5,) weighted by the triangular memberships of the mismatch at peaks inputs (5,).
 
     Triangles that meet at each other's peaks make the weighted mean a straight line between neighbours.
     """
     last = inputs.shape[0] - 1
     if mismatch <= inputs[0]:
-        return outputs[0]
+        return float(outputs[0])
     for k in range(last):
         if mismatch < inputs[k + 1]:
             share = (mismatch - inputs[k]) / (inputs[k + 1] - inputs[k])
-            return (1.0 - share) * outputs[k] + share * outputs[k + 1]
-    return outputs[last]
+            return float((1.0 - share) * outputs[k] + share * outputs[k + 1])
+    return float(outputs[last])
 
 
 @compiled

@@ -2,7 +2,7 @@
 
 Legend
     mismatch    actual over theoretical innovation variance, minus 1 [1]; 0 when R is right, -1 is its lower end
-    inputs      peaks of the five triangular sets of the mismatch: much smaller, smaller, equal, larger, much larger (5,)
+    inputs      peaks of the five triangular sets: much smaller, smaller, equal, larger, much larger (5,)
     outputs     log of the multiplier on R that each set asks for [nat] (5,)
     ln_scales   log of the nominal R relative to the table of constants: wheel speed rows, axle rows [nat] (2,)
 
@@ -54,7 +54,7 @@ class Memberships:
         if np.any(np.diff(self.outputs) < 0.0) or max(map(abs, self.outputs)) > LARGEST_STEP:
             raise InputError(
                 "memberships.outputs",
-                "not rising inside the range of a step: R must grow where the actual innovation exceeds the theoretical one",
+                "not rising within a step: R must grow where the actual innovation exceeds the theoretical",
                 f"order them in [-{LARGEST_STEP:g}, {LARGEST_STEP:g}]",
             )
         if self.outputs[0] > 0.0 or self.outputs[-1] < 0.0:

@@ -1,6 +1,6 @@
 """Vertical wheel loads under quasi-static transfer.
 
-Legend: m mass [kg], h height of the centre of gravity [m], L wheelbase [m], a, b distances to the front and rear axle [m],
+Legend: m mass [kg], h height of the centre of gravity [m], L wheelbase [m], a, b distances to the axles [m],
 a_x, a_y acceleration of the centre of gravity [m/s^2], Fz load [N]; wheels in the order fl, fr, rl, rr.
 ISO 8855 signs: accelerating loads the rear, a left turn (a_y > 0) loads the right wheels.
 """

@@ -1,7 +1,7 @@
 """One sample of one vehicle: sums of the block, and at the block's end one turn of the mixture.
 
-Order at the end of a block: road change per metre and re-injection, measurement update of every node at the state of the
-block's beginning, reweighing with the evidence tempered by demand, adaptation of R, prediction to the block's end.
+Order at the end of a block: road change per metre and re-injection, measurement update of every node at the state of
+the block's beginning, reweighing with the evidence tempered by demand, adaptation of R, prediction to the block's end.
 Between ends of blocks the velocity is carried on by the same exact kinematics.
 """
 
@@ -126,7 +126,7 @@ def _measure(memory: Memory, design: Design, scratch: Scratch, row: FloatArray, 
     held[H.LOG_LIKELIHOOD] = top + math.log(total) if rows > 0 else 0.0
     held[H.NIS] = nis / rows if rows > 0 else 0.0
     need = (constants[C.DEMAND_HALF] / max(scratch.features[F.DEMAND], 1e-3)) ** constants[C.DEMAND_POWER]
-    share = 1.0 / (1.0 + need)
+    share = novelty(memory.usual[n], scratch.features, constants, duration) / (1.0 + need)
     for j in range(count):
         loss = scratch.log_likelihood[j] - best
         beyond = min(loss + constants[C.PLAUSIBLE], 0.0)
@@ -145,6 +145,20 @@ def _measure(memory: Memory, design: Design, scratch: Scratch, row: FloatArray, 
                     memory.factor[n, group], memory.actual[n, group], memory.theoretical[n, group],
                     design.inputs, design.outputs,
                 )  # fmt: skip
+
+
+@compiled
+def novelty(usual: FloatArray, features: FloatArray, constants: FloatArray, duration: float) -> float:
+    """Share of the evidence that is new, from the forces against their smoothed past `usual` (6,), which is moved on."""
+    keep = math.exp(-duration / constants[C.STEADY_TIME])
+    most = 0.0
+    for r in range(6):
+        force = features[F.FORCE + r] if r < 4 else features[F.SIDE + r - 4]
+        if not math.isnan(force):
+            most = max(most, abs(force - usual[r]))
+            usual[r] = keep * usual[r] + (1.0 - keep) * force
+    least = constants[C.STEADY_SHARE]
+    return least + (1.0 - least) * most * most / (most * most + constants[C.STEADY_HALF] ** 2)
 
 
 @compiled

@@ -1,15 +1,17 @@
 """The estimator bank: N vehicles side by side through one compiled path.
 
-No vehicle's numbers meet another's, and all state lies in the memory, so results are bit-equal whatever N is and however
-the samples are cut into calls.
+No vehicle's numbers meet another's, and all state lies in the memory, so results are bit-equal whatever N is and
+however the samples are cut into calls.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edge_agent.estimators.advance import Design, Scratch, step, velocity
 from edge_agent.estimators.block import F
@@ -21,13 +23,15 @@ from edge_agent.estimators.residuals import ROWS
 from edge_agent.estimators.sample import UNKNOWN_VX_STD
 from schemas.errors import InputError
 from schemas.mugrid import BINS, CENTRES
-from schemas.numeric import BoolArray, FloatArray, IntArray, compiled
+from schemas.numeric import BoolArray, FloatArray, compiled
 from schemas.signals import CHANNELS
 
 OUTPUTS = (
-    "vx", "vy", "yaw_rate", "sideslip", "vx_std", "vy_std", "yaw_rate_std", "sideslip_std", "mu", "mu_lower", "mu_upper",
-    "mu_utilised", "innovation_nis", "adaptation", "innovation_log_likelihood",
+    "vx", "vy", "yaw_rate", "sideslip", "vx_std", "vy_std", "yaw_rate_std", "sideslip_std",
+    "mu", "mu_lower", "mu_upper", "mu_utilised", "innovation_nis", "adaptation", "innovation_log_likelihood",
 )  # fmt: skip
+FlagArray: TypeAlias = NDArray[np.int32]
+
 SLOWEST_M_S = 0.5  # sideslip is taken against at least this speed
 YAW_RATE_OFFSET_STD = 0.001  # [rad/s]
 
@@ -51,7 +55,7 @@ class Estimates:
     innovation_nis: FloatArray  # per row of measurement; 1 is expected
     adaptation: FloatArray  # largest factor on R
     innovation_log_likelihood: FloatArray  # of the block that ended at the sample, else 0 [nat]
-    health: IntArray  # schemas.signals.Health
+    health: FlagArray  # schemas.signals.Health
     mu_wheel: FloatArray | None  # (T, N, 4, 3) median, lower, upper per wheel, where the estimator has them
     evidence: FloatArray | None  # (T, N, 32) at closes, else NaN: log-likelihood of the visit on the friction grid
 
@@ -67,7 +71,7 @@ def advance_all(
     signals: FloatArray,
     closes: BoolArray,
     out: FloatArray,
-    health: IntArray,
+    health: FlagArray,
     evidence: FloatArray,
 ) -> None:
     """Fill out (15, T, N), health (T, N) and evidence (T, N, 32) where closes (T, N); other evidence stays."""

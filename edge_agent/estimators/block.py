@@ -1,8 +1,8 @@
 """From the sums of a block to the few numbers that the measurement equations need.
 
 Legend (index `F` of a feature row)
-    COS, SIN, GAIN    mean velocity of the block = rotation(COS, SIN)*v + gains, v at the beginning of the block; the four
-                      mean gains of memory.G, x and y each [m/s]
+    COS, SIN, GAIN    mean velocity of the block = rotation(COS, SIN)*v + gains, v at the beginning of the block; the
+                      four mean gains of memory.G, x and y each [m/s]
     ROLL              R*omega, mean rolling speed of a wheel [m/s]
     FORCE             F_x/F_z of a wheel [1]
     LOAD              wheel load over axle load [1]

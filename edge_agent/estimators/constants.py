@@ -80,12 +80,15 @@ class C(IntEnum):
     LAG = 42
     NO_TORQUE_SHARE = 43
     WINDOW = 44
+    STEADY_TIME = 45
+    STEADY_HALF = 46
+    STEADY_SHARE = 47
 
 
 class Constant(NamedTuple):
     """One constant: its place, value, unit and reason."""
 
-    index: C
+    place: C
     value: float
     unit: str
     reason: str
@@ -175,6 +178,14 @@ CONSTANTS = (
     Constant(C.BEND_SHARE, 0.05, "1", "shape error of the tyre curve at full demand, in force over load"),
     Constant(C.LAG, 0.02, "s", "side force behind slip (relaxation, roll), times its rate"),
     Constant(C.NO_TORQUE_SHARE, 0.3, "1", "how badly the total force is shared out when torque is missing"),
+    Constant(C.STEADY_TIME, 2.0, "s", "memory of the usual force, against which a new one is told"),
+    Constant(C.STEADY_HALF, 0.03, "1", "change of force over load from the usual at which half of the evidence is new"),
+    Constant(
+        C.STEADY_SHARE,
+        0.15,
+        "1",
+        "evidence left where nothing changes: the error of curve and offsets is then the same again",
+    ),
     Constant(C.WINDOW, 1.0, "s", "window of the innovation variances"),
 )
 
@@ -183,7 +194,7 @@ def constant_row(**changes: float) -> FloatArray:
     """The constants as the kernels read them, (len(C),); `changes` by lower-case name replace values in studies."""
     row = np.full(len(C), np.nan)
     for constant in CONSTANTS:
-        row[constant.index] = constant.value
+        row[constant.place] = constant.value
     for name, value in changes.items():
         row[C[name.upper()]] = value
     return row

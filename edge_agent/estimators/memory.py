@@ -73,6 +73,7 @@ class Memory(NamedTuple):
     theoretical: FloatArray  # (N, 2)
     factor: FloatArray  # (N, 2) adapted over nominal R
     side: FloatArray  # (N, 2) SIDE of the axles in the block before [1]
+    usual: FloatArray  # (N, 6) FORCE of the wheels and SIDE of the axles, smoothed [1]
     ring_time: FloatArray  # (N, 64) [s]
     ring_used: FloatArray  # (N, 64)
 
@@ -99,6 +100,7 @@ def new_memory(count: int) -> Memory:
         theoretical=np.zeros((count, 2)),
         factor=np.ones((count, 2)),
         side=np.full((count, 2), np.nan),
+        usual=np.zeros((count, 6)),
         ring_time=np.full((count, RING), -np.inf),
         ring_used=np.zeros((count, RING)),
     )

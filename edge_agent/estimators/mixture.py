@@ -5,8 +5,8 @@ Legend
     m, L            mean and sqrt_cov of the whole mixture
     zeta            share of a node's predicted mass that came from anywhere by a road change [1]
 
-The state of a node after mixing is (1 - zeta)*N(m_j, P_j) + zeta*N(m, P), matched in its first two moments: an improbable
-node keeps the state of the vehicle and is ready to explain the next sample (interacting multiple models, Blom and
+The state of a node after mixing is (1 - zeta)*N(m_j, P_j) + zeta*N(m, P), matched in its first two moments: an
+improbable node keeps the state of the vehicle and is ready to explain the next sample (interacting multiple models, Blom and
 Bar-Shalom 1988). Every covariance is a sum of factors, made triangular.
 """
 
@@ -125,9 +125,7 @@ def update_node(
             square += ratio
             plain -= 0.5 * (ratio + math.log(2.0 * math.pi * theoretical[r]))
     deviations(points, mean, w_cov, scratch_states(work, n, count), 0)
-    used, log_likelihood, whitened = update(
-        mean, root, scratch_states(work, n, count), outcomes.T, innovation, noise, work[n:]
-    )
+    used, _, whitened = update(mean, root, scratch_states(work, n, count), outcomes.T, innovation, noise, work[n:])
     keep_within(mean, constants)
     occam = 0.0
     line = n

@@ -8,8 +8,8 @@ Legend
     e_a         slip at the measured force by the inverse tyre, minus the measured slip, as linear force over load [1]
     e           sign(e_b)*|e_a*e_b|/sqrt(e_a^2 + e_b^2): distance to the tyre curve [1]
 
-Rows: the four wheels along, then the two axles across. In the linear range e weighs slip and force alike; on the flat and
-beyond the peak it is the force that decides, so a sliding wheel says what its friction is (errata, what made the
+Rows: the four wheels along, then the two axles across. In the linear range e weighs slip and force alike; on the flat
+and beyond the peak it is the force that decides, so a sliding wheel says what its friction is (errata, what made the
 difference, 1). An axle takes one mean slip; its wheels share the side force by load.
 """
 

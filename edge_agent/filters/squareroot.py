@@ -9,8 +9,8 @@ Legend
     r           standard deviations of the measurement noise, independent    (k,)
     S           innovation covariance Z*Z' + diag(r^2)                       (k, k)
 
-Everything is an orthogonal transformation of an array of factors (Householder): no covariance is ever subtracted, so none
-can lose its sign. Kernels write into arrays of the caller; they allocate nothing.
+Everything is an orthogonal transformation of an array of factors (Householder): no covariance is ever subtracted, so
+none can lose its sign. Kernels write into arrays of the caller; they allocate nothing.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def sigma_points(mean: FloatArray, sqrt_cov: FloatArray, xi: FloatArray, points:
 
 @compiled
 def weighted_mean(points: FloatArray, w_mean: FloatArray, mean: FloatArray) -> None:
-    """mean = sum of w_mean[j]*points[j], taken as the first point plus deviations so that large offsets lose no digits."""
+    """mean = sum of w_mean[j]*points[j], as the first point plus deviations so that large offsets lose no digits."""
     count, n = points.shape
     for i in range(n):
         total = 0.0
