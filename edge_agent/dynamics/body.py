@@ -2,8 +2,8 @@
 
 Legend: Fx, Fy wheel forces in the wheel's frame [N], delta road-wheel angle [rad], m mass [kg], Iz yaw inertia
 [kg m^2], (x, y) wheel position [m], a_x, a_y acceleration of the centre of gravity in body axes [m/s^2] (what a level
-accelerometer there would read), r yaw rate [rad/s]. The velocities follow from v_x' = a_x + r*v_y and v_y' = a_y - r*v_x
-(paper 004, equation 2, with the sign of the errata).
+accelerometer there would read), r yaw rate [rad/s]. The velocities follow from v_x' = a_x + r*v_y and
+v_y' = a_y - r*v_x (paper 004, equation 2, with the sign of the errata).
 """
 
 from __future__ import annotations

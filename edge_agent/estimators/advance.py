@@ -19,10 +19,14 @@ from edge_agent.estimators.memory import INPUTS, RING, H, Memory
 from edge_agent.estimators.mixture import moments, predict_node, recall_lost, reinject, update_node
 from edge_agent.estimators.nodes import change_road, quantile, reweigh
 from edge_agent.estimators.residuals import gained
-from edge_agent.estimators.sample import start, take_sample
+from edge_agent.estimators.sample import restart_motion, start, take_sample
 from schemas.numeric import FloatArray, compiled
+from schemas.signals import S
 
 SLIDING_THETA = 3.0  # normalised slip beyond the peak of every passenger tyre's curve
+FREE_DEMAND = 0.15  # force over load below which wheels that roll alike are taken for rolling freely
+LOST_RATIO = 8.0  # of actual over nominal innovation variance in the window: no noise or curve does that
+LOST_SPREAD_M_S = 5.0
 EXCITED_S = 1.0  # memory of the grip used
 
 
@@ -72,12 +76,14 @@ def finish_block(memory: Memory, design: Design, scratch: Scratch, row: FloatArr
     scratch.scales[0] = design.scales[0] * memory.factor[n, 0]
     scratch.scales[1] = design.scales[1] * memory.factor[n, 1]
     health = block_features(
-        row, constants, scratch.scales, held, memory.side[n], memory.gain_sum[n], memory.sums[n], memory.counts[n], memory.start_omega[n],
-        memory.last_omega[n], memory.last_delta[n], duration, speed, scratch.loads, scratch.spin, scratch.features,
+        row, constants, scratch.scales, held, memory.side[n], memory.gain_sum[n], memory.sums[n], memory.counts[n],
+        memory.start_omega[n], memory.last_omega[n], memory.last_delta[n], duration, speed, scratch.loads,
+        scratch.spin, scratch.features,
     )  # fmt: skip
     _road(memory, design, scratch, n, speed * duration)
     _measure(memory, design, scratch, row, n, duration)
     _predict(memory, design, scratch, n, duration, speed)
+    health |= _recover(memory, design, scratch, n)
     _conclude(memory, design, scratch, row, n, health)
 
 
@@ -97,7 +103,10 @@ def _road(memory: Memory, design: Design, scratch: Scratch, n: int, metres: floa
 
 @compiled
 def _measure(memory: Memory, design: Design, scratch: Scratch, row: FloatArray, n: int, duration: float) -> None:
-    """Update all nodes, reweigh, adapt, and note NIS and the predictive log-likelihood."""
+    """Update all nodes, reweigh, adapt, and note NIS and the predictive log-likelihood.
+
+    Without accelerations, yaw rate or steering, sliding cannot be told from rolling: nothing is concluded on friction.
+    """
     held, constants = memory.held[n], design.constants
     inflation = max(constants[C.CORRELATION] / duration, 1.0)
     count = design.mu.shape[0]
@@ -108,8 +117,8 @@ def _measure(memory: Memory, design: Design, scratch: Scratch, row: FloatArray, 
     for j in range(count):
         loglik, plain, square, used = update_node(
             row, constants, design.mu[j], memory.mean[n, j], memory.root[n, j], scratch.features, inflation,
-            design.xi, design.w_cov, scratch.at_force, scratch.slopes, scratch.points, scratch.outcomes, scratch.innovation[j],
-            scratch.theoretical[j], scratch.noise, scratch.work,
+            design.xi, design.w_cov, scratch.at_force, scratch.slopes, scratch.points, scratch.outcomes,
+            scratch.innovation[j], scratch.theoretical[j], scratch.noise, scratch.work,
         )  # fmt: skip
         scratch.log_likelihood[j], scratch.plain[j] = loglik, plain + math.log(memory.weight[n, j])
         best, top = max(best, loglik), max(top, scratch.plain[j])
@@ -126,12 +135,13 @@ def _measure(memory: Memory, design: Design, scratch: Scratch, row: FloatArray, 
     held[H.LOG_LIKELIHOOD] = top + math.log(total) if rows > 0 else 0.0
     held[H.NIS] = nis / rows if rows > 0 else 0.0
     need = (constants[C.DEMAND_HALF] / max(scratch.features[F.DEMAND], 1e-3)) ** constants[C.DEMAND_POWER]
+    blind = memory.counts[n, S.AX] == 0 or math.isnan(scratch.features[F.SIDE] + scratch.features[F.SIDE + 1])
     share = novelty(memory.usual[n], scratch.features, constants, duration) / (1.0 + need)
     for j in range(count):
         loss = scratch.log_likelihood[j] - best
         beyond = min(loss + constants[C.PLAUSIBLE], 0.0)
         loss = max(loss, -constants[C.PLAUSIBLE])
-        scratch.log_likelihood[j] = max(share * loss + beyond, -constants[C.LARGEST_LOSS])
+        scratch.log_likelihood[j] = 0.0 if blind else max(share * loss + beyond, -constants[C.LARGEST_LOSS])
     recall_lost(memory.mean[n], memory.root[n], memory.weight[n], constants)
     reweigh(memory.weight[n], scratch.log_likelihood)
     reweigh(memory.visit[n], scratch.log_likelihood)
@@ -148,8 +158,28 @@ def _measure(memory: Memory, design: Design, scratch: Scratch, row: FloatArray, 
 
 
 @compiled
+def _recover(memory: Memory, design: Design, scratch: Scratch, n: int) -> int:
+    """Begin the motion and the friction anew where freely rolling wheels have long contradicted them.
+
+    A wheel without force rolls: if all nodes call it sliding, none finds back by itself, for the curve is flat there.
+    """
+    expected = memory.theoretical[n, 0]
+    if scratch.features[F.DEMAND] > FREE_DEMAND or memory.actual[n, 0] * memory.factor[n, 0] < LOST_RATIO * expected:
+        return 0
+    speed, most = math.nan, -math.inf
+    for wheel in range(4):
+        if scratch.features[F.ROLL + wheel] > most:
+            speed = most = scratch.features[F.ROLL + wheel]
+    restart_motion(memory, n, speed, LOST_SPREAD_M_S)
+    memory.actual[n, 0] = expected
+    for j in range(design.prior.shape[0]):
+        memory.weight[n, j] = memory.visit[n, j] = design.prior[j]
+    return flags.RESET
+
+
+@compiled
 def novelty(usual: FloatArray, features: FloatArray, constants: FloatArray, duration: float) -> float:
-    """Share of the evidence that is new, from the forces against their smoothed past `usual` (6,), which is moved on."""
+    """Share of the evidence that is new: forces against their smoothed past `usual` (6,), moved on by a block."""
     keep = math.exp(-duration / constants[C.STEADY_TIME])
     most = 0.0
     for r in range(6):
@@ -158,7 +188,7 @@ def novelty(usual: FloatArray, features: FloatArray, constants: FloatArray, dura
             most = max(most, abs(force - usual[r]))
             usual[r] = keep * usual[r] + (1.0 - keep) * force
     least = constants[C.STEADY_SHARE]
-    return least + (1.0 - least) * most * most / (most * most + constants[C.STEADY_HALF] ** 2)
+    return float(least + (1.0 - least) * most * most / (most * most + constants[C.STEADY_HALF] ** 2))
 
 
 @compiled

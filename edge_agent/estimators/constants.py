@@ -178,6 +178,7 @@ CONSTANTS = (
     Constant(C.BEND_SHARE, 0.05, "1", "shape error of the tyre curve at full demand, in force over load"),
     Constant(C.LAG, 0.02, "s", "side force behind slip (relaxation, roll), times its rate"),
     Constant(C.NO_TORQUE_SHARE, 0.3, "1", "how badly the total force is shared out when torque is missing"),
+    Constant(C.WINDOW, 1.0, "s", "window of the innovation variances"),
     Constant(C.STEADY_TIME, 2.0, "s", "memory of the usual force, against which a new one is told"),
     Constant(C.STEADY_HALF, 0.03, "1", "change of force over load from the usual at which half of the evidence is new"),
     Constant(
@@ -186,7 +187,6 @@ CONSTANTS = (
         "1",
         "evidence left where nothing changes: the error of curve and offsets is then the same again",
     ),
-    Constant(C.WINDOW, 1.0, "s", "window of the innovation variances"),
 )
 
 

@@ -6,8 +6,8 @@ Legend
     zeta            share of a node's predicted mass that came from anywhere by a road change [1]
 
 The state of a node after mixing is (1 - zeta)*N(m_j, P_j) + zeta*N(m, P), matched in its first two moments: an
-improbable node keeps the state of the vehicle and is ready to explain the next sample (interacting multiple models, Blom and
-Bar-Shalom 1988). Every covariance is a sum of factors, made triangular.
+improbable node keeps the state of the vehicle and is ready to explain the next sample (interacting multiple models,
+Blom and Bar-Shalom 1988). Every covariance is a sum of factors, made triangular.
 """
 
 from __future__ import annotations

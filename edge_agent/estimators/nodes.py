@@ -73,7 +73,7 @@ def quantile(mu: FloatArray, prior: FloatArray, w: FloatArray, q: float) -> floa
             last = w[count - 1] / prior[count - 1] if j == count else w[j] / prior[j]
             slope = (last - first) / (right - left)
             root = math.sqrt(max(first * first + 2.0 * slope * target, 0.0))
-            return min(left + 2.0 * target / max(first + root, SMALLEST), right)
+            return float(min(left + 2.0 * target / max(first + root, SMALLEST), right))
         target -= mass
     return UPPER
 
@@ -83,10 +83,10 @@ def _segment(mu: FloatArray, prior: FloatArray, w: FloatArray, j: int) -> float:
     """Mass between nodes j - 1 and j (with the ends of the range for nodes -1 and K)."""
     count = mu.shape[0]
     if j == 0:
-        return (mu[0] - LOWER) * w[0] / prior[0]
+        return float((mu[0] - LOWER) * w[0] / prior[0])
     if j == count:
-        return (UPPER - mu[count - 1]) * w[count - 1] / prior[count - 1]
-    return 0.5 * (mu[j] - mu[j - 1]) * (w[j - 1] / prior[j - 1] + w[j] / prior[j])
+        return float((UPPER - mu[count - 1]) * w[count - 1] / prior[count - 1])
+    return float(0.5 * (mu[j] - mu[j - 1]) * (w[j - 1] / prior[j - 1] + w[j] / prior[j]))
 
 
 @compiled

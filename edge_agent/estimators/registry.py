@@ -2,9 +2,9 @@
 
 `aco-fckf`, `fckf` and `ckf` are one filter: a Rao-Blackwellised mixture over friction with square-root cubature filters
 as its nodes. They differ in the fuzzy adaptation of the measurement noise: tuned by the ant colony, untuned, none.
-Departures from paper 004, whose family it is: kinematic prediction, wheel speed as a measurement, force from torque, residuals by
-total least squares, friction as a mixture instead of a state, stiffness and leak as states, bounded adaptation in the
-direction of the errata.
+Departures from paper 004, whose family it is: kinematic prediction, wheel speed as a measurement, force from torque,
+residuals by total least squares, friction as a mixture instead of a state, stiffness, leaks and offsets as states,
+bounded adaptation in the direction of the errata.
 """
 
 from __future__ import annotations

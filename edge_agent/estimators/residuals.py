@@ -46,13 +46,14 @@ def gained(gains: FloatArray, first: int, x: FloatArray, axis: int) -> float:
     """
     ahead, left = gains[first + 6], gains[first + 7]
     unit_x, unit_y = (ahead, -left) if axis == 0 else (left, ahead)
-    return (
+    total = (
         gains[first + axis]
         - x[X.LEAK_X] * gains[first + 2 + axis]
         - x[X.LEAK_Y] * gains[first + 4 + axis]
         - x[X.BIAS_X] * unit_x
         - x[X.BIAS_Y] * unit_y
     )
+    return float(total)
 
 
 @compiled
@@ -122,6 +123,7 @@ def residuals(
     vy = cos * x[X.VY] - sin * x[X.VX] + gained(features, F.GAIN, x, 1)
     for axle in range(2):
         offset = x[X.STEER] if axle == 0 else 0.0
+        blind = math.isnan(features[F.SIDE + axle])  # slip across is then guesswork, and must not bend the force along
         first = 2 * axle
         ln_kx = told(
             x[X.LN_KX],
@@ -145,7 +147,7 @@ def residuals(
             rolling = features[F.ROLL + wheel]
             known = not math.isnan(rolling)
             g_x = slope_x * (rolling - along) / speed if known else features[F.FORCE + wheel]
-            g_y = slope_y * (offset - across / speed)
+            g_y = 0.0 if blind else slope_y * (offset - across / speed)
             theta = math.hypot(g_x, g_y) / mu
             ratio = magic_formula(theta, shape, 0.0) / theta if theta > TINY else 1.0
             slopes[wheel] = steepness(g_x, g_y, theta, ratio, shape) if known else 1.0

@@ -222,19 +222,8 @@ def _add(memory: Memory, n: int, sample: FloatArray) -> None:
 
 
 @compiled
-def _bridge(
-    memory: Memory, constants: FloatArray, prior: FloatArray, row: FloatArray, n: int, time: float, sample: FloatArray
-) -> int:
-    """After a silence: the friction is forgotten over the metres driven meanwhile, the motion starts anew."""
-    held = memory.held[n]
-    gone = time - held[H.TIME]
-    hazard = 1.0 - math.exp(-abs(memory.all_mean[n, X.VX]) * gone * constants[C.HAZARD])
-    for j in range(prior.shape[0]):
-        memory.sums[n, 0] = 0.0
-        memory.weight[n, j] += hazard * (prior[j] - memory.weight[n, j])
-        memory.visit[n, j] += hazard * (prior[j] - memory.visit[n, j])
-    speed = rolling_speed(row, sample)
-    spread = min(GAP_ACCELERATION * gone, UNKNOWN_VX_STD)
+def restart_motion(memory: Memory, n: int, speed: float, spread: float) -> None:
+    """All nodes of vehicle n go on at `speed` [m/s], or, where that is NaN, at the speed they have within `spread`."""
     if not math.isnan(speed):
         memory.all_mean[n, X.VX], spread = speed, FIRST_VX_STD
     memory.all_mean[n, X.VY] = 0.0
@@ -243,9 +232,23 @@ def _bridge(
         for axis in range(2):
             root[i, axis] = 0.0
     root[X.VX, X.VX], root[X.VY, X.VY] = spread, FIRST_VY_STD
-    for j in range(prior.shape[0]):
+    for j in range(memory.mean.shape[1]):
         memory.mean[n, j] = memory.all_mean[n]
         memory.root[n, j] = root
+
+
+@compiled
+def _bridge(
+    memory: Memory, constants: FloatArray, prior: FloatArray, row: FloatArray, n: int, time: float, sample: FloatArray
+) -> int:
+    """After a silence: the friction is forgotten over the metres driven meanwhile, the motion starts anew."""
+    held = memory.held[n]
+    gone = time - held[H.TIME]
+    hazard = 1.0 - math.exp(-abs(memory.all_mean[n, X.VX]) * gone * constants[C.HAZARD])
+    for j in range(prior.shape[0]):
+        memory.weight[n, j] += hazard * (prior[j] - memory.weight[n, j])
+        memory.visit[n, j] += hazard * (prior[j] - memory.visit[n, j])
+    restart_motion(memory, n, rolling_speed(row, sample), min(GAP_ACCELERATION * gone, UNKNOWN_VX_STD))
     rate = reading(sample, S.YAW_RATE)
     if not math.isnan(rate):
         held[H.YAW_RATE], held[H.YAW_RATE_VAR] = rate, YAW_STD**2

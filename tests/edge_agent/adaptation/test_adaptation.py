@@ -1,0 +1,85 @@
+"""The fuzzy adaptation grows R when innovations are too large, within bounds, by tables that refuse nonsense."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edge_agent.adaptation.fuzzy import LARGEST_FACTOR, LEAST_FACTOR, adapted, infer
+from edge_agent.adaptation.memberships import Memberships, load_memberships
+from schemas.errors import InputError
+
+SETS = Memberships()
+INPUTS, OUTPUTS = np.array(SETS.inputs), np.array(SETS.outputs)
+
+
+def test_at_the_peak_of_a_set_its_output_alone_speaks() -> None:
+    for peak, output in zip(INPUTS, OUTPUTS, strict=True):
+        assert infer(float(peak), INPUTS, OUTPUTS) == pytest.approx(float(output))
+
+
+def test_inference_rises_with_the_mismatch_and_covers_its_whole_range() -> None:
+    said = [infer(float(x), INPUTS, OUTPUTS) for x in np.linspace(-1.0, 50.0, 2000)]
+    assert (np.diff(said) >= 0).all()
+
+
+def test_noise_grows_where_the_actual_innovation_exceeds_the_theoretical_one() -> None:
+    assert adapted(1.0, 3.0, 1.0, INPUTS, OUTPUTS) > 1.0
+    assert adapted(1.0, 1.0, 1.0, INPUTS, OUTPUTS) == 1.0
+    assert adapted(2.0, 0.2, 1.0, INPUTS, OUTPUTS) < 2.0
+
+
+def test_the_factor_stays_within_its_bounds_however_long_the_mismatch_lasts() -> None:
+    high = low = 1.0
+    for _ in range(1000):
+        high, low = adapted(high, 100.0, 1.0, INPUTS, OUTPUTS), adapted(low, 0.0, 1.0, INPUTS, OUTPUTS)
+    assert high == LARGEST_FACTOR
+    assert low == LEAST_FACTOR
+
+
+def test_without_a_theoretical_variance_nothing_is_concluded() -> None:
+    assert adapted(2.0, 1.0, 0.0, INPUTS, OUTPUTS) == 2.0
+
+
+def test_memberships_survive_vector_and_json(tmp_path: Path) -> None:
+    sets = Memberships(ln_scales=(0.2, -0.3))
+    assert Memberships.from_vector(sets.to_vector()) == sets
+    path = tmp_path / "sets.json"
+    path.write_text(json.dumps({"memberships": sets.to_json(), "seed": 3}))
+    assert load_memberships(path) == sets
+
+
+def test_every_vector_within_the_bounds_is_a_valid_set_of_memberships() -> None:
+    lower, upper = Memberships.bounds()
+    rng = np.random.default_rng(6)
+    for share in rng.uniform(size=(200, len(lower))):
+        Memberships.from_vector(lower + share * (upper - lower))
+    assert ((SETS.to_vector() >= lower) & (SETS.to_vector() <= upper)).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"inputs": (0.0, -0.4, 0.1, 1.0, 4.0)}, "inputs"),
+        ({"inputs": (-0.8, -0.4, 0.0, 1.0)}, "inputs"),
+        ({"outputs": (0.1, 0.0, 0.0, 0.0, -0.1)}, "outputs"),
+        ({"outputs": (-0.1, 0.0, 0.0, 0.0, float("nan"))}, "outputs"),
+        ({"outputs": (0.01, 0.02, 0.03, 0.04, 0.05)}, "outputs"),
+        ({"ln_scales": (9.0, 0.0)}, "ln_scales"),
+    ],
+)
+def test_impossible_memberships_are_refused_by_name(change: dict[str, Any], field: str) -> None:
+    with pytest.raises(InputError, match=field):
+        Memberships(**change)
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"inputs": "wide"}', '{"memberships": {}}'])
+def test_a_file_that_is_no_memberships_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "sets.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match="memberships"):
+        load_memberships(path)

@@ -1,0 +1,225 @@
+"""What every estimator of the bank promises: causality, bit-equality, honesty without excitation, no NaN."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from edge_agent.adaptation.memberships import Memberships
+from edge_agent.estimators import ESTIMATORS, Estimates, create
+from schemas.errors import InputError
+from schemas.mugrid import CENTRES
+from schemas.numeric import FloatArray
+from schemas.signals import Health, S
+from tests.edge_agent.estimators.drives import drive, joined
+
+PRIOR_WIDTH = 0.9 * 1.15
+ARRAYS = [f.name for f in fields(Estimates) if f.name not in ("mu_wheel", "evidence")]
+
+
+def run(name: str, t: FloatArray, signals: FloatArray, vehicle: object, closes: FloatArray | None = None) -> Estimates:
+    bank = create(name, [vehicle], memberships=Memberships())  # type: ignore[list-item]
+    ends = None if closes is None else closes.astype(bool)[:, None]
+    return bank.advance(t[:, None], signals[:, None], ends)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_a_drive_that_excites_finds_its_friction_and_its_velocity(name: str) -> None:
+    t, signals, vehicle = drive("j-turn", 0.5)
+    said = run(name, t, signals, vehicle)
+    assert said.mu_lower[-1, 0] < 0.5 < said.mu_upper[-1, 0]
+    assert said.mu_upper[-1, 0] - said.mu_lower[-1, 0] < 0.4
+    assert said.mu_utilised[-1, 0] > 0.35
+
+
+def test_straight_on_at_constant_speed_the_interval_stays_as_wide_as_the_prior() -> None:
+    t, signals, vehicle = drive("straight", 0.85)
+    said = run("fckf", t, signals, vehicle)
+    assert (said.mu_upper - said.mu_lower)[-1, 0] >= 0.8 * PRIOR_WIDTH
+
+
+def test_what_was_learned_is_forgotten_over_the_metres_driven_without_excitation() -> None:
+    turn, straight = drive("j-turn", 0.5), drive("straight", 0.5, seconds=40.0)
+    t, signals = joined(turn, straight)
+    said = run("fckf", t, signals, turn[2])
+    width = (said.mu_upper - said.mu_lower)[:, 0]
+    assert width[len(turn[0]) - 1] < 0.4
+    assert width[-1] >= 0.8 * PRIOR_WIDTH
+
+
+def test_a_vehicle_has_the_same_numbers_alone_and_among_many() -> None:
+    t, signals, vehicle = drive("slalom", 0.3, seconds=6.0)
+    many = 7
+    alone = run("fckf", t, signals, vehicle)
+    bank = create("fckf", [vehicle] * many, memberships=Memberships())
+    crowd = np.repeat(signals[:, None], many, axis=1)
+    crowd[:, 1:] += 0.01 * np.random.default_rng(0).normal(size=(1, many - 1, crowd.shape[2]))
+    together = bank.advance(np.repeat(t[:, None], many, axis=1), crowd)
+    for name in ARRAYS:
+        assert np.array_equal(getattr(together, name)[:, 0], getattr(alone, name)[:, 0]), name
+
+
+def test_however_the_samples_are_cut_the_numbers_are_the_same() -> None:
+    t, signals, vehicle = drive("slalom", 0.3, seconds=6.0)
+    whole = run("fckf", t, signals, vehicle)
+    bank = create("fckf", [vehicle], memberships=Memberships())
+    cuts = [0, 1, 2, 5, 6, 83, 200, 201, 599, len(t)]
+    parts = [bank.advance(t[a:b, None], signals[a:b, None]) for a, b in pairwise(cuts)]
+    for name in ARRAYS:
+        assert np.array_equal(np.concatenate([getattr(p, name) for p in parts]), getattr(whole, name)), name
+
+
+def test_closing_visits_does_not_change_the_estimates() -> None:
+    t, signals, vehicle = drive("slalom", 0.3, seconds=6.0)
+    closes = np.arange(len(t)) % 100 == 50
+    plain, closed = run("fckf", t, signals, vehicle), run("fckf", t, signals, vehicle, closes)
+    for name in ARRAYS:
+        assert np.array_equal(getattr(plain, name), getattr(closed, name)), name
+    assert closed.evidence is not None
+    assert np.isfinite(closed.evidence[closes]).all()
+    assert np.isnan(closed.evidence[~closes]).all()
+    assert (closed.evidence[closes].max(axis=-1) == 0.0).all()
+
+
+def test_two_beliefs_that_enter_a_cell_send_the_same_evidence_within_half_a_nat() -> None:
+    visit = drive("slalom", 0.3, seconds=8.0)
+    said = []
+    for before in (0.3, 0.85):
+        lead = drive("j-turn", before)
+        t, signals = joined(lead, visit)
+        closes = np.zeros(len(t), bool)
+        closes[[len(lead[0]) + 300, -1]] = True
+        estimates = run("fckf", t, signals, visit[2], closes)
+        assert estimates.evidence is not None
+        said.append(estimates.evidence[-1, 0])
+    told = np.maximum(said[0], said[1]) > -3.0
+    assert np.abs(said[0] - said[1])[told].max() < 0.5
+
+
+def test_a_visit_straight_on_is_flat() -> None:
+    t, signals, vehicle = drive("straight", 0.85)
+    closes = np.zeros(len(t), bool)
+    closes[[300, 500]] = True
+    said = run("fckf", t, signals, vehicle, closes)
+    assert said.evidence is not None
+    assert np.ptp(said.evidence[500, 0]) < 0.2
+
+
+def test_a_gently_braking_visit_excludes_less_than_the_grip_used_and_hardly_anything_above() -> None:
+    t, signals, vehicle = drive("gentle-braking", 0.85)
+    closes = np.zeros(len(t), bool)
+    end = int(np.searchsorted(t, 4.0))
+    closes[[50, end]] = True
+    said = run("fckf", t, signals, vehicle, closes)
+    assert said.evidence is not None
+    used = float(said.mu_utilised[:end].max())
+    told = said.evidence[end, 0]
+    assert np.ptp(told[1.5 * used < CENTRES]) < 2.0
+    assert told[0.7 * used > CENTRES].max() < -4.0
+
+
+def _without(*channels: int) -> Callable[[FloatArray, FloatArray], None]:
+    def fault(_: FloatArray, signals: FloatArray) -> None:
+        signals[200:, list(channels)] = np.nan
+
+    return fault
+
+
+def _spikes(_: FloatArray, signals: FloatArray) -> None:
+    signals[::97, :15] = 1e9
+    signals[::89, :15] = np.inf
+
+
+def _gap(t: FloatArray, _: FloatArray) -> None:
+    t[300:] += 3.0
+
+
+def _backwards(t: FloatArray, _: FloatArray) -> None:
+    t[300:330] -= 1.0
+    t[400] = np.nan
+
+
+def _all_gone(_: FloatArray, signals: FloatArray) -> None:
+    signals[:] = np.nan
+
+
+FOUR = range(4)
+FAULTS = {
+    "no torque": (_without(*(S.TORQUE + w for w in FOUR)), Health.NO_TORQUE),
+    "no wheel speed": (_without(*(S.OMEGA + w for w in FOUR)), Health.NO_WHEEL_SPEED),
+    "one wheel speed lost": (_without(S.OMEGA + 2), Health.NO_WHEEL_SPEED),
+    "no accelerometers": (_without(S.AX, S.AY), Health.NO_INERTIAL),
+    "no gyroscope": (_without(S.YAW_RATE), Health.NO_INERTIAL),
+    "no steering": (_without(*(S.DELTA + w for w in FOUR)), Health.NO_STEERING),
+    "no position": (_without(S.LATITUDE, S.LONGITUDE, S.YAW), Health.NO_POSITION),
+    "spikes and infinities": (_spikes, Health.OUTLIER),
+    "a gap of three seconds": (_gap, Health.TIME_GAP),
+    "time going backwards and missing": (_backwards, Health.TIME_GAP),
+    "nothing at all": (_all_gone, Health.NO_INERTIAL),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_no_fault_makes_a_nan_and_health_says_what_happened(fault: str) -> None:
+    t, signals, vehicle = drive("slalom", 0.3, seconds=6.0)
+    t, signals = t.copy(), signals.copy()
+    harm, flag = FAULTS[fault]
+    harm(t, signals)
+    said = run("fckf", t, signals, vehicle)
+    for name in ARRAYS:
+        assert np.isfinite(getattr(said, name)).all(), name
+    assert (said.health & int(flag)).any()
+    assert (said.mu_lower <= said.mu).all()
+    assert (said.mu <= said.mu_upper).all()
+
+
+@pytest.mark.parametrize("fault", ["no torque", "no steering", "no accelerometers"])
+def test_with_less_to_go_by_the_interval_is_wider_or_still_right(fault: str) -> None:
+    t, signals, vehicle = drive("slalom", 0.3)
+    broken = signals.copy()
+    FAULTS[fault][0](t, broken)
+    said = run("fckf", t, broken, vehicle)
+    right = (said.mu_lower[200:, 0] <= 0.3) & (said.mu_upper[200:, 0] >= 0.3)
+    assert right.mean() > 0.8
+
+
+def test_a_time_that_is_not_a_number_at_first_is_waited_out() -> None:
+    t, signals, vehicle = drive("slalom", 0.3, seconds=2.0)
+    late = t.copy()
+    late[:10] = np.nan
+    said = run("fckf", late, signals, vehicle)
+    assert np.isfinite(said.mu).all()
+    assert (said.health[:10] & int(Health.TIME_GAP)).all()
+
+
+def test_the_adaptation_is_what_tells_the_estimators_apart() -> None:
+    t, signals, vehicle = drive("slalom", 0.3, seconds=6.0)
+    fuzzy, plain = run("fckf", t, signals, vehicle), run("ckf", t, signals, vehicle)
+    assert (plain.adaptation == 1.0).all()
+    assert (fuzzy.adaptation != 1.0).any()
+    assert not np.array_equal(fuzzy.mu, plain.mu)
+
+
+def test_noisier_scales_give_wider_velocities() -> None:
+    t, signals, vehicle = drive("slalom", 0.3, seconds=6.0)
+    wide = create("ckf", [vehicle], memberships=Memberships(ln_scales=(1.0, 1.0))).advance(t[:, None], signals[:, None])
+    assert wide.vx_std[-1, 0] > run("ckf", t, signals, vehicle).vx_std[-1, 0]
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "field"),
+    [("aco-fckf-2", (3, 1, 18), "estimator"), ("ckf", (3, 2, 18), "signals"), ("ckf", (3, 1, 17), "signals")],
+)
+def test_misuse_is_refused_by_name(name: str, shape: tuple[int, ...], field: str) -> None:
+    vehicle = drive("slalom", 0.3, seconds=2.0)[2]
+    with pytest.raises(InputError, match=field):
+        create(name, [vehicle], memberships=Memberships()).advance(np.zeros((3, 1)), np.zeros(shape))
+
+
+def test_a_bank_of_no_vehicles_is_refused() -> None:
+    with pytest.raises(InputError, match="vehicles"):
+        create("ckf", [])

@@ -1,0 +1,52 @@
+"""Identities of the friction mixture: prior, road change, quantiles, evidence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edge_agent.estimators.constants import CONSTANTS, NODES, C
+from edge_agent.estimators.nodes import change_road, evidence, node_table, quantile, reweigh
+from schemas.mugrid import CENTRES
+
+MU, PRIOR = node_table(NODES)
+
+
+def test_the_prior_of_the_nodes_is_uniform_in_mu_and_its_quantiles_say_so() -> None:
+    assert PRIOR.sum() == pytest.approx(1.0)
+    for q in (0.05, 0.5, 0.95):
+        assert quantile(MU, PRIOR, PRIOR, q) == pytest.approx(0.05 + 1.15 * q, abs=1e-9)
+
+
+def test_road_change_leaves_the_prior_as_it_is() -> None:
+    out = np.empty(NODES)
+    change_road(PRIOR, PRIOR, 0.1, 0.3, out)
+    assert out == pytest.approx(PRIOR, abs=1e-12)
+
+
+def test_road_change_keeps_the_whole_mass_and_brings_any_belief_back_to_the_prior() -> None:
+    w = np.zeros(NODES)
+    w[3] = 1.0
+    out = np.empty(NODES)
+    for _ in range(400):
+        change_road(w, PRIOR, 0.02, 0.05, out)
+        w[:] = out
+        assert w.sum() == pytest.approx(1.0)
+    assert w == pytest.approx(PRIOR, abs=1e-3)
+
+
+def test_evidence_is_the_likelihood_that_was_put_in() -> None:
+    w = PRIOR.copy()
+    log_likelihood = -((MU - 0.6) ** 2) / 0.02
+    reweigh(w, log_likelihood - log_likelihood.max())
+    out = np.empty(len(CENTRES))
+    evidence(MU, PRIOR, w, CENTRES, out)
+    inner = (CENTRES > 0.3) & (CENTRES < 0.9)
+    expected = -((CENTRES - 0.6) ** 2) / 0.02
+    assert out.max() == 0.0
+    assert np.abs((out - out[inner].max()) - (expected - expected[inner].max()))[inner].max() < 0.2
+
+
+def test_every_constant_stands_once_in_the_table_with_unit_and_reason() -> None:
+    assert [c.place for c in CONSTANTS] == list(C)
+    assert all(c.unit and c.reason for c in CONSTANTS)

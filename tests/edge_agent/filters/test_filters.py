@@ -1,0 +1,157 @@
+"""Theorems of the sigma rules and oracles of the square-root core."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from edge_agent.filters import squareroot
+from edge_agent.filters.sigma import SigmaRule, cubature, unscented
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+
+RULES = [cubature(4), unscented(4, 1.0, 0.0, 0.0), unscented(4, 1.0, 2.0, 0.5), unscented(4, 0.9, 2.0, 1.0)]
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
+def test_a_rule_integrates_a_random_quadratic_exactly(rule: SigmaRule) -> None:
+    rng = np.random.default_rng(1)
+    a, b = rng.normal(size=(4, 4)), rng.normal(size=4)
+    values = np.einsum("pi,ij,pj->p", rule.xi, a, rule.xi) + rule.xi @ b + 3.0
+    assert rule.w_mean @ values == pytest.approx(np.trace(a) + 3.0, abs=1e-9)
+
+
+def test_cubature_is_unscented_with_alpha_one_and_beta_and_kappa_zero() -> None:
+    for n in range(1, 9):
+        left, right = cubature(n), unscented(n, 1.0, 0.0, 0.0)
+        assert np.array_equal(left.xi, right.xi)
+        assert np.array_equal(left.w_mean, right.w_mean)
+        assert np.array_equal(left.w_cov, right.w_cov)
+
+
+@pytest.mark.parametrize("place", ["xi", "w_mean", "w_cov"])
+def test_a_rule_with_one_corrupted_constant_is_refused(place: str) -> None:
+    rule = cubature(3)
+    parts = {name: getattr(rule, name).copy() for name in ("xi", "w_mean", "w_cov")}
+    parts[place].flat[0] += 1e-6
+    with pytest.raises(InputError, match="moment"):
+        SigmaRule("corrupted", **parts)
+
+
+def test_a_negative_covariance_weight_is_refused() -> None:
+    with pytest.raises(InputError, match="negative"):
+        unscented(4, 1.0, 0.0, -2.0)
+
+
+@pytest.mark.parametrize("shape", [(3, 3), (3, 7), (6, 20)])
+def test_triangularizing_keeps_the_product_and_makes_a_cholesky_factor(shape: tuple[int, int]) -> None:
+    a = np.random.default_rng(5).normal(size=shape)
+    b = a.copy()
+    squareroot.triangularize(b, *shape)
+    factor = b[:, : shape[0]]
+    assert np.allclose(factor @ factor.T, a @ a.T, rtol=0, atol=1e-12)
+    assert np.allclose(factor, np.tril(factor))
+    assert (np.diag(factor) >= 0).all()
+
+
+def test_a_covariance_keeps_a_centimetre_at_an_offset_of_5400_kilometres() -> None:
+    rule = cubature(2)
+    points, mean, work = np.empty((4, 2)), np.empty(2), np.zeros((2, 6))
+    root = np.zeros((2, 2))
+    squareroot.sigma_points(np.array([5.4e6, -5.4e6]), 0.01 * np.eye(2), rule.xi, points)
+    squareroot.predict(points, rule.w_mean, rule.w_cov, np.zeros((2, 2)), mean, root, work)
+    assert np.diag(root) == pytest.approx([0.01, 0.01], rel=1e-6)
+
+
+def factor_of(cov: FloatArray) -> FloatArray:
+    """Lower-triangular factor of a covariance."""
+    return np.asarray(np.linalg.cholesky(cov), np.float64)
+
+
+def _moved(
+    rule: SigmaRule, mean: FloatArray, cov: FloatArray, f: FloatArray, q: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    n = len(mean)
+    count = len(rule.xi)
+    points = np.empty((count, n))
+    squareroot.sigma_points(mean, factor_of(cov), rule.xi, points)
+    new, root = np.empty(n), np.zeros((n, n))
+    noise = factor_of(q)
+    squareroot.predict(points @ f.T, rule.w_mean, rule.w_cov, noise, new, root, np.zeros((n, count + n)))
+    return new, root
+
+
+def _corrected(
+    rule: SigmaRule, mean: FloatArray, root: FloatArray, h: FloatArray, std: FloatArray, z: FloatArray
+) -> tuple[FloatArray, FloatArray, tuple[int, float, float]]:
+    n, count, rows = len(mean), len(rule.xi), len(z)
+    points = np.empty((count, n))
+    squareroot.sigma_points(mean, root, rule.xi, points)
+    x, y = np.empty((n, count)), np.empty((rows, count))
+    squareroot.deviations(points, mean, rule.w_cov, x, 0)
+    seen = points @ h.T
+    squareroot.deviations(seen, rule.w_mean @ seen, rule.w_cov, y, 0)
+    new, factor = mean.copy(), root.copy()
+    work = np.zeros((rows + n, count + rows))
+    said = squareroot.update(new, factor, x, y, z - rule.w_mean @ seen, std, work)
+    return new, factor, said
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
+def test_on_a_linear_system_the_core_is_the_kalman_filter(rule: SigmaRule) -> None:
+    rng = np.random.default_rng(2)
+    f, h = 0.9 * np.eye(4) + 0.05 * rng.normal(size=(4, 4)), rng.normal(size=(3, 4))
+    q, std = 0.01 * np.eye(4), np.array([0.1, 0.2, 0.3])
+    mean, cov = rng.normal(size=4), np.eye(4)
+    ours, ours_cov = mean, cov
+    for _ in range(50):
+        z = rng.normal(size=3)
+        mean, cov = f @ mean, f @ cov @ f.T + q
+        s = h @ cov @ h.T + np.diag(std**2)
+        k = cov @ h.T @ np.linalg.inv(s)
+        nu = z - h @ mean
+        expected = -0.5 * (nu @ np.linalg.solve(s, nu) + np.linalg.slogdet(2 * np.pi * s)[1])
+        rest = np.eye(4) - k @ h
+        mean, cov = mean + k @ nu, rest @ cov @ rest.T + k @ np.diag(std**2) @ k.T
+        ours, root = _moved(rule, ours, ours_cov, f, q)
+        ours, root, said = _corrected(rule, ours, root, h, std, z)
+        ours_cov = root @ root.T
+        assert said[1] == pytest.approx(expected, abs=1e-9)
+        assert np.allclose(ours, mean, rtol=0, atol=1e-12)
+        assert np.allclose(ours_cov, cov, rtol=0, atol=1e-12)
+
+
+def test_on_a_curved_measurement_the_square_root_is_the_textbook_covariance_filter() -> None:
+    rule = cubature(3)
+    rng = np.random.default_rng(4)
+    a = rng.normal(size=(3, 3))
+    mean, cov = rng.normal(size=3), a @ a.T
+    points = mean + rule.xi @ np.linalg.cholesky(cov).T
+    seen = np.stack([np.sin(points[:, 0]), points[:, 1] * points[:, 2]], axis=1)
+    centre = seen.mean(0)
+    r = np.array([0.3, 0.4])
+    s = (seen - centre).T @ (seen - centre) / 6 + np.diag(r**2)
+    c = (points - mean).T @ (seen - centre) / 6
+    nu = np.array([0.2, -0.5])
+    k = c @ np.linalg.inv(s)
+    new, root = mean.copy(), factor_of(cov)
+    squareroot.update(
+        new, root, (points - mean).T / math.sqrt(6), (seen - centre).T / math.sqrt(6), nu, r, np.zeros((5, 8))
+    )
+    assert np.allclose(new, mean + k @ nu, rtol=0, atol=1e-9)
+    assert np.allclose(root @ root.T, cov - k @ s @ k.T, rtol=0, atol=1e-9)
+
+
+def test_a_missing_row_is_as_if_it_had_never_been_asked_for() -> None:
+    rule = cubature(2)
+    mean, root = np.array([1.0, 2.0]), np.array([[1.0, 0.0], [0.3, 0.5]])
+    h, std = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]), np.array([0.1, 0.2, 0.3])
+    gappy = _corrected(rule, mean, root, h, std, np.array([1.5, math.nan, 3.0]))
+    whole = _corrected(rule, mean, root, h[[0, 2]], std[[0, 2]], np.array([1.5, 3.0]))
+    assert np.array_equal(gappy[0], whole[0])
+    assert np.array_equal(gappy[1], whole[1])
+    nothing = _corrected(rule, mean, root, h, std, np.full(3, math.nan))
+    assert np.array_equal(nothing[0], mean)
+    assert nothing[2] == (0, 0.0, 0.0)
