@@ -20,7 +20,7 @@ from schemas import figures
 from schemas.errors import InputError
 
 ESTIMATOR: Final = "aco-fckf"
-ANTS, ITERATIONS, DURATION_S = 12, 14, 6.0
+ANTS, ITERATIONS, DURATION_S = 12, 10, 6.0
 QUICK_ANTS, QUICK_ITERATIONS, QUICK_DURATION_S = 3, 2, 2.0
 POSITIONS: Final = 7  # per vertex: the default and three to each side
 

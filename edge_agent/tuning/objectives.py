@@ -66,6 +66,18 @@ TRAIN: Final = (
     Drive("pulses", "sedan", 0.35, 110),
     Drive("pulses", "small", 0.80, 111, NOISY),
     Drive("straight", "van", 0.85, 112),
+    Drive("double-lane-change", "sedan", 0.45, 113),
+    Drive("slalom", "van", 0.60, 114),
+    Drive("slalom", "small", 0.80, 115, NOISY),
+    Drive("sine", "van", 0.90, 116),
+    Drive("acceleration", "sedan", 0.85, 117),
+    Drive("braking", "small", 0.35, 118),
+    Drive("braking", "van", 0.25, 119, NOISY),
+    Drive("gentle-braking", "van", 0.80, 120),
+    Drive("constant-radius", "small", 0.70, 121),
+    Drive("j-turn", "van", 0.50, 122),
+    Drive("j-turn", "small", 0.30, 123, NOISY),
+    Drive("pulses", "sedan", 0.60, 124),
 )
 HELD_OUT: Final = (
     Drive("double-lane-change", "van", 0.70, 901),

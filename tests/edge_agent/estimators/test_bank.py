@@ -27,7 +27,7 @@ def run(name: str, t: FloatArray, signals: FloatArray, vehicle: object, closes: 
     return bank.advance(t[:, None], signals[:, None], ends)
 
 
-@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("name", ["aco-fckf", "fckf", "ckf"])
 def test_a_drive_that_excites_finds_its_friction_and_its_velocity(name: str) -> None:
     t, signals, vehicle = drive("j-turn", 0.5)
     said = run(name, t, signals, vehicle)
