@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.estimators import ESTIMATORS, Estimates, create
+from edge_agent.estimators import Estimates, create
 from schemas.errors import InputError
 from schemas.mugrid import CENTRES
 from schemas.numeric import FloatArray
