@@ -11,10 +11,11 @@ import numpy as np
 
 from edge_agent.observer import Open, Records, observe
 from edge_agent.sources import NS, Block
+from edge_agent.trip_ends import TripEnds
 from edge_agent.visits import Track, locate
 
 if TYPE_CHECKING:
-    from edge_agent.estimators import Estimates, EstimatorBank
+    from edge_agent.estimators import Bank, Estimates
     from schemas.config import AgentConfig
 
 FINAL_STEP_S = 1e-3  # after the last sample; short, so that the estimate is not propagated
@@ -23,18 +24,20 @@ FINAL_STEP_S = 1e-3  # after the last sample; short, so that the estimate is not
 class Pipeline:
     """A bank of N vehicles with its open visits. Use `step` for each block in order, then `finish` once."""
 
-    def __init__(self, bank: EstimatorBank, vehicles: int, config: AgentConfig) -> None:
+    def __init__(self, bank: Bank, vehicles: int, config: AgentConfig) -> None:
         self._bank, self._config = bank, config
         self._track, self._open = Track.start(vehicles), Open.start(vehicles)
+        self._ends = TripEnds(vehicles, config.trip_end_m, config.trip_end_s)
         self._last: Block | None = None
 
     def step(self, block: Block) -> tuple[Estimates, Records, Records]:
-        """Estimates, observations and states of a block of at least one sample."""
+        """Estimates, observations and states of a block of at least one sample, the latter two without trip ends."""
         self._track, located = locate(self._track, block.t, block.signals)
         estimates = self._bank.advance(block.t, block.signals, located.closes)
         self._open, observations, states = observe(self._open, block.time, located, estimates, self._config)
         self._last = block
-        return estimates, observations, states
+        self._ends.drive(block.time, estimates.vx)
+        return estimates, self._ends.cut(observations), self._ends.cut(states)
 
     def finish(self) -> Records | None:
         """Close the open visits and return their observations; None when there was no sample.
@@ -50,4 +53,4 @@ class Pipeline:
         estimates = self._bank.advance(t, empty, located.closes)
         self._track = track
         self._open, observations, _ = observe(self._open, time, located, estimates, self._config)
-        return observations
+        return self._ends.cut(observations)

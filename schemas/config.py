@@ -44,6 +44,12 @@ class AgentConfig(Settings):
         default=256.0, description="[MB] at the most; oldest state goes first, then observations"
     )
     resend_s: Positive = Field(default=2.0, description="first wait before a batch is sent again; doubles up to 6 s")
+    trip_end_m: float = Field(
+        default=0.0, ge=0.0, allow_inf_nan=False, description="[m] at both ends of a trip of which nothing is told"
+    )
+    trip_end_s: float = Field(
+        default=0.0, ge=0.0, allow_inf_nan=False, description="[s] likewise; both must have passed"
+    )
     tyre_season: int = Field(default=0, ge=0, le=3, description="0 unknown, 1 summer, 2 winter, 3 all-season")
 
 
@@ -61,6 +67,9 @@ class ServiceConfig(Settings):
     segment_s: Positive = Field(default=0.5, le=1.0, description="longest time an admitted row waits for its segment")
     put_s: Positive = Field(default=1.0, description="shortest time between two puts of one tile")
     lateness_s: Positive = Field(default=120.0, description="later observations are archived, not fused")
+    public_vehicles: int = Field(
+        default=1, ge=1, description="answers and tiles show only cells of so many distinct vehicles (privacy)"
+    )
     clock_ahead_s: Positive = Field(default=30.0, description="records further in the future are refused")
     oldest_s: Positive = Field(default=30 * 86400.0, description="records older than this are refused")
     queue_batches: int = Field(

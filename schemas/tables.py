@@ -103,6 +103,7 @@ MAP_CELL: Final = (
     Field("south", F64, "deg", "border of the cell"),
     Field("east", F64, "deg", "border of the cell"),
     Field("north", F64, "deg", "border of the cell"),
+    Field("safe_deceleration", F32, "m/s^2", "what the road bears with 95 % probability, g mu_lower; level road"),
 )
 
 ESTIMATES: Final = (

@@ -1,4 +1,4 @@
-"""`edge-agent`: simulate, replay, run, fleet, tune.
+"""`edge-agent`: simulate, replay, run, fleet, tune, evaluate.
 
 Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. What a command needs is imported when
 it is chosen, so that help is quick.
@@ -30,6 +30,7 @@ COMMANDS: Final = (
     Command("run", "edge_agent.cli.run", "one vehicle, live, in real time"),
     Command("fleet", "edge_agent.cli.fleet", "many simulated vehicles in real time, each with its own session"),
     Command("tune", "edge_agent.tuning.cli", "tune the fuzzy memberships by ant colony"),
+    Command("evaluate", "edge_agent.evaluation.cli", "the papers' manoeuvres for every estimator, with figures"),
 )
 
 

@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from edge_agent.agent import Progress
-    from edge_agent.estimators import EstimatorBank
+    from edge_agent.estimators import Bank
     from edge_agent.publisher import Publisher
 
 
-def bank_of(estimator: str, vehicles: Sequence[Vehicle]) -> EstimatorBank:
+def bank_of(estimator: str, vehicles: Sequence[Vehicle]) -> Bank:
     """The estimator bank of a name.
 
     Raises:

@@ -9,8 +9,8 @@ Legend
     c, e        shape and curvature of the Magic Formula [1]
 
 Because K does not depend on mu, all roads share one initial slope: friction is seen in the bend of the curve only
-(errata of papers 002 and 004). Sources: Pacejka, Tyre and Vehicle Dynamics, chapter 4; Dugoff, Fancher and Segel,
-SAE 700377.
+(errata of papers 002 and 004). Sources: Pacejka, Tyre and Vehicle Dynamics, chapters 3 (brush) and 4; Dugoff, Fancher
+and Segel, SAE 700377.
 """
 
 from __future__ import annotations
@@ -44,6 +44,13 @@ def dugoff(theta: float) -> float:
     """Dugoff curve: theta up to one half, then 1 - 1/(4*theta); odd in theta; it has no falling branch."""
     size = abs(theta)
     return theta if size <= 0.5 else math.copysign(1.0 - 0.25 / size, theta)
+
+
+@compiled
+def brush(theta: float) -> float:
+    """Brush curve with parabolic pressure: theta - theta|theta|/3 + theta^3/27 up to 3, then 1; odd in theta."""
+    size = min(abs(theta), 3.0)
+    return math.copysign(size - size * size / 3.0 + size**3 / 27.0, theta)
 
 
 @compiled

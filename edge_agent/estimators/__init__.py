@@ -1,6 +1,7 @@
-"""Estimators by name, through one bank: `create(name, vehicles)` and `EstimatorBank.advance`."""
+"""Estimators by name, through one interface: `create(name, vehicles)` and `Bank.advance`."""
 
-from edge_agent.estimators.bank import Estimates, EstimatorBank
+from edge_agent.estimators.friction_mixture.bank import Estimates, EstimatorBank
+from edge_agent.estimators.gaussian.bank import Bank
 from edge_agent.estimators.registry import ESTIMATORS, create
 
-__all__ = ["ESTIMATORS", "Estimates", "EstimatorBank", "create"]
+__all__ = ["ESTIMATORS", "Bank", "Estimates", "EstimatorBank", "create"]

@@ -9,17 +9,20 @@ bounded adaptation in the direction of the errata.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
 from edge_agent.adaptation.memberships import Memberships, load_memberships
 from edge_agent.dynamics.parameters import parameter_table
-from edge_agent.estimators.advance import Design
-from edge_agent.estimators.bank import EstimatorBank
-from edge_agent.estimators.constants import NODES, STATES, constant_row
-from edge_agent.estimators.nodes import node_table
+from edge_agent.estimators import adaptive_federated_ckf, compensated_wckf, federated_ckf, paper_aco_fckf, sr_ukf
+from edge_agent.estimators.friction_mixture.advance import Design
+from edge_agent.estimators.friction_mixture.bank import EstimatorBank
+from edge_agent.estimators.friction_mixture.constants import NODES, STATES, constant_row
+from edge_agent.estimators.friction_mixture.nodes import node_table
+from edge_agent.estimators.gaussian.bank import Bank
 from edge_agent.filters.sigma import cubature
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
@@ -29,8 +32,21 @@ ESTIMATORS = {
     "aco-fckf": "default: friction mixture of cubature filters, fuzzy noise adaptation tuned by the ant colony",
     "fckf": "the same with untuned memberships",
     "ckf": "the same without adaptation",
+    "paper-aco-fckf": "paper 004 as printed, errata corrected: friction as a state, fuzzy R, wheel speed as an input",
+    "federated-ckf": "paper 000: two cubature sub-filters and a master, for motion and for four-wheel friction",
+    "adaptive-federated-ckf": "paper 001: the same for motion, with fuzzy R and adaptive shares; friction is set",
+    "compensated-wckf": "paper 002: electric drive wheels, then motion by compensated tyre forces; friction is set",
+    "sr-ukf": "paper 003: square-root unscented filter for four-wheel friction with wheel torque",
 }
 TUNED = Path(__file__).parents[1] / "tuning" / "tuned" / "aco-fckf.json"
+
+# the papers' estimators without fuzzy sets that could be tuned
+PLAIN: Final[dict[str, Callable[[Sequence[Vehicle]], Bank]]] = {
+    "federated-ckf": federated_ckf.bank,
+    "adaptive-federated-ckf": adaptive_federated_ckf.bank,
+    "compensated-wckf": compensated_wckf.bank,
+    "sr-ukf": sr_ukf.bank,
+}
 
 
 def design_of(memberships: Memberships, *, adaptive: bool, constants: FloatArray | None = None) -> Design:
@@ -50,7 +66,7 @@ def design_of(memberships: Memberships, *, adaptive: bool, constants: FloatArray
     )
 
 
-def create(name: str, vehicles: Sequence[Vehicle], *, memberships: Memberships | None = None) -> EstimatorBank:
+def create(name: str, vehicles: Sequence[Vehicle], *, memberships: Memberships | None = None) -> Bank:
     """A bank of estimators `name`, one per vehicle.
 
     Args:
@@ -59,12 +75,19 @@ def create(name: str, vehicles: Sequence[Vehicle], *, memberships: Memberships |
         memberships: replaces the estimator's own; for tuning and studies.
 
     Raises:
-        InputError: the name is unknown, no vehicle is given, or the tuned memberships cannot be read.
+        InputError: the name is unknown, no vehicle is given, the tuned memberships cannot be read, or memberships are
+            given to an estimator that has none.
     """
     if name not in ESTIMATORS:
         raise InputError("estimator", f"{name!r} is unknown", f"choose one of {', '.join(ESTIMATORS)}")
     if not vehicles:
         raise InputError("vehicles", "none given", "give at least one vehicle")
+    if name in PLAIN:
+        if memberships is not None:
+            raise InputError("memberships", f"{name} has no fuzzy sets to replace", "leave them out")
+        return PLAIN[name](vehicles)
+    if name == "paper-aco-fckf":
+        return paper_aco_fckf.bank(vehicles, load_memberships(TUNED) if memberships is None else memberships)
     if memberships is None:
         memberships = load_memberships(TUNED) if name == "aco-fckf" else Memberships()
     return EstimatorBank(parameter_table(vehicles), design_of(memberships, adaptive=name != "ckf"))

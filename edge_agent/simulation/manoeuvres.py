@@ -13,6 +13,7 @@ from typing import Final
 
 WHEELBASE: Final = 2.7  # [m] every driver knows his own near enough
 SPEED_GAIN: Final = 1.5  # [1/s] how fast a driver takes back an error of speed
+G: Final = 9.81  # [m/s^2]
 LARGEST_STEER: Final = 0.5  # [rad at the road wheel]
 
 
@@ -139,6 +140,37 @@ def j_turn(now: Moment) -> tuple[float, float]:
     return 0.06 * smooth_step((now.t - 1.0) / 0.3), hold(now)
 
 
+def two_lane_changes(now: Moment) -> tuple[float, float]:
+    """A double lane change, and another from 110 m on."""
+    ahead = now.x + preview(now)
+    return steer_to(now, ahead, lane_change_path(ahead) + lane_change_path(ahead - 110.0)), hold(now)
+
+
+def accelerating_sine(now: Moment) -> tuple[float, float]:
+    """Sine steering, from six seconds on 5 m/s faster."""
+    return sine(now)[0], min(hold(now, now.speed + 5.0 * smooth_step((now.t - 6.0) / 4.0)), 2.0)
+
+
+def low_turn(now: Moment) -> tuple[float, float]:
+    """60 degrees of the steering wheel within .3 s, held; road wheel one sixteenth of it."""
+    return math.radians(60.0) / 16.0 * smooth_step(now.t / 0.3), hold(now)
+
+
+def firm_acceleration(now: Moment) -> tuple[float, float]:
+    """0.6 g after one second, kept straight."""
+    return steer_to(now, now.x + preview(now), 0.0), 0.6 * G if now.t >= 1.0 else hold(now)
+
+
+def brisk_acceleration(now: Moment) -> tuple[float, float]:
+    """0.45 g after one second, kept straight."""
+    return steer_to(now, now.x + preview(now), 0.0), 0.45 * G if now.t >= 1.0 else hold(now)
+
+
+def moderate_braking(now: Moment) -> tuple[float, float]:
+    """0.28 g after one second, down to walking pace."""
+    return steer_to(now, now.x + preview(now), 0.0), -0.28 * G if now.t >= 1.0 and now.vx > 2.0 else min(hold(now), 1.0)
+
+
 def pulses(now: Moment) -> tuple[float, float]:
     """Two seconds of throttle, two of brakes, in a gentle weave: town traffic in short."""
     wanted = 2.5 if now.t % 4.0 < 2.0 else -2.5
@@ -162,5 +194,11 @@ MANOEUVRES: Final = {
     "constant-radius": Manoeuvre(constant_radius, kmh(40), 30.0, 0.35, "circle of 40 m radius, ISO 4138 in kind"),
     "straight": Manoeuvre(straight, kmh(60), 20.0, 0.85, "straight on at constant speed: unexcited"),
     "j-turn": Manoeuvre(j_turn, kmh(70), 8.0, 0.85, "step of the steering, ISO 7401 in kind"),
+    "two-lane-changes": Manoeuvre(two_lane_changes, kmh(30), 25.0, jump(0.5, 0.3, 110.0), "wet, then snow: paper 000"),
+    "accelerating-sine": Manoeuvre(accelerating_sine, 20.0, 13.0, 0.70, "sine, then faster: paper 002"),
+    "low-turn": Manoeuvre(low_turn, kmh(40), 8.0, 0.35, "a turn on snow: paper 003"),
+    "firm-acceleration": Manoeuvre(firm_acceleration, kmh(20), 5.0, 0.85, "0.6 g: paper 003"),
+    "brisk-acceleration": Manoeuvre(brisk_acceleration, kmh(20), 6.0, jump(0.85, 0.50, 30.0), "0.45 g onto wet"),
+    "moderate-braking": Manoeuvre(moderate_braking, kmh(80), 6.0, jump(0.85, 0.30, 60.0), "0.28 g from dry onto snow"),
     "pulses": Manoeuvre(pulses, kmh(50), 30.0, 0.60, "throttle and brakes in turn while weaving"),
 }

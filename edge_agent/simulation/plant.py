@@ -11,7 +11,8 @@ stiffness grows less than the load, its loads follow the accelerations with a la
     θ = K s / (μ F_z),  F = μ F_z f(|θ|) θ/|θ|   s         slip (longitudinal, lateral), K its stiffness
     K = κ F_z (1 − ε (F_z/F_0 − 1))              F_0       static load, ε how degressive the tyre is
 
-K does not know μ: friction acts by similarity (Pacejka, Tyre and Vehicle Dynamics, 3rd ed., §4.2), and |F| ≤ μ F_z.
+K does not know μ, unless the tyre softens: friction acts by similarity (Pacejka, Tyre and Vehicle Dynamics, 3rd ed.,
+§4.2), and |F| ≤ μ F_z.
 
 Explicit Euler for the body and linearly implicit Euler for the wheels, whose slip is stiff: with the secant slope of
 the tyre in the denominator a wheel step is stable at any speed. The tyre's force is taken at the step's end, where the
@@ -29,12 +30,13 @@ from edge_agent.dynamics.body import accelerations
 from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import P
 from edge_agent.dynamics.slip import SLOWEST_M_S, slips, wheel_position, wheel_velocity
-from edge_agent.dynamics.tyres import TINY, magic_formula
+from edge_agent.dynamics.tyres import TINY, brush, magic_formula
 from schemas.numeric import FloatArray, compiled
 
 LONGEST_SUBSTEP: Final = 1e-3  # [s]; lateral dynamics at 1 m/s have poles near 150/s
 SOFTEST: Final = 0.3  # stiffness never degrades below this share of proportional, however overloaded the wheel
 REAR_LIMIT: Final = 0.5  # slip control lets go of the rear wheels at this share of the limit, so that they still guide
+FIRM: Final = 1.0  # friction at which a softening tyre has its full stiffness
 STANDING: Final = 1.0  # [rad/s] below it a brake fades, so that it holds a wheel and does not turn it backwards
 
 
@@ -69,6 +71,8 @@ class Q(IntEnum):
     SLIP_LIMIT = len(P) + 8  # slip at which anti-lock and traction control begin to let go; inf: none
     BRAKE_FRONT = len(P) + 9  # share of the braking torque at the front axle
     POWER = len(P) + 10  # [W]
+    BRUSH = len(P) + 11  # 1: the tyre's curve is that of the brush model, not the Magic Formula
+    SOFTENING = len(P) + 12  # stiffness falls with friction, as (mu/FIRM)^softening; 0: it does not know friction
 
 
 PARAMETERS: Final = len(P) + len(Q)
@@ -116,7 +120,7 @@ def slip_limit(p: FloatArray, i: int) -> float:
 
 @compiled
 def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> None:
-    """Fill `w` (8, 4) for the state `x` (12,), parameters `p` (23,) and inputs `u` (4, 4)."""
+    """Fill `w` (8, 4) for the state `x` (12,), parameters `p` (25,) and inputs `u` (4, 4)."""
     loads = wheel_loads(p, x[X.AX_LAGGED], x[X.AY_LAGGED])
     at_rest = wheel_loads(p, 0.0, 0.0)
     for i in range(4):
@@ -125,9 +129,13 @@ def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> 
         slip_x, slip_y = slips(p[P.RADIUS], omega, along, across)
         slope_x = stiffness_per_load(p[P.SLOPE_X], p[Q.DEGRESSION], load, at_rest[i])
         slope_y = stiffness_per_load(p[P.SLOPE_Y], p[Q.DEGRESSION], load, at_rest[i])
+        if p[Q.SOFTENING] > 0.0:
+            soft = (u[U.MU, i] / FIRM) ** p[Q.SOFTENING]
+            slope_x, slope_y = soft * slope_x, soft * slope_y
         theta_x, theta_y = slope_x * slip_x / u[U.MU, i], slope_y * slip_y / u[U.MU, i]
         theta = math.hypot(theta_x, theta_y)
-        secant = magic_formula(theta, p[Q.SHAPE], p[Q.CURVATURE]) / theta if theta > TINY else 1.0
+        curve = brush(theta) if p[Q.BRUSH] > 0.0 else magic_formula(theta, p[Q.SHAPE], p[Q.CURVATURE])
+        secant = curve / theta if theta > TINY else 1.0
         pull = secant * u[U.MU, i] * load
         drive, brake = u[U.DRIVE, i], u[U.BRAKE, i]
         if slip_x > 0.0:

@@ -33,13 +33,18 @@ class TrueVehicle:
     slip_limit: float = 0.08
     brake_front: float = 0.70
     power: float = 90e3
+    brush: bool = False  # the brush model's curve in place of the Magic Formula's
+    softening: float = 0.0  # power of friction by which the stiffness falls; real tyres 0 to .3
 
     def row(self) -> FloatArray:
         """The parameters for `plant`, shape (PARAMETERS,), in the order of P and Q."""
         drive = self.vehicle.drive_split_front
         nominal = parameter_row(self.vehicle.model_copy(update={"drive_split_front": 1.0 if drive is None else drive}))
         own = (self.shape, self.curvature, self.degression, self.lag, self.roll_leak, self.pitch_leak)
-        return np.array([*nominal, *own, self.drag, self.rolling, self.slip_limit, self.brake_front, self.power])
+        return np.array([
+            *nominal, *own, self.drag, self.rolling, self.slip_limit, self.brake_front, self.power,
+            float(self.brush), self.softening,
+        ])  # fmt: skip
 
 
 def car(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edge_agent.estimators.constants import CONSTANTS, NODES, C
-from edge_agent.estimators.nodes import change_road, evidence, node_table, quantile, reweigh
+from edge_agent.estimators.friction_mixture.constants import CONSTANTS, NODES, C
+from edge_agent.estimators.friction_mixture.nodes import change_road, evidence, node_table, quantile, reweigh
 from schemas.mugrid import CENTRES
 
 MU, PRIOR = node_table(NODES)

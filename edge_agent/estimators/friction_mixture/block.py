@@ -24,8 +24,8 @@ from edge_agent.dynamics.parameters import P
 from edge_agent.dynamics.slip import wheel_position
 from edge_agent.dynamics.wheel import force_from_torque
 from edge_agent.estimators import flags
-from edge_agent.estimators.constants import C
-from edge_agent.estimators.memory import H
+from edge_agent.estimators.friction_mixture.constants import C
+from edge_agent.estimators.friction_mixture.memory import H
 from schemas.numeric import FloatArray, IntArray, compiled
 from schemas.signals import S
 

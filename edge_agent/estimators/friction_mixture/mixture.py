@@ -16,10 +16,10 @@ import math
 
 import numpy as np
 
-from edge_agent.estimators.block import F
-from edge_agent.estimators.constants import C, X
-from edge_agent.estimators.nodes import SMALLEST
-from edge_agent.estimators.residuals import ROWS, gained, residuals, slips_at_force
+from edge_agent.estimators.friction_mixture.block import F
+from edge_agent.estimators.friction_mixture.constants import C, X
+from edge_agent.estimators.friction_mixture.nodes import SMALLEST
+from edge_agent.estimators.friction_mixture.residuals import ROWS, gained, residuals, slips_at_force
 from edge_agent.filters.squareroot import deviations, sigma_points, triangularize, update
 from schemas.numeric import FloatArray, compiled
 

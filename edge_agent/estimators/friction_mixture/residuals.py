@@ -20,8 +20,8 @@ import math
 from edge_agent.dynamics.parameters import P
 from edge_agent.dynamics.slip import wheel_position
 from edge_agent.dynamics.tyres import TINY, magic_formula, magic_formula_inverse
-from edge_agent.estimators.block import F
-from edge_agent.estimators.constants import C, X
+from edge_agent.estimators.friction_mixture.block import F
+from edge_agent.estimators.friction_mixture.constants import C, X
 from schemas.numeric import FloatArray, compiled
 
 ROWS = 6

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edge_agent.estimators.constants import NODES, STATES
+from edge_agent.estimators.friction_mixture.constants import NODES, STATES
 from schemas.numeric import BoolArray, FloatArray, IntArray
 
 INPUTS = 15  # ax, ay, yaw rate, steering, wheel speed, torque: the channels before the position

@@ -13,13 +13,13 @@ from typing import NamedTuple
 from edge_agent.adaptation.fuzzy import adapted
 from edge_agent.dynamics.parameters import P
 from edge_agent.estimators import flags
-from edge_agent.estimators.block import F, block_features
-from edge_agent.estimators.constants import C, X
-from edge_agent.estimators.memory import INPUTS, RING, H, Memory
-from edge_agent.estimators.mixture import moments, predict_node, recall_lost, reinject, update_node
-from edge_agent.estimators.nodes import change_road, quantile, reweigh
-from edge_agent.estimators.residuals import gained
-from edge_agent.estimators.sample import restart_motion, start, take_sample
+from edge_agent.estimators.friction_mixture.block import F, block_features
+from edge_agent.estimators.friction_mixture.constants import C, X
+from edge_agent.estimators.friction_mixture.memory import INPUTS, RING, H, Memory
+from edge_agent.estimators.friction_mixture.mixture import moments, predict_node, recall_lost, reinject, update_node
+from edge_agent.estimators.friction_mixture.nodes import change_road, quantile, reweigh
+from edge_agent.estimators.friction_mixture.residuals import gained
+from edge_agent.estimators.friction_mixture.sample import restart_motion, start, take_sample
 from schemas.numeric import FloatArray, compiled
 from schemas.signals import S
 

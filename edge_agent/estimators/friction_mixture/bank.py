@@ -13,14 +13,14 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_agent.estimators.advance import Design, Scratch, step, velocity
-from edge_agent.estimators.block import F
-from edge_agent.estimators.constants import NODES, STATES, X
-from edge_agent.estimators.memory import H, Memory, new_memory
-from edge_agent.estimators.nodes import evidence as evidence_of
-from edge_agent.estimators.nodes import quantile
-from edge_agent.estimators.residuals import ROWS
-from edge_agent.estimators.sample import UNKNOWN_VX_STD
+from edge_agent.estimators.friction_mixture.advance import Design, Scratch, step, velocity
+from edge_agent.estimators.friction_mixture.block import F
+from edge_agent.estimators.friction_mixture.constants import NODES, STATES, X
+from edge_agent.estimators.friction_mixture.memory import H, Memory, new_memory
+from edge_agent.estimators.friction_mixture.nodes import evidence as evidence_of
+from edge_agent.estimators.friction_mixture.nodes import quantile
+from edge_agent.estimators.friction_mixture.residuals import ROWS
+from edge_agent.estimators.friction_mixture.sample import UNKNOWN_VX_STD
 from schemas.errors import InputError
 from schemas.mugrid import BINS, CENTRES
 from schemas.numeric import BoolArray, FloatArray, compiled

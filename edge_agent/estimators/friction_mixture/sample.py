@@ -11,9 +11,9 @@ import math
 from edge_agent.dynamics.body import advance_velocity
 from edge_agent.dynamics.parameters import P
 from edge_agent.estimators import flags
-from edge_agent.estimators.constants import C, X
-from edge_agent.estimators.memory import INPUTS, G, H, Memory
-from edge_agent.estimators.nodes import quantile
+from edge_agent.estimators.friction_mixture.constants import C, X
+from edge_agent.estimators.friction_mixture.memory import INPUTS, G, H, Memory
+from edge_agent.estimators.friction_mixture.nodes import quantile
 from schemas.numeric import FloatArray, compiled
 from schemas.signals import S
 

@@ -1,0 +1,73 @@
+"""Fuzzy inference with two inputs: a table of rules over the mismatch of the innovations and its rate (paper 001).
+
+Legend
+    alpha       mismatch of the innovation variance, actual over theoretical, minus 1 [1]; the paper's (18) is a
+                difference of traces, which adds squares of unlike units
+    rate        its rate [1/s]
+    level       what a rule asks for: ln of the factor on R [nat]                         (5, 7)
+
+Sets are triangles that meet at each other's peaks, so memberships sum to one and the inference is bilinear.
+
+Table 1 of paper 001, rows NB NM Z PM PB of the rate, columns NB NM NS Z PS PM PB of alpha. Where alpha is negative the
+printed table grows R, although the text asks for less: there the level counts as its reciprocal. PMB and PSM, which the
+declared sets do not have, are taken as the steps beside PM.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from schemas.errors import InputError
+from schemas.numeric import FloatArray, compiled
+
+LEVELS: Final = {"PVS": 0.5, "PS": 0.7, "PSM": 1.0, "PM": 1.5, "PMB": 2.5, "PB": 4.0, "PVB": 8.0}
+PRINTED: Final = (
+    "PVB PB PMB PSM PVS PS PMB",
+    "PB PMB PM PM PS PSM PB",
+    "PMB PM PSM PSM PSM PM PMB",
+    "PB PSM PS PM PM PMB PB",
+    "PMB PS PSM PMB PMB PB PVB",
+)
+ALPHA: Final = np.array([-0.8, -0.5, -0.2, 0.0, 0.5, 1.5, 4.0])
+RATE: Final = np.array([-8.0, -2.0, 0.0, 2.0, 8.0])  # [1/s]
+
+
+def rule_table(printed: tuple[str, ...] = PRINTED) -> FloatArray:
+    """Levels (5, 7) [nat] of a table of set names.
+
+    Raises:
+        InputError: a name is unknown, the shape is wrong, or no mismatch does not mean no change.
+    """
+    try:
+        levels = np.array([[math.log(LEVELS[name]) for name in row.split()] for row in printed])
+    except KeyError as error:
+        raise InputError("rules", f"there is no set {error}", f"use {', '.join(LEVELS)}") from error
+    if levels.shape != (len(RATE), len(ALPHA)):
+        raise InputError("rules", f"a table of {levels.shape}", f"give {(len(RATE), len(ALPHA))}")
+    levels[:, ALPHA < 0.0] *= -1.0
+    if levels[RATE == 0.0][:, ALPHA == 0.0].any():
+        raise InputError("rules", "R changes where nothing is wrong", "let the middle be PSM")
+    return levels
+
+
+@compiled
+def infer_two(alpha: float, rate: float, at: FloatArray, of: FloatArray, levels: FloatArray) -> float:
+    """ln of the factor on R: bilinear in alpha (peaks `at` (7,)) and rate (peaks `of` (5,)), level beyond the ends."""
+    i, u = bracket(alpha, at)
+    j, v = bracket(rate, of)
+    lower = (1.0 - u) * levels[j, i] + u * levels[j, i + 1]
+    upper = (1.0 - u) * levels[j + 1, i] + u * levels[j + 1, i + 1]
+    return float((1.0 - v) * lower + v * upper)
+
+
+@compiled
+def bracket(value: float, peaks: FloatArray) -> tuple[int, float]:
+    """(k, share) with value = (1 - share)*peaks[k] + share*peaks[k + 1], held at the ends."""
+    last = peaks.shape[0] - 2
+    k = 0
+    while k < last and value >= peaks[k + 1]:
+        k += 1
+    return k, min(max((value - peaks[k]) / (peaks[k + 1] - peaks[k]), 0.0), 1.0)

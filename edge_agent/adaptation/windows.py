@@ -1,0 +1,33 @@
+"""Measurement noise from a moving window of innovations, larger ones weighing more (paper 002, equations 24 and 25).
+
+Legend: e_j innovations of the last N samples of one row; c_j = |e_j| their weights, normalised (the paper's are not);
+P variance of the predicted measurement; R = sum(c_j*e_j^2)/sum(c_j)/2 - P.
+The half is the departure that makes it right: of a normal variable E|e|^3 / E|e| = 2 var(e).
+"""
+
+from __future__ import annotations
+
+from schemas.numeric import FloatArray, compiled
+
+
+@compiled
+def push(window: FloatArray, innovation: float) -> None:
+    """Put the newest innovation first in window (N,), and let the oldest go."""
+    for j in range(window.shape[0] - 1, 0, -1):
+        window[j] = window[j - 1]
+    window[0] = innovation
+
+
+@compiled
+def weighted_noise(window: FloatArray, predicted: float, nominal: float, least: float, largest: float) -> float:
+    """R of a row from its window (N,), NaN where not yet filled: then nominal; within [least, largest]*nominal."""
+    weight = total = 0.0
+    for error in window:
+        size = abs(error)
+        if not size >= 0.0:
+            return nominal
+        weight += size
+        total += size * error * error
+    if weight <= 0.0:
+        return least * nominal
+    return min(max(0.5 * total / weight - predicted, least * nominal), largest * nominal)

@@ -1,0 +1,52 @@
+"""The electric drive wheel: motor, wheel and tyre force, and the force's derivative by a sliding mode (paper 002).
+
+Legend
+    tau         motor torque at the wheel, K_t*i [N m]              J   inertia of wheel and rotor [kg m^2]
+    tau_u       torque that the voltage would settle at [N m]       T_e electric time constant L/R [s]
+    omega       wheel speed [rad/s]                                 R   wheel radius [m]
+    F, F'       longitudinal force and its derivative [N, N/s]      k1, k2  sliding mode [N/s^2, 1/s]
+
+tau' = (tau_u - tau)/T_e (10), J*omega' = tau - R*F (11), F'' = -k1*sgn(F') - k2*F' (31).
+Torque stands for current: the paper's K_a, K_t and J are not of one machine, and there are no signals of current or
+voltage. (31) prints the derivative of F where that of F' belongs, and takes the sign of a difference of unlike units.
+"""
+
+from __future__ import annotations
+
+import math
+
+from schemas.numeric import FloatArray, compiled
+
+ELECTRIC_S = 0.125 / 0.688  # T_e, paper 002, table 1
+SLIDING_GAIN, SLIDING_RATE = 2000.0, 10.0  # k1, k2; not given
+SOFT_N_S = 500.0  # the sign is smoothed over so much
+
+
+@compiled
+def drive_wheel(
+    torque: float, omega: float, force: float, slope: float, settled: float, inertia: float, radius: float, step: float
+) -> tuple[float, float, float, float]:
+    """(tau, omega, F, F') after `step` [s] by Euler's rule, as printed (32)."""
+    pull = SLIDING_GAIN * math.tanh(slope / SOFT_N_S) + SLIDING_RATE * slope
+    return (
+        torque + step * (settled - torque) / ELECTRIC_S,
+        omega + step * (torque - radius * force) / inertia,
+        force + step * slope,
+        slope - step * pull,
+    )
+
+
+@compiled
+def slip_share(radius: float, omega: float, along: float) -> float:
+    """Weight of the tyre model's force, 1/2 + 2^(-1/|s|) (33), s of (15): one half at all ordinary slips."""
+    turning = radius * omega
+    most = max(abs(turning), abs(along), 1e-3)
+    size = min(abs(turning - along) / most, 1.0)
+    return 0.5 + (2.0 ** (-1.0 / size) if size > 0.0 else 0.0)
+
+
+@compiled
+def blended(share: FloatArray, model: FloatArray, observed: FloatArray, out: FloatArray) -> None:
+    """out (4,) = share*model + (1 - share)*observed: the compensated force (33)."""
+    for wheel in range(4):
+        out[wheel] = share[wheel] * model[wheel] + (1.0 - share[wheel]) * observed[wheel]

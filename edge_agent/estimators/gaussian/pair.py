@@ -1,0 +1,202 @@
+"""Two cubature sub-filters and a master on the planar motion: what papers 000 and 001 have in common.
+
+State [v_x, v_y, a_x, a_y, r, r'] (the papers carry the moment Gamma = I_z*r'). Sub-filter 1 measures [a_x, a_y, r],
+sub-filter 2 [a_y, r] (000, below equation 53). A turn: share (15) to (17), predict (21) to (25), update (31) to (39),
+fuse (49), (50).
+
+Departures: a_y and r are measured once but used by both sub-filters, so each takes them with twice the variance, and
+the fused estimate is that of one filter; sub-filter 1 also measures the speed of the wheels, freed of the slip that
+their force needs, because nothing in the printed measurements observes v_x.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from edge_agent.dynamics.chassis import DUGOFF
+from edge_agent.dynamics.loads import wheel_loads
+from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.slip import wheel_velocity
+from edge_agent.estimators.friction_mixture.sample import rolling_speed
+from edge_agent.estimators.gaussian.bank import FIRST_V_STD, UNKNOWN_V_STD
+from edge_agent.estimators.gaussian.intake import Track, wheel_force
+from edge_agent.estimators.gaussian.planar import carry
+from edge_agent.filters.federated import fuse, share
+from edge_agent.filters.sigma import cubature
+from edge_agent.filters.squareroot import deviations, predict, update, weighted_mean
+from edge_agent.filters.svd import axis_points
+from schemas.numeric import FloatArray, compiled
+from schemas.signals import S
+
+STATES, ROWS = 6, 4
+STEP_S = 0.02  # process variances are per so much time
+# variances of the process per STEP_S: offsets of the accelerometers, drag and slopes that torque does not know, and the
+# error of the tyre model; the papers' 100, 1 and .01 for all states alike are in no unit
+PROCESS = np.sqrt(np.array([4e-6, 4e-6, 5e-2, 5e-2, 1e-6, 5e-2]))
+START = np.sqrt(np.array([FIRST_V_STD**2, FIRST_V_STD**2, 0.2, 0.2, 0.01, 0.2]))
+# variances of a_x, a_y, r with some model error; the papers set theirs by hand for each manoeuvre
+NOISE = np.array([0.01, 0.01, 1e-4])
+SPEED_STD, SPEED_SHARE, SLIP_SHARE = 0.03, 0.003, 0.3  # [m/s], radius, and how wrong the slip of a force is
+FARTHEST = 2.0  # innovations in standard deviations beyond which the wheels' speed is trusted less
+LEAST_BETA = 0.1  # of the information, that no sub-filter is starved
+
+
+class X(IntEnum):
+    """Index of a state."""
+
+    VX = 0
+    VY = 1
+    AX = 2
+    AY = 3
+    YAW_RATE = 4
+    TURN = 5  # yaw acceleration [rad/s^2]
+
+
+class Pair(NamedTuple):
+    """The master's state of N filters, their shares, and room for a turn."""
+
+    mean: FloatArray  # (N, 6)
+    root: FloatArray  # (N, 6, 6)
+    beta: FloatArray  # (N,) share of sub-filter 1
+    factor: FloatArray  # (N, 2) on R of each sub-filter
+    gamma: FloatArray  # (N, 2) squared innovation over its expectation, per sub-filter
+    innovation: FloatArray  # (N, 2, 4)
+    expected: FloatArray  # (N, 2, 4) innovation variances if R were nominal
+    told: FloatArray  # (N, 2) NIS, log-likelihood
+    size: FloatArray  # (N, 2) trace of the sub-filters' covariances over the starting variances
+    xi: FloatArray  # (12, 6)
+    weight: FloatArray  # (12,)
+    process: FloatArray  # (6,)
+    start: FloatArray  # (6,)
+    noise: FloatArray  # (3,)
+
+
+def new_pair(count: int) -> Pair:
+    """`count` pairs that have not begun."""
+    rule, halves = cubature(STATES), (count, 2)
+    return Pair(
+        np.zeros((count, STATES)), np.zeros((count, STATES, STATES)), np.full(count, 0.5), np.ones(halves),
+        np.ones(halves), np.zeros((*halves, ROWS)), np.ones((*halves, ROWS)), np.zeros(halves), np.ones(halves),
+        rule.xi, rule.w_cov, PROCESS, START, NOISE,
+    )  # fmt: skip
+
+
+@compiled
+def begin(pair: Pair, track: Track, row: FloatArray, n: int, sample: FloatArray) -> None:
+    """Begin vehicle n at the speed of its wheels."""
+    mean, root, use = pair.mean[n], pair.root[n], track.use[n]
+    speed = rolling_speed(row, sample)
+    known = not math.isnan(speed)
+    mean[:] = 0.0
+    mean[X.VX] = speed if known else 0.0
+    mean[X.AX], mean[X.AY], mean[X.YAW_RATE] = use[S.AX], use[S.AY], use[S.YAW_RATE]
+    root[:, :] = 0.0
+    for i in range(STATES):
+        root[i, i] = pair.start[i]
+    if not known:
+        root[X.VX, X.VX] = UNKNOWN_V_STD
+    pair.beta[n], pair.factor[n], pair.gamma[n], pair.told[n] = 0.5, 1.0, 1.0, 0.0
+
+
+@compiled
+def turn(pair: Pair, track: Track, row: FloatArray, n: int, gone: float, friction: FloatArray) -> None:
+    """Share, predict and update in both sub-filters, and fuse; friction (4,) is given. `gone` [s]."""
+    root, process = np.empty((STATES, STATES)), np.zeros((STATES, STATES))
+    mean, first_mean, first_root = np.empty(STATES), np.empty(STATES), np.empty((STATES, STATES))
+    points, work = np.empty((2 * STATES, STATES)), np.empty((2 * STATES, 4 * STATES))
+    pair.told[n] = 0.0
+    for sub in range(2):
+        beta = pair.beta[n] if sub == 0 else 1.0 - pair.beta[n]
+        share(pair.root[n], beta, root)
+        axis_points(pair.mean[n], root, pair.xi, points)
+        for p in range(points.shape[0]):
+            carry(row, points[p], friction, track.before[n], track.use[n], gone, True, DUGOFF)
+        for i in range(STATES):
+            process[i, i] = pair.process[i] * math.sqrt(gone / STEP_S / beta)
+        predict(points, pair.weight, pair.weight, process, mean, root, work)
+        _measure(pair, track, row, n, sub, gone, mean, root, points, work)
+        if sub == 0:
+            first_mean[:], first_root[:] = mean, root
+    fuse(first_mean, first_root, mean, root, work)
+    pair.mean[n], pair.root[n] = first_mean, first_root
+
+
+@compiled
+def _measure(
+    pair: Pair, track: Track, row: FloatArray, n: int, sub: int, gone: float, mean: FloatArray, root: FloatArray,
+    points: FloatArray, work: FloatArray,
+) -> None:  # fmt: skip
+    now = track.now[n]
+    outcomes, predicted, std = np.empty((2 * STATES, ROWS)), np.empty(ROWS), np.empty(ROWS)
+    state, measured = np.empty((STATES, 2 * STATES)), np.empty((ROWS, 2 * STATES))
+    axis_points(mean, root, pair.xi, points)
+    for p in range(points.shape[0]):
+        for r in range(3):
+            outcomes[p, r] = points[p, X.AX + r]
+        outcomes[p, 3] = rolling(row, track.use[n], points[p], X.YAW_RATE)
+    weighted_mean(outcomes, pair.weight, predicted)
+    deviations(points, mean, pair.weight, state, 0)
+    deviations(outcomes, predicted, pair.weight, measured, 0)
+    innovation = pair.innovation[n, sub]
+    twice = np.array([1.0, 2.0, 2.0])
+    for r in range(3):
+        innovation[r] = now[r] - predicted[r]
+        std[r] = math.sqrt(twice[r] * pair.factor[n, sub] * pair.noise[r])
+    speed, std[3] = freed_speed(row, track.before[n], track.use[n], gone)
+    innovation[3] = speed - predicted[3]
+    std[3] = doubted(std[3], innovation[3])
+    if sub == 1:
+        innovation[0] = innovation[3] = math.nan
+    for r in range(ROWS):
+        pair.expected[n, sub, r] = std[r] ** 2 / (pair.factor[n, sub] if r < 3 else 1.0)
+        for p in range(points.shape[0]):
+            pair.expected[n, sub, r] += measured[r, p] ** 2
+    used, log_likelihood, square = update(mean, root, state, measured, innovation, std, work)
+    pair.gamma[n, sub] = square / max(used, 1)
+    pair.told[n, 0] += 0.5 * pair.gamma[n, sub]
+    pair.told[n, 1] += log_likelihood
+    pair.size[n, sub] = 0.0
+    for i in range(STATES):
+        for j in range(i + 1):
+            pair.size[n, sub] += (root[i, j] / pair.start[i]) ** 2
+
+
+@compiled
+def rolling(row: FloatArray, use: FloatArray, x: FloatArray, rate: int) -> float:
+    """Mean speed along the wheels whose speed is measured, in state x whose yaw rate is state `rate`."""
+    total, count = 0.0, 0
+    for wheel in range(4):
+        if not math.isnan(use[S.OMEGA + wheel]):
+            total += wheel_velocity(row, wheel, x[X.VX], x[X.VY], x[rate], use[S.DELTA + wheel])[0]
+            count += 1
+    return total / max(count, 1)
+
+
+@compiled
+def doubted(std: float, innovation: float) -> float:
+    """Standard deviation [m/s] of the wheels' speed: spinning or locked wheels count as two of them, at most."""
+    return std if math.isnan(innovation) else max(std, abs(innovation) / FARTHEST)
+
+
+@compiled
+def freed_speed(row: FloatArray, before: FloatArray, use: FloatArray, gone: float) -> tuple[float, float]:
+    """(mean of R*omega/(1 + slip), its standard deviation) [m/s], the slip being F_x/K; NaN without any wheel."""
+    loads = wheel_loads(row, use[S.AX], use[S.AY])
+    total, most, count = 0.0, 0.0, 0
+    for wheel in range(4):
+        omega = use[S.OMEGA + wheel]
+        if math.isnan(omega):
+            continue
+        slip = wheel_force(row, before, use, wheel, gone) / (row[P.SLOPE_X] * loads[wheel])
+        slip = min(max(slip, -0.5), 0.5)
+        total += row[P.RADIUS] * omega / (1.0 + slip)
+        most = max(most, abs(slip))
+        count += 1
+    if count == 0:
+        return math.nan, 1.0
+    speed = total / count
+    return speed, SPEED_STD + abs(speed) * (SPEED_SHARE + SLIP_SHARE * most)

@@ -1,0 +1,79 @@
+"""The friction of four wheels as states of a Gaussian filter: how it is forgotten, and what its mean is.
+
+Legend: mu_i friction of a wheel, its prior mean m_0 and standard deviation s_0 (moments of the uniform prior), lambda
+metres after which it is forgotten, rho correlation of the wheels' roads. Over d metres
+mu' = m_0 + k*(mu - m_0), P' = k^2*P + (1 - k^2)*P_0, k = exp(-d/lambda): without evidence it is the prior again.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from edge_agent.estimators.gaussian.bank import PRIOR_MU, PRIOR_MU_STD
+from edge_agent.filters.squareroot import triangularize
+from schemas.numeric import FloatArray, compiled
+
+FORGET_M = 190.0  # one road change per so many metres (errata)
+LOOK_S = 0.2  # one independent look at the tyre per so much time (errata)
+DEMAND_HALF = 0.15  # [g] of force at which half of what a sample could say of friction is believed (errata)
+SIDE_CORRELATION = 0.9  # roads are mostly the same under both sides; the wheels of one side see one road
+
+
+def prior_root() -> FloatArray:
+    """Factor (4, 4) of P_0: wheels of a side alike but for a trace, sides correlated; wheel order fl, fr, rl, rr."""
+    same, other = 0.99, SIDE_CORRELATION
+    correlation = np.array([
+        [1.0, other, same, other], [other, 1.0, other, same], [same, other, 1.0, other], [other, same, other, 1.0],
+    ])  # fmt: skip
+    return np.asarray(PRIOR_MU_STD * np.linalg.cholesky(correlation))
+
+
+PRIOR_ROOT = prior_root()
+
+
+@compiled
+def return_to_prior(mean: FloatArray, root: FloatArray, metres: float, work: FloatArray) -> None:
+    """Forget the friction of four wheels over `metres`, in place; mean (4,), root (4, 4), work (4, 8) or larger."""
+    keep = math.exp(-metres / FORGET_M)
+    fresh = math.sqrt(max(1.0 - keep * keep, 0.0))
+    for i in range(4):
+        mean[i] = PRIOR_MU + keep * (mean[i] - PRIOR_MU)
+        for j in range(4):
+            work[i, j] = keep * root[i, j]
+            work[i, 4 + j] = fresh * PRIOR_ROOT[i, j]
+    triangularize(work, 4, 8)
+    for i in range(4):
+        for j in range(4):
+            root[i, j] = work[i, j] if j <= i else 0.0
+
+
+@compiled
+def dependence(demand: float, gone: float) -> float:
+    """Factor on the standard deviation of a sample `gone` [s] after the last, at `demand` [g] of force.
+
+    Model error lasts: many samples are one look. And without demand slip's noise, not friction, explains what is left.
+    """
+    return math.sqrt(max(LOOK_S / gone, 1.0) * (1.0 + (DEMAND_HALF / max(demand, 1e-2)) ** 4))
+
+
+@compiled
+def told_share(demand: float) -> float:
+    """Share of friction's spread that a measurement at `demand` [g] of force may see: none below, all far above."""
+    used = (demand / DEMAND_HALF) ** 4
+    return used / (1.0 + used)
+
+
+@compiled
+def mean_friction(mean: FloatArray, root: FloatArray, first: int) -> tuple[float, float]:
+    """(mean of the four frictions from state `first` on, its standard deviation)."""
+    total, square = 0.0, 0.0
+    for j in range(first + 4):
+        column = 0.0
+        for i in range(first, first + 4):
+            column += 0.25 * root[i, j]
+        square += column * column
+    for i in range(first, first + 4):
+        total += 0.25 * mean[i]
+    return total, math.sqrt(square)

@@ -1,0 +1,239 @@
+"""`sr-ukf`: the square-root unscented filter for the friction of four wheels of paper 003.
+
+"Estimation of the road adhesion coefficient by a square-root unscented Kalman filter" for distributed drive vehicles
+(paper 003; the equations are lost in the text copy, so its sections are cited). Seven degrees of freedom with Dugoff
+tyres (section 2), unscented points, time and measurement update (3.1), posterior factor by downdates (3.2).
+
+State [v_x, v_y, r, mu_fl, mu_fr, mu_rl, mu_rr]. The four wheels' degrees of freedom are their torque balances, taken as
+measurements: F_x = (T - J*omega')/R. With them each driven wheel is observable; with the paper's a_x, a_y, r alone two
+of four frictions are, at most (errata).
+
+Departures: v_x, v_y, r are estimated, where the paper takes them from the simulator; a_x and a_y are inputs of the
+kinematics, and the wheel torques stand for a_x in the measurement, with a_y, r and the speed of the wheels freed of
+slip; alpha = 1, where .001 gives the centre a weight of -10^6; a downdate that would lose a positive covariance
+refuses, and an orthogonal update takes its place, where the paper clips singular values; friction returns to the prior
+over the metres driven, and counts only as far as it is used, so that the bounds of a wheel that tells nothing are the
+prior's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from edge_agent.dynamics.body import advance_velocity
+from edge_agent.dynamics.chassis import DUGOFF, response
+from edge_agent.dynamics.loads import wheel_loads
+from edge_agent.dynamics.parameters import GRAVITY, P, parameter_table
+from edge_agent.estimators import flags
+from edge_agent.estimators.friction_mixture.bank import FlagArray
+from edge_agent.estimators.friction_mixture.sample import rolling_speed
+from edge_agent.estimators.gaussian.bank import (
+    FIRST_V_STD,
+    PRIOR_MU,
+    PRIOR_MU_STD,
+    UNKNOWN_V_STD,
+    GaussianBank,
+    hold_mu,
+    interval,
+    lost,
+    sliding,
+    tell_motion,
+    tell_nothing,
+    variance,
+)
+from edge_agent.estimators.gaussian.intake import BEGUN, STEPPED, Track, grip_used, take, wheel_force
+from edge_agent.estimators.gaussian.pair import doubted, freed_speed, rolling
+from edge_agent.estimators.gaussian.road import FORGET_M, LOOK_S, PRIOR_ROOT, mean_friction, told_share
+from edge_agent.filters.downdate import update_by_downdate
+from edge_agent.filters.sigma import unscented
+from edge_agent.filters.squareroot import deviations, predict, sigma_points, weighted_mean
+from schemas.mugrid import LOWER, UPPER
+from schemas.numeric import FloatArray, compiled
+from schemas.signals import S
+from schemas.vehicle import Vehicle
+
+STATES, ROWS = 7, 7  # rows: speed of the wheels, r, a_y, four longitudinal forces
+MU = 3  # first friction
+DRIFT = np.array([0.05, 0.05, 0.1])  # [m/s, m/s, rad/s per s^.5] offsets of the accelerometers; yaw model error
+RATE_STD = 0.003  # [rad/s]
+AY_STD, AY_SHARE = 0.15, 0.05  # [m/s^2], and of a_y, that the tyre model may miss, per look
+FORCE_STD, FORCE_SHARE = 0.01, 0.15  # of the load: rolling resistance; of the force: torque gain and stiffness
+SLIP_STD, OMEGA_STD = 0.001, 0.03  # [1] radius differences, [rad/s] noise: through the slip stiffness
+
+
+class X(IntEnum):
+    """Index of a state before the frictions."""
+
+    VX = 0
+    VY = 1
+    YAW_RATE = 2
+
+
+class Memory(NamedTuple):
+    """State of N filters."""
+
+    mean: FloatArray  # (N, 7)
+    root: FloatArray  # (N, 7, 7)
+    told: FloatArray  # (N, 3) NIS per row, log-likelihood, downdates refused
+    xi: FloatArray  # (15, 7)
+    w_mean: FloatArray  # (15,)
+    w_cov: FloatArray  # (15,)
+
+
+def bank(vehicles: Sequence[Vehicle]) -> GaussianBank[Memory]:
+    """N of these filters."""
+    n, rule = len(vehicles), unscented(STATES, 1.0, 2.0, 0.0)
+    memory = Memory(
+        np.zeros((n, STATES)), np.zeros((n, STATES, STATES)), np.zeros((n, 3)), rule.xi, rule.w_mean, rule.w_cov
+    )
+    return GaussianBank(parameter_table(vehicles), memory, _advance, wheels=True)
+
+
+@compiled
+def _advance(
+    memory: Memory,
+    track: Track,
+    rows: FloatArray,
+    t: FloatArray,
+    signals: FloatArray,
+    out: FloatArray,
+    wheels: FloatArray,
+    health: FlagArray,
+) -> None:
+    for n in range(t.shape[1]):
+        for k in range(t.shape[0]):
+            memory.told[n, 1] = 0.0
+            told, kind, gone = take(track, rows[n], n, t[k, n], signals[k, n])
+            if kind == STEPPED:
+                _step(memory, track, rows[n], n, gone)
+                if lost(memory.mean[n], memory.root[n], X.VX, X.VY, X.YAW_RATE):
+                    told, kind = told | flags.RESET, BEGUN
+            if kind == BEGUN:
+                _begin(memory, track, rows[n], n, signals[k, n])
+            if track.started[n]:
+                _report(memory, track, n, out[:, k, n], wheels[k, n])
+                x = memory.mean[n]
+                health[k, n] = told | sliding(rows[n], track.use[n], x[X.VX], x[X.VY], out[8, k, n])
+            else:
+                health[k, n] = told
+                tell_nothing(out[:, k, n])
+                for wheel in range(4):
+                    wheels[k, n, wheel] = out[8:11, k, n]
+
+
+@compiled
+def _begin(memory: Memory, track: Track, row: FloatArray, n: int, sample: FloatArray) -> None:
+    mean, root = memory.mean[n], memory.root[n]
+    speed = rolling_speed(row, sample)
+    known = not math.isnan(speed)
+    mean[X.VX], mean[X.VY], mean[X.YAW_RATE] = speed if known else 0.0, 0.0, track.use[n, S.YAW_RATE]
+    mean[MU:] = PRIOR_MU
+    root[:, :] = 0.0
+    root[X.VX, X.VX], root[X.VY, X.VY] = FIRST_V_STD if known else UNKNOWN_V_STD, FIRST_V_STD
+    root[X.YAW_RATE, X.YAW_RATE] = 0.1
+    root[MU:, MU:] = PRIOR_ROOT
+    memory.told[n] = 0.0
+
+
+@compiled
+def _model(
+    row: FloatArray, x: FloatArray, use: FloatArray, mean: FloatArray, share: float, known: FloatArray,
+    force_x: FloatArray,
+) -> tuple[float, float]:  # fmt: skip
+    """(a_y, yaw acceleration) and force_x (4,) of the tyres at x (7,); friction deviates by `share` of its own."""
+    mu, force_y = np.empty(4), np.empty(4)
+    for wheel in range(4):
+        told = mean[MU + wheel] + share * (x[MU + wheel] - mean[MU + wheel])
+        mu[wheel] = min(max(told, LOWER), UPPER)
+    at = np.array([x[X.VX], x[X.VY], x[X.YAW_RATE], use[S.AX], use[S.AY]])
+    delta, omega = use[S.DELTA : S.DELTA + 4], use[S.OMEGA : S.OMEGA + 4]
+    _, ay, turn = response(row, at, delta, omega, known, mu, DUGOFF, force_x, force_y)
+    return ay, turn
+
+
+@compiled
+def _step(memory: Memory, track: Track, row: FloatArray, n: int, gone: float) -> None:
+    mean, root, use = memory.mean[n], memory.root[n], track.use[n]
+    count = memory.xi.shape[0]
+    points, work = np.empty((count, STATES)), np.empty((ROWS + STATES, count + 2 * STATES))
+    noise, unknown, force_x = np.zeros((STATES, STATES)), np.full(4, math.nan), np.empty(4)
+    middle, share = mean.copy(), told_share(math.hypot(use[S.AX], use[S.AY]) / GRAVITY)
+    keep = math.exp(-abs(mean[X.VX]) * gone / FORGET_M)
+    sigma_points(mean, root, memory.xi, points)
+    for p in range(count):
+        x = points[p]
+        _, turn = _model(row, x, use, middle, share, unknown, force_x)
+        x[X.VX], x[X.VY] = advance_velocity(x[X.VX], x[X.VY], use[S.AX], use[S.AY], x[X.YAW_RATE], gone)
+        x[X.YAW_RATE] += gone * turn
+        for wheel in range(MU, STATES):
+            x[wheel] = PRIOR_MU + keep * (x[wheel] - PRIOR_MU)
+    for i in range(3):
+        noise[i, i] = DRIFT[i] * math.sqrt(gone)
+    noise[MU:, MU:] = math.sqrt(max(1.0 - keep * keep, 0.0)) * PRIOR_ROOT
+    predict(points, memory.w_mean, memory.w_cov, noise, mean, root, work)
+    sigma_points(mean, root, memory.xi, points)
+    _measure(memory, track, row, n, gone, share, points, work)
+    for wheel in range(4):
+        hold_mu(mean, root, MU + wheel, PRIOR_MU_STD)
+
+
+@compiled
+def _measure(
+    memory: Memory,
+    track: Track,
+    row: FloatArray,
+    n: int,
+    gone: float,
+    share: float,
+    points: FloatArray,
+    work: FloatArray,
+) -> None:
+    mean, root, now, use = memory.mean[n], memory.root[n], track.now[n], track.use[n]
+    count = points.shape[0]
+    outcomes, predicted, unknown = np.empty((count, ROWS)), np.empty(ROWS), np.full(4, math.nan)
+    state, measured = np.empty((STATES, count)), np.empty((ROWS, count))
+    innovation, std = np.empty(ROWS), np.empty(ROWS)
+    middle = mean.copy()
+    for p in range(count):
+        outcomes[p, 0], outcomes[p, 1] = rolling(row, use, points[p], X.YAW_RATE), points[p, X.YAW_RATE]
+        outcomes[p, 2], _ = _model(row, points[p], use, middle, share, unknown, outcomes[p, 3:])
+    weighted_mean(outcomes, memory.w_mean, predicted)
+    deviations(points, mean, memory.w_cov, state, 0)
+    deviations(outcomes, predicted, memory.w_cov, measured, 0)
+    looks = math.sqrt(max(LOOK_S / gone, 1.0))
+    speed, std[0] = freed_speed(row, track.before[n], use, gone)
+    innovation[0], innovation[1], innovation[2] = speed, now[S.YAW_RATE], now[S.AY]
+    std[1], std[2] = RATE_STD, looks * math.hypot(AY_STD, AY_SHARE * use[S.AY])
+    loads = wheel_loads(row, use[S.AX], use[S.AY])
+    for wheel in range(4):
+        force = wheel_force(row, track.before[n], use, wheel, gone)
+        slip_std = SLIP_STD + OMEGA_STD * row[P.RADIUS] / max(abs(mean[X.VX]), 1.0)
+        quiet = math.hypot(FORCE_STD * loads[wheel], FORCE_SHARE * force)
+        std[3 + wheel] = looks * math.hypot(quiet, row[P.SLOPE_X] * loads[wheel] * slip_std)
+        missing = math.isnan(now[S.OMEGA + wheel]) or math.isnan(now[S.TORQUE + wheel])
+        innovation[3 + wheel] = math.nan if missing else force
+    for r in range(ROWS):
+        innovation[r] -= predicted[r]
+    std[0] = doubted(std[0], innovation[0])
+    used, log_likelihood, square, refused = update_by_downdate(mean, root, state, measured, innovation, std, work)
+    memory.told[n, 0], memory.told[n, 1] = square / max(used, 1), log_likelihood
+    memory.told[n, 2] += 1.0 if refused else 0.0
+
+
+@compiled
+def _report(memory: Memory, track: Track, n: int, out: FloatArray, wheels: FloatArray) -> None:
+    mean, root = memory.mean[n], memory.root[n]
+    tell_motion(
+        out, mean[X.VX], mean[X.VY], mean[X.YAW_RATE],
+        variance(root, X.VX), variance(root, X.VY), variance(root, X.YAW_RATE),
+    )  # fmt: skip
+    for wheel in range(4):
+        interval(mean[MU + wheel], math.sqrt(variance(root, MU + wheel)), wheels[wheel])
+    mu, std = mean_friction(mean, root, MU)
+    interval(mu, std, out[8:11])
+    out[11], out[12], out[13], out[14] = grip_used(track, n), memory.told[n, 0], 1.0, memory.told[n, 1]

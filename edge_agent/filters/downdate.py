@@ -1,0 +1,102 @@
+"""Taking a rank away from a covariance factor, and refusing where the covariance does not hold so much.
+
+Legend: L sqrt_cov, lower triangular (n, n); v a column (n,); wanted L_new*L_new' = L*L' - v*v'.
+The difference is positive definite exactly when |L^-1*v| < 1 (Golub and Van Loan, Matrix Computations, section 6.5.4).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from edge_agent.filters.squareroot import LOG_TWO_PI, triangularize, update
+from schemas.numeric import FloatArray, compiled
+
+LEAST_LEFT = 1e-12  # of the variance in the direction of v; below it rounding decides the sign
+
+
+@compiled
+def downdate(sqrt_cov: FloatArray, column: FloatArray, white: FloatArray) -> bool:
+    """sqrt_cov (n, n) becomes the factor without column (n,); False, and nothing changed, where there is none.
+
+    white (n,) is scratch.
+    """
+    n = column.shape[0]
+    square = 0.0
+    for i in range(n):
+        total = column[i]
+        for j in range(i):
+            total -= sqrt_cov[i, j] * white[j]
+        white[i] = total / sqrt_cov[i, i]
+        square += white[i] * white[i]
+    if not 1.0 - square > LEAST_LEFT:
+        return False
+    # Givens rotations from the last coordinate to the first turn (white, rest) into (0, 1)
+    rest = math.sqrt(1.0 - square)
+    carried = white.copy()
+    for i in range(n):
+        white[i] = 0.0
+    for j in range(n - 1, -1, -1):
+        norm = math.hypot(rest, carried[j])
+        cos, sin = rest / norm, carried[j] / norm
+        rest = norm
+        for i in range(j, n):
+            spare = white[i]
+            white[i] = cos * spare + sin * sqrt_cov[i, j]
+            sqrt_cov[i, j] = cos * sqrt_cov[i, j] - sin * spare
+    return True
+
+
+@compiled
+def update_by_downdate(
+    mean: FloatArray,
+    sqrt_cov: FloatArray,
+    state_deviations: FloatArray,
+    measured_deviations: FloatArray,
+    innovation: FloatArray,
+    noise_std: FloatArray,
+    work: FloatArray,
+) -> tuple[int, float, float, bool]:
+    """Measurement update in place as paper 003 does it: L loses the columns of U = P_xz*S^-T/2, one after the other.
+
+    Arguments as `squareroot.update`. Returns what it returns, and whether a downdate was refused: then `update` has
+    done the work, whose orthogonal transformation cannot fail.
+    """
+    n, points = state_deviations.shape
+    rows = innovation.shape[0]
+    place, used = np.empty(rows, np.int64), 0
+    for k in range(rows):
+        if not math.isnan(innovation[k]):
+            place[used] = k
+            used += 1
+    if used == 0:
+        return 0, 0.0, 0.0, False
+    size = points + used
+    for a in range(used):
+        for p in range(size):
+            work[a, p] = measured_deviations[place[a], p] if p < points else 0.0
+        work[a, points + a] = noise_std[place[a]]
+    triangularize(work, used, size)
+    kept, start, white = sqrt_cov.copy(), mean.copy(), np.empty(n)
+    gain = np.zeros((used, n))
+    log_likelihood, square = -0.5 * used * LOG_TWO_PI, 0.0
+    whitened = np.empty(used)
+    for a in range(used):
+        whitened[a] = innovation[place[a]]
+        for i in range(n):
+            for p in range(points):
+                gain[a, i] += state_deviations[i, p] * measured_deviations[place[a], p]
+        for b in range(a):
+            whitened[a] -= work[a, b] * whitened[b]
+            gain[a] -= work[a, b] * gain[b]
+        whitened[a] /= work[a, a]
+        gain[a] /= work[a, a]
+        log_likelihood -= math.log(work[a, a])
+        square += whitened[a] ** 2
+        mean += gain[a] * whitened[a]
+        if not downdate(sqrt_cov, gain[a], white):
+            sqrt_cov[:, :], mean[:] = kept, start
+            told = update(mean, sqrt_cov, state_deviations, measured_deviations, innovation, noise_std, work)
+            return told[0], told[1], told[2], True
+    return used, log_likelihood - 0.5 * square, square, False

@@ -1,0 +1,52 @@
+"""The federated filter's two acts: the master shares its information out, and fuses what the sub-filters make of it.
+
+Legend
+    P, L        covariance and its factor sqrt_cov, P = L*L'         (n, n)
+    beta        share of the information of one sub-filter [1]; the shares sum to one
+    x_i, L_i    estimate of sub-filter i                             (n,), (n, n)
+
+Shared: P_i = P/beta_i (papers 000 and 001, equation 16). Fused: P = (P_1^-1 + P_2^-1)^-1,
+x = P*(P_1^-1*x_1 + P_2^-1*x_2) (equations 49 and 50, the latter with P where its inverse is printed).
+Carlson's condition sum beta = 1 makes fuse(share) the identity.
+
+Fusing is done as an update of x_1 by a measurement x_2 of the whole state with noise P_2, which is the same and needs
+no inverse: [[L_1, L_2], [L_1, 0]] becomes [[S^1/2, 0], [P_1*S^-T/2, L]].
+"""
+
+from __future__ import annotations
+
+import math
+
+from edge_agent.filters.squareroot import triangularize
+from schemas.numeric import FloatArray, compiled
+
+
+@compiled
+def share(sqrt_cov: FloatArray, beta: float, out: FloatArray) -> None:
+    """out (n, n) = sqrt_cov of a sub-filter that gets the share beta in (0, 1] of the information."""
+    gain = 1.0 / math.sqrt(beta)
+    for i in range(sqrt_cov.shape[0]):
+        for j in range(sqrt_cov.shape[1]):
+            out[i, j] = gain * sqrt_cov[i, j]
+
+
+@compiled
+def fuse(mean: FloatArray, sqrt_cov: FloatArray, other: FloatArray, other_root: FloatArray, work: FloatArray) -> None:
+    """Fuse the independent estimate (other, other_root) into (mean, sqrt_cov), in place; work (2n, 2n) or larger."""
+    n = mean.shape[0]
+    for i in range(n):
+        for j in range(n):
+            work[i, j], work[i, n + j] = sqrt_cov[i, j], other_root[i, j]
+            work[n + i, j], work[n + i, n + j] = sqrt_cov[i, j], 0.0
+    triangularize(work, 2 * n, 2 * n)
+    for k in range(n):
+        white = other[k] - mean[k]
+        for j in range(k):
+            white -= work[k, j] * work[j, 2 * n - 1]
+        # right of the diagonal all is zero by now: room for the whitened difference
+        work[k, 2 * n - 1] = white / work[k, k]
+    for i in range(n):
+        for k in range(n):
+            mean[i] += work[n + i, k] * work[k, 2 * n - 1]
+        for j in range(n):
+            sqrt_cov[i, j] = work[n + i, n + j] if j <= i else 0.0

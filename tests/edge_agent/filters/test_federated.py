@@ -1,0 +1,140 @@
+"""Sharing, fusing, downdating, and points by singular values: identities and linear oracles."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edge_agent.filters.downdate import downdate, update_by_downdate
+from edge_agent.filters.federated import fuse, share
+from edge_agent.filters.sigma import cubature
+from edge_agent.filters.squareroot import predict, update
+from edge_agent.filters.svd import axis_points
+from schemas.numeric import FloatArray
+
+
+def covariance(n: int, seed: int) -> FloatArray:
+    a = np.random.default_rng(seed).normal(size=(n, n))
+    return np.asarray(a @ a.T + 0.1 * np.eye(n))
+
+
+@pytest.mark.parametrize("beta", [0.1, 0.5, 0.83])
+def test_share_then_fuse_is_the_identity(beta: float) -> None:
+    root, mean = np.linalg.cholesky(covariance(5, 0)), np.arange(5.0)
+    first, second, work = np.empty((5, 5)), np.empty((5, 5)), np.empty((10, 10))
+    share(root, beta, first)
+    share(root, 1.0 - beta, second)
+    fused = mean.copy()
+    fuse(fused, first, mean, second, work)
+    assert first @ first.T == pytest.approx(root @ root.T, abs=1e-12)
+    assert fused == pytest.approx(mean, abs=1e-12)
+
+
+def test_fusing_adds_information() -> None:
+    p, q = covariance(4, 1), covariance(4, 2)
+    x, y = np.array([1.0, 2.0, 3.0, 4.0]), np.array([1.5, 1.0, 3.0, 5.0])
+    mean, root = x.copy(), np.linalg.cholesky(p)
+    fuse(mean, root, y, np.linalg.cholesky(q), np.empty((8, 8)))
+    information = np.linalg.inv(p) + np.linalg.inv(q)
+    assert root @ root.T == pytest.approx(np.linalg.inv(information), abs=1e-12)
+    expected = np.linalg.solve(information, np.linalg.solve(p, x) + np.linalg.solve(q, y))
+    assert mean == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_federated_filter_that_counts_shared_rows_half_is_the_one_kalman_filter() -> None:
+    """Two sub-filters, [z1, z2] and [z2], over ten steps of a linear system: the oracle is the textbook filter."""
+    rng, n = np.random.default_rng(3), 3
+    f, h = np.eye(n) + 0.1 * rng.normal(size=(n, n)), rng.normal(size=(2, n))
+    q, noise = 0.05 * covariance(n, 4), np.array([0.2, 0.3])
+    mean, cov = np.ones(n), covariance(n, 5)
+    x, root, rule = mean.copy(), np.linalg.cholesky(cov), cubature(n)
+    for _ in range(10):
+        z = rng.normal(size=2)
+        mean, cov = f @ mean, f @ cov @ f.T + q
+        s = h @ cov @ h.T + np.diag(noise**2)
+        gain = cov @ h.T @ np.linalg.inv(s)
+        mean, cov = mean + gain @ (z - h @ mean), cov - gain @ s @ gain.T
+        x, root = _federated_turn(rule.xi, rule.w_cov, (x, root), (f, q, h, noise), z, 0.37)
+    assert x == pytest.approx(mean, abs=1e-12)
+    assert root @ root.T == pytest.approx(cov, abs=1e-12)
+
+
+def _federated_turn(
+    xi: FloatArray, weight: FloatArray, state: tuple[FloatArray, FloatArray],
+    system: tuple[FloatArray, FloatArray, FloatArray, FloatArray], z: FloatArray, beta: float,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    (mean, root), (f, q, h, noise) = state, system
+    n, work = len(mean), np.empty((20, 40))
+    parts = []
+    for sub, part in enumerate((beta, 1.0 - beta)):
+        own, own_root, points = np.empty(n), np.empty((n, n)), np.empty((2 * n, n))
+        share(root, part, own_root)
+        axis_points(mean, own_root, xi, points)
+        predict(np.ascontiguousarray(points @ f.T), weight, weight, np.linalg.cholesky(q / part), own, own_root, work)
+        innovation, std = z - h @ own, noise * np.array([1.0, np.sqrt(2.0)])
+        if sub == 1:
+            innovation[0] = np.nan
+        update(own, own_root, own_root.copy(), np.ascontiguousarray(h @ own_root), innovation, std, work)
+        parts.append((own, own_root))
+    fuse(parts[0][0], parts[0][1], parts[1][0], parts[1][1], work)
+    return parts[0]
+
+
+def test_points_by_singular_values_have_the_moments_of_the_state() -> None:
+    rule, root, mean = cubature(4), np.linalg.cholesky(covariance(4, 6)), np.arange(4.0)
+    points = np.empty((8, 4))
+    axis_points(mean, root, rule.xi, points)
+    assert rule.w_mean @ points == pytest.approx(mean, abs=1e-12)
+    centred = points - mean
+    assert (rule.w_cov[:, None] * centred).T @ centred == pytest.approx(root @ root.T, abs=1e-12)
+
+
+def test_points_by_singular_values_lie_on_the_axes_of_the_ellipsoid() -> None:
+    root = np.linalg.cholesky(covariance(3, 7))
+    points = np.empty((6, 3))
+    axis_points(np.zeros(3), root, cubature(3).xi, points)
+    gram = points[:3] @ points[:3].T
+    assert gram - np.diag(np.diag(gram)) == pytest.approx(np.zeros((3, 3)), abs=1e-12)
+
+
+def test_a_downdate_takes_a_column_away() -> None:
+    cov, column = covariance(5, 8), 0.2 * np.random.default_rng(9).normal(size=5)
+    root = np.linalg.cholesky(cov)
+    assert downdate(root, column, np.empty(5))
+    assert root @ root.T == pytest.approx(cov - np.outer(column, column), abs=1e-12)
+    assert np.array_equal(root, np.tril(root))
+
+
+def test_a_downdate_that_would_leave_no_covariance_refuses_and_changes_nothing() -> None:
+    root = np.linalg.cholesky(covariance(3, 10))
+    before = root.copy()
+    assert not downdate(root, 1.0001 * root[:, 0], np.empty(3))
+    assert np.array_equal(root, before)
+
+
+def _measured(seed: int, noise: float) -> tuple[tuple[FloatArray, ...], tuple[int, float, float, bool]]:
+    rng = np.random.default_rng(seed)
+    root, mean = np.linalg.cholesky(covariance(4, seed)), rng.normal(size=4)
+    h, innovation = rng.normal(size=(3, 4)), rng.normal(size=3)
+    innovation[1] = np.nan
+    args = (root.copy(), np.ascontiguousarray(h @ root), innovation, np.full(3, noise), np.empty((12, 12)))
+    other, other_root = mean.copy(), root.copy()
+    told = update_by_downdate(mean, root, *args)
+    plain = update(other, other_root, *args)
+    assert told[:3] == pytest.approx(plain, rel=1e-9)
+    return (mean, other, root @ root.T, other_root @ other_root.T), told
+
+
+def test_an_update_by_downdates_is_the_orthogonal_update() -> None:
+    (mean, other, cov, other_cov), told = _measured(11, 0.5)
+    assert not told[3]
+    assert mean == pytest.approx(other, abs=1e-9)
+    assert cov == pytest.approx(other_cov, abs=1e-9)
+
+
+def test_where_the_downdate_refuses_the_orthogonal_update_does_the_work() -> None:
+    """Noise so small that rounding leaves no variance in the measured direction."""
+    (mean, other, cov, other_cov), told = _measured(12, 1e-9)
+    assert told[3]
+    assert np.array_equal(mean, other)
+    assert np.array_equal(cov, other_cov)
