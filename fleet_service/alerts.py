@@ -14,10 +14,15 @@ from schemas.numeric import IntArray
 from schemas.wire import Alert
 
 RAISE_ABOVE: Final = 0.9  # P(slippery)
-CLEAR_BELOW: Final = 0.5
+# Grip must be as sure as ice was: clearing too early is the dearer error, and a few liars can lower P for a while.
+CLEAR_BELOW: Final = 0.05
+FADE_BELOW: Final = 0.5  # ... but when nobody confirms it, it ends as soon as it is less likely than not
 WITNESSES: Final = (
     2  # distinct vehicles that called it slippery themselves: one liar, or one bad sensor, raises nothing
 )
+# Where the map rests on so many values, it takes one witness more to turn it over. With two, and six of sixty vehicles
+# sending random values, a town in five had a false alert (of five that were tried).
+FIRM_VALUES: Final = 5.0
 WITNESS_NS: Final = 3600 * 10**9  # ... within the hour; older ice belongs to an older road
 
 
@@ -42,7 +47,8 @@ class Alerts:
             slot = int(slots[k])
             if slot in self.raised:
                 continue
-            if witnesses(fusion.live, slots[k : k + 1], int(time[k]) - WITNESS_NS)[0] >= WITNESSES:
+            needed = WITNESSES + (fusion.live.values[slot] >= FIRM_VALUES)
+            if witnesses(fusion.live, slots[k : k + 1], int(time[k]) - WITNESS_NS)[0] >= needed:
                 self.raised.add(slot)
                 out.append(self._alert(slot, int(time[k]), True, f"P(mu < 0.4) = {slippery[k]:.2f} > {RAISE_ABOVE}"))
         down = np.flatnonzero(slippery < CLEAR_BELOW).tolist() if self.raised else []
@@ -50,11 +56,14 @@ class Alerts:
         return out + [self._clear(int(slots[k]), int(time[k]), reason) for k in down if int(slots[k]) in self.raised]
 
     def faded(self, now: int) -> list[Alert]:
-        """Alerts that time alone cleared until `now` [ns]."""
+        """Alerts that time alone cleared until `now` [ns]: what was likely has faded, or what is contested is old."""
         slots = np.array(sorted(self.raised), np.int64)
-        slippery = self._fusion.beliefs(slots, now) @ SLIPPERY_SHARE
+        live = self._fusion.live
+        likely = live.belief[slots] @ SLIPPERY_SHARE >= FADE_BELOW
+        forgotten = witnesses(live, slots, now - WITNESS_NS) == 0
+        faded = (self._fusion.beliefs(slots, now) @ SLIPPERY_SHARE < FADE_BELOW) & (likely | forgotten)
         reason = "no visit has confirmed it for too long"
-        return [self._clear(int(slot), now, reason) for slot in slots[slippery < CLEAR_BELOW]]
+        return [self._clear(int(slot), now, reason) for slot in slots[faded]]
 
     def _clear(self, slot: int, time: int, reason: str) -> Alert:
         self.raised.discard(slot)

@@ -1,4 +1,7 @@
-"""`fleet-service run | query | watch`. Heavy imports wait until a command needs them, so that help comes at once."""
+"""`fleet-service run | query | watch | evaluate`.
+
+Heavy imports wait until a command needs them, so that help comes at once.
+"""
 
 from __future__ import annotations
 
@@ -53,6 +56,12 @@ def _parser() -> argparse.ArgumentParser:
     watch.add_argument("--bbox", metavar="W,S,E,N", help="only tiles that touch this box")
     _connection(watch)
     watch.set_defaults(command=_watch)
+
+    evaluate = commands.add_parser("evaluate", help="simulated fleets, beside truth and simple rules")
+    evaluate.add_argument("--out", metavar="DIR", type=Path, required=True, help="figures, table and plots go there")
+    evaluate.add_argument("--quick", action="store_true", help="one seed, to see that it works; judges nothing")
+    evaluate.add_argument("--skip-whole-way", action="store_true", help="leave the vehicles with real estimators out")
+    evaluate.set_defaults(command=_evaluate)
     return parser
 
 
@@ -97,6 +106,19 @@ def _watch(arguments: argparse.Namespace) -> int:
         client.settings(arguments.connect, arguments.config), arguments.bbox, stop, lambda s: print(s, flush=True)
     )
     return 0
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    from fleet_service.evaluation import campaign
+    from schemas import figures
+
+    drive = None if arguments.skip_whole_way else campaign.whole_way_of(arguments.quick)
+    try:
+        found = campaign.run(arguments.out, arguments.quick, drive, lambda line: print(line, flush=True))
+    except OSError as error:
+        raise InputError("out", f"cannot write {error.filename} ({error.strerror})", "give another folder") from error
+    print(f"\n{figures.markdown([figure for figure in found if figure.bar is not None])}\n")
+    return 0 if arguments.quick or campaign.holds(found) else 1
 
 
 def stop_on_signals() -> threading.Event:

@@ -25,6 +25,7 @@ from fleet_service.ingest import Admitted, Candidate, Intake, Message
 from fleet_service.map_state import MapState, arrow_stream, cell_table
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
+from schemas.numeric import IntArray
 from schemas.query import MapQuery
 from schemas.wire import Alert, Kind
 
@@ -77,6 +78,11 @@ class Engine:
         """Cells under an alert."""
         return len(self._alerts.raised)
 
+    @property
+    def alerted(self) -> IntArray:
+        """Slots under an alert, (k,)."""
+        return np.array(sorted(self._alerts.raised), np.int64)
+
     def take(self, messages: Sequence[Message], now: int) -> list[Alert]:
         """Admit and fuse; returns the alerts that this raises or clears."""
         clock = Clock(now, int(self._config.clock_ahead_s * 1e9), int(self._config.oldest_s * 1e9))
@@ -120,12 +126,15 @@ class Engine:
         return self._acks.messages()
 
     def tiles(self, now: int) -> list[tuple[int, bytes]]:
-        """Tile and Arrow stream of every tile that changed since the last call."""
+        """Tile and Arrow stream of every tile that changed since the last call, as far as it is public."""
         out = []
         for tile in self.map.take_dirty():
             with self._guard:
-                table = cell_table(self.fusion, self.map.slots(tile), now)
-            out.append((tile, arrow_stream(table)))
+                slots = self.map.slots(tile)
+                public = slots[self.fusion.live.vehicles[slots] >= self._config.public_vehicles]
+                table = cell_table(self.fusion, public, now)
+            if table.num_rows:
+                out.append((tile, arrow_stream(table)))
         return out
 
     def fading(self, now: int) -> list[Alert]:
@@ -139,6 +148,8 @@ class Engine:
         Raises:
             InputError: a route too long, a time in the future, or an archive that cannot be read.
         """
+        least = max(query.min_vehicles, self._config.public_vehicles)
+        query = query.model_copy(update={"min_vehicles": least})
         if query.at is None:
             with self._guard:
                 return list(answer(self.map, query, wanted, now))

@@ -15,6 +15,7 @@ from schemas import grid, mugrid, tables
 from schemas.numeric import Float32Array, FloatArray, IntArray
 
 LOWER, UPPER = 0.05, 0.95  # of the interval
+GRAVITY: Final = 9.81  # [m/s²]
 PRIOR_UPPER: Final = float(mugrid.quantiles(mugrid.PRIOR, UPPER))
 PRIOR_WIDTH: Final = PRIOR_UPPER - float(mugrid.quantiles(mugrid.PRIOR, LOWER))
 # A cell is `measured` when a value brought its upper end down by more than numerics and forgetting move it, or halved
@@ -93,6 +94,7 @@ def map_table(
         "p_slippery": belief @ SLIPPERY_SHARE, "basis": basis, "vehicles": vehicles, "observations": observations,
         "first_time": first, "last_time": last, "age_s": np.maximum(now - last, 0) * 1e-9,
         "latitude": latitude, "longitude": longitude, "west": west, "south": south, "east": east, "north": north,
+        "safe_deceleration": GRAVITY * mugrid.quantiles(belief, LOWER),
     }  # fmt: skip
     arrays = [pa.array(columns[f.name]).cast(f.type, safe=False) for f in tables.MAP_SCHEMA]
     return pa.Table.from_arrays(arrays, schema=tables.MAP_SCHEMA)

@@ -10,6 +10,7 @@ from schemas import mugrid
 from schemas.numeric import Float32Array, IntArray, compiled
 
 NOBODY = -1
+WITNESSES = 3  # remembered per slot: as many as an alert ever needs
 
 
 class Cells(NamedTuple):
@@ -22,8 +23,9 @@ class Cells(NamedTuple):
         visits: (n,) observations.
         vehicles: (n,) distinct vehicles.
         values: (n,) votes with a value, fractions of repeated ones summed.
-        witness: (n, 2) the last two distinct vehicles that called it slippery, or NOBODY.
-        witnessed: (n, 2) when they did [ns].
+        crowd: (n, 2) bounds and values of vehicles that are not trusted, as far as they are not renewed.
+        witness: (n, WITNESSES) the last distinct vehicles that called it slippery, or NOBODY.
+        witnessed: (n, WITNESSES) when they did [ns].
     """
 
     belief: Float32Array
@@ -32,6 +34,7 @@ class Cells(NamedTuple):
     visits: IntArray
     vehicles: IntArray
     values: Float32Array
+    crowd: Float32Array
     witness: IntArray
     witnessed: IntArray
 
@@ -45,8 +48,9 @@ def empty(slots: int) -> Cells:
         np.zeros(slots, np.int64),
         np.zeros(slots, np.int64),
         np.zeros(slots, np.float32),
-        np.full((slots, 2), NOBODY, np.int64),
-        np.zeros((slots, 2), np.int64),
+        np.zeros((slots, 2), np.float32),
+        np.full((slots, WITNESSES), NOBODY, np.int64),
+        np.zeros((slots, WITNESSES), np.int64),
     )
 
 
@@ -69,5 +73,6 @@ def copy_slot(source: Cells, target: Cells, slot: int) -> None:
     target.visits[slot] = source.visits[slot]
     target.vehicles[slot] = source.vehicles[slot]
     target.values[slot] = source.values[slot]
+    target.crowd[slot] = source.crowd[slot]
     target.witness[slot] = source.witness[slot]
     target.witnessed[slot] = source.witnessed[slot]

@@ -9,26 +9,26 @@ from schemas import mugrid
 BIN_WIDTH: Final = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS
 
 # Share of reports that say nothing about the road (faulty sensor, wrong cell, wrong tyre model): bounds what one vote
-# can do to a factor of about 60. 10 to 20 % served a toy study with liars; the middle of it.
+# can do to a factor of about 60. Fixes in the wrong cell alone are 12 % at the border of a surface.
 CONTAMINATION: Final = 0.15
 
 # A vehicle's own error: tyres, mass and stiffness off by a few per cent move all its values the same way. It does not
 # average out over its visits, so it widens every vote; only other vehicles narrow it.
 BIAS_RELATIVE: Final = 0.05
-BIAS_ABSOLUTE: Final = 0.02
+BIAS_ABSOLUTE: Final = 0.01  # .015 of a vehicle, less what half a bin adds by itself
 
 # A road changes slowly (drying, polishing): random walk of μ, standard deviation after one hour.
 DRIFT_PER_ROOT_HOUR: Final = 0.04
 
-# ... and at once (ice, snow, a gritter): mean time between changes that leave nothing of what was known. Two hours make
-# three passes enough to turn a firm belief, and a lonely measurement fade within a morning.
-CHANGE_S: Final = 7200.0
+# ... and at once (ice, snow, a gritter): mean time between changes that leave nothing of what was known. With three
+# hours a lonely measurement fades within a day.
+CHANGE_S: Final = 10800.0
 # Visits may follow each other within the second, and a road may change between them: a new value always finds this much
-# chance of it. Lower bounds do not: however many there are, they wear nothing away.
+# chance of it: three passes turn a firm belief. Lower bounds do not: however many there are, they wear nothing away.
 CHANGE_LEAST: Final = 0.003
 
-# A vehicle's vote in a cell counts again in the measure in which the map forgets the first one; half of CHANGE_S, so
-# that no vehicle can hold a cell by driving over it all day.
+# A vehicle's vote in a cell counts again in the measure in which the map forgets the first one, by drift as by change;
+# so that no vehicle can hold a cell by driving over it all day.
 VOTE_RENEWAL_S: Final = 3600.0
 
 # ... or at once, if it says something else: its own bias cancels in the difference to its own last vote. From two
@@ -36,6 +36,11 @@ VOTE_RENEWAL_S: Final = 3600.0
 NOVELTY_FROM: Final = 2.0
 NOVELTY_FULL: Final = 4.0
 NOVELTY_STD: Final = 0.05
+# So many whole votes a vehicle has in a cell per VOTE_RENEWAL_S, however often it changes its mind: one and one change.
+# With one and a half, ice takes four passes to be seen instead of three.
+VOTES: Final = 2.0
+# ... and only at a visit of its own: nobody drives round a block in less. So a flood of reports is one report.
+REVISIT_S: Final = 20.0
 # For a lower bound, "something else" is this much more grip used.
 NOVELTY_UTILISED: Final = 0.10
 
@@ -43,11 +48,6 @@ NOVELTY_UTILISED: Final = 0.10
 # log-likelihood), so a fall towards the upper end of less than twice that is taken as flat: a bound, not a value.
 VALUE_DROP_NATS: Final = 1.0
 VALUE_DROP_STEPS: Final = int(VALUE_DROP_NATS * mugrid.STEPS_PER_NAT)
-
-# Between the grip used and its maximum a value says "there was more than I used". That rests on the shape of the tyre
-# curve, which all vehicles assume alike and which no number of them averages out; so it counts this much of its nats.
-# On a simulated fleet a quarter raised the coverage of measured cells from .78 to .87 and made nothing worse.
-CURVE_SHARE: Final = 0.25
 
 # A posterior (μ, interval) is a value only where this share of μ was used (contract), else a lower bound.
 VALUE_UTILISATION: Final = 0.6
@@ -58,14 +58,29 @@ POSTERIOR_STD_LEAST: Final = 0.02  # half a bin: the grid cannot hold less
 # Slippery is μ below this (contract of p_slippery).
 SLIPPERY: Final = 0.4
 
-# Trust: agreement g in (0, 1) of a value with what others said, as a Beta mean with this prior; a vehicle that agrees
-# no better than chance (one half) keeps half a vote, one that disagrees most of the time none.
-TRUST_AGREED: Final = 3.0
-TRUST_DISAGREED: Final = 2.0
-TRUST_NONE: Final = 0.3
-TRUST_FULL: Final = 0.7
-TRUST_MEMORY: Final = 100.0  # votes after which the old half as much: a repaired sensor is believed again
-TRUST_VEHICLES: Final = 3  # a cell judges a vote only when so many vehicles were there before
+# Trust: two values agree up to 2.5 standard deviations of their difference (bias included) and disagree from 4 on.
+# Honest vehicles then agree in 95 % of their meetings (fixes in the wrong cell, roads that change), whatever the road.
+PEERS_AGREE: Final = 2.5
+PEERS_DISAGREE: Final = 4.0
+PEER_NS: Final = 900 * 10**9  # values further apart in time may both be right
+PEER_STD: Final = 0.25  # wider ones agree with everything
+# Meetings with one vehicle after which the old count half: who was honest and begins to lie is seen in minutes, and a
+# repaired sensor as soon; the mean over many others keeps it quiet.
+PEER_MEMORY: Final = 3.0
+SPEAKERS: Final = 6  # last values of a cell that a new one is held against
+PEERS: Final = 48  # places for others: a sample, which is enough for a mean
+# As a mean over others, beginning with TRUST_PRIOR_PEERS imagined ones that agreed in TRUST_PRIOR. No weight is left to
+# who disagrees with 30 % of those that are trusted; with less than a third of a fleet colluding that is the colluders.
+TRUST_PRIOR: Final = 0.85
+TRUST_PRIOR_PEERS: Final = 8.0
+TRUST_NONE: Final = 0.7
+TRUST_FULL: Final = 0.9
+TRUST_HEARD_LEAST: Final = 0.2  # how much a vehicle's word about others counts at least: all distrusted is no end
+# Once so many vehicles are known (met so many others, and are trusted), one that is not is a newcomer: it votes with
+# this weight, bears no witness, and shares one vote per cell with all others that are not trusted (CROWD).
+ESTABLISHED_PEERS: Final = 4.0
+ESTABLISHED_VEHICLES: Final = 10
+NEWCOMER: Final = 0.4
 WITNESS_TRUST: Final = 0.5  # less trusted vehicles vote, but do not bear witness for an alert
 WITNESS_SHARE: Final = 0.6  # P(slippery) from the vote alone, against the uniform prior, that makes a witness
 

@@ -15,12 +15,14 @@ from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import forget
 from fleet_service.fusion.cells import Cells, empty, extended
 from fleet_service.fusion.table import EMPTY, grown, places_of, room, slots_of
-from fleet_service.fusion.window import NONE, Entries, Links, absorb, no_entries, no_links, no_pairs, settle
+from fleet_service.fusion.trust import newcomer, no_peers, no_speakers, trusted
+from fleet_service.fusion.window import NONE, Entries, Links, Pairs, absorb, no_entries, no_links, no_pairs, settle
 from schemas import grid
 from schemas.numeric import BoolArray, ByteArray, Float32Array, FloatArray, IntArray, compiled
 
 SmallArray = NDArray[np.int8]
 _FIRST_SLOTS = 1024
+_FIRST_VEHICLES = 64
 
 
 @dataclass(frozen=True)
@@ -78,8 +80,8 @@ class Fusion:
         self._entries: Entries = no_entries(_FIRST_SLOTS)
         self._pairs, self._pair_count = no_pairs(2 * _FIRST_SLOTS), 0
         self._vehicles: dict[int, int] = {}
-        self._agreed, self._judged = np.zeros(0), np.zeros(0)
-        self._trust: list[tuple[int, Float32Array]] = [(-1, np.zeros(0, np.float32))]
+        self._speakers, self._peers = no_speakers(_FIRST_SLOTS), no_peers(_FIRST_VEHICLES)
+        self._trust: list[tuple[int, Float32Array, float]] = [(-1, np.zeros(0, np.float32), newcomer(False))]
 
     @property
     def waiting(self) -> int:
@@ -130,16 +132,15 @@ class Fusion:
         ids, inverse = np.unique(vehicle, return_inverse=True)
         known = self._vehicles
         indices = np.array([known.setdefault(i, len(known)) for i in ids.tolist()], np.int64)
-        if len(known) > len(self._agreed):
-            spare = np.zeros(2 * len(known) - len(self._agreed))
-            self._agreed, self._judged = np.append(self._agreed, spare), np.append(self._judged, spare)
+        if len(known) > len(self._peers.other):
+            self._peers = extended(self._peers, no_peers(2 * len(known)))
         return np.asarray(indices[inverse])
 
     def _weights(self, epoch: int, vehicle: IntArray) -> Float32Array:
-        known = next(weights for since, weights in reversed(self._trust) if since <= epoch or since < 0)
-        newcomer = _weight(np.zeros(1), np.zeros(1))
+        record = next(record for record in reversed(self._trust) if record[0] <= epoch or record[0] < 0)
+        known, unknown = record[1], np.float32(record[2])
         inside = vehicle < len(known)
-        return np.where(inside, np.append(known, newcomer)[np.where(inside, vehicle, len(known))], newcomer)
+        return np.where(inside, np.append(known, unknown)[np.where(inside, vehicle, len(known))], unknown)
 
     def _advance(self, epoch: int) -> None:
         """Move T to `epoch`, one epoch at a time while the window holds anything."""
@@ -148,21 +149,23 @@ class Fusion:
         while self._epoch < epoch:
             self._epoch = self._epoch + 1 if self.waiting else epoch
             self._settle(self._epoch * c.EPOCH_NS - self._lateness_ns)
-            known = len(self._vehicles)
-            weights = _weight(self._agreed[:known], self._judged[:known])
-            self._trust = [self._trust[0], *self._trust[1:][-self._kept_epochs :], (self._epoch, weights)]
+            before = self._trust[-1][1]
+            joined = np.full(len(self._vehicles) - len(before), newcomer(False), np.float32)
+            weights, established = trusted(self._peers, np.append(before, joined))
+            record = (self._epoch, weights, newcomer(established))
+            self._trust = [self._trust[0], *self._trust[1:][-self._kept_epochs :], record]
 
     def _settle(self, before: int) -> None:
         if not self.waiting:
             return
         self._reserve_pairs(self.waiting)
         slots = np.flatnonzero(self._links.head[: self.size] != NONE)
+        slots = slots[
+            np.lexsort((self.sector[slots], self.cell[slots]))
+        ]  # an order that does not depend on who came first
         self._pair_count += settle(
-            self._kept, self._links, self._entries, self._pairs, self._agreed, self._judged, slots, before
+            self._kept, self._links, self._entries, self._pairs, self._speakers, self._peers, slots, before
         )
-        fade = np.where(self._judged > c.TRUST_MEMORY, 0.5, 1.0)
-        self._agreed *= fade
-        self._judged *= fade
 
     def _absorb(self, o: Observations, vehicle: IntArray, weight: Float32Array) -> IntArray:
         both = np.flatnonzero(o.second >= 0)
@@ -200,12 +203,14 @@ class Fusion:
         self.live = extended(self.live, empty(slots))
         self._kept = extended(self._kept, empty(slots))
         self._links = extended(self._links, no_links(slots))
+        self._speakers = extended(self._speakers, no_speakers(slots))
 
     def _reserve_pairs(self, more: int) -> None:
         if 2 * (self._pair_count + more) > len(self._pairs.keys):
             keys, old, new = grown(self._pairs.keys, room(2 * (self._pair_count + more)))
             larger = no_pairs(len(keys))._replace(keys=keys)
-            larger.time[new], larger.mean[new], larger.std[new] = (column[old] for column in self._pairs[1:])
+            for name in Pairs._fields[1:]:
+                getattr(larger, name)[new] = getattr(self._pairs, name)[old]
             self._pairs = larger
 
 
@@ -216,12 +221,6 @@ def _more_entries(old: Entries, places: int) -> Entries:
     new.free[unused : unused + places - had] = np.arange(had, places)
     new.unused[0] = unused + places - had
     return new
-
-
-def _weight(agreed: FloatArray, judged: FloatArray) -> Float32Array:
-    """Weight of a vehicle's votes in [0, 1] from its agreement."""
-    mean = (c.TRUST_AGREED + agreed) / (c.TRUST_AGREED + c.TRUST_DISAGREED + judged)
-    return np.clip((mean - c.TRUST_NONE) / (c.TRUST_FULL - c.TRUST_NONE), 0.0, 1.0).astype(np.float32)
 
 
 @compiled

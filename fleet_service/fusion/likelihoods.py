@@ -50,8 +50,7 @@ def evidence(columns: Mapping[str, NDArray[Any]], told: BoolArray) -> ByteArray:
 def levelled(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
     """Likelihoods (n, 32) that claim no more than the grip used (n,) supports.
 
-    A bound is made flat above `used`. A value keeps its fall above its maximum and its rise below `used`; what it
-    claims in between, that there is more grip than was used, counts CURVE_SHARE. Where `used` is NaN nothing changes.
+    A bound is made flat above `used`. A value stays as it is, and so does everything where `used` is NaN.
     """
     known = ~np.isnan(used)
     level = np.nan_to_num(used)
@@ -60,9 +59,7 @@ def levelled(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
     place = np.clip(np.searchsorted(mugrid.EDGES, level) - 1, 0, mugrid.BINS - 1)[:, None]
     floor = np.take_along_axis(np.minimum.accumulate(steps, axis=1), place, axis=1)
     flat = np.where(above, 0, np.maximum(steps, floor) - floor)
-    between = above & (np.arange(mugrid.BINS) < steps.argmin(axis=1)[:, None])
-    value = np.where(between, np.rint(c.CURVE_SHARE * steps), steps)
-    return np.where(known[:, None], np.where(bound[:, None], flat, value), steps).astype(np.uint8)
+    return np.where((known & bound)[:, None], flat, steps).astype(np.uint8)
 
 
 def at_least(used: FloatArray) -> FloatArray:

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import BOUND, VALUE, describe, doubt, forget, kind_of, spread, vote
-from fleet_service.fusion.cells import NOBODY, Cells, copy_slot
+from fleet_service.fusion.cells import NOBODY, WITNESSES, Cells, copy_slot
 from fleet_service.fusion.table import EMPTY, locate
+from fleet_service.fusion.trust import Peers, Speakers, meet
 from schemas import mugrid
 from schemas.numeric import ByteArray, Float32Array, FloatArray, IntArray, compiled
 
@@ -35,7 +36,7 @@ class Entries(NamedTuple):
     """One observation in one cell, (m,); a pool with a stack of free places.
 
     `identity` (m, 4) is (vehicle, boot, region, place in the stream), the order of equal times. `mean`, `std`, `share`
-    describe the vote; `power`, `last_mean`, `last_std`, `fresh` say what the same vehicle had said before.
+    describe the vote; `power`, `last_mean`, `last_std`, `spent`, `fresh` say what the same vehicle had said before.
     """
 
     free: IntArray
@@ -56,6 +57,7 @@ class Entries(NamedTuple):
     power: Float32Array
     last_mean: Float32Array
     last_std: Float32Array
+    spent: Float32Array
 
 
 class Pairs(NamedTuple):
@@ -65,6 +67,7 @@ class Pairs(NamedTuple):
     time: IntArray
     mean: Float32Array
     std: Float32Array
+    spent: Float32Array
 
 
 def no_links(slots: int) -> Links:
@@ -86,7 +89,7 @@ def no_entries(places: int) -> Entries:
         previous=whole(), following=whole(), slot=whole(), time=whole(), identity=np.zeros((places, 4), np.int64),
         vehicle=whole(), evidence=np.zeros((places, mugrid.BINS), np.uint8), weight=single(),
         kind=np.zeros(places, np.int8), fresh=np.zeros(places, np.int8), mean=single(), std=single(), share=single(),
-        power=single(), last_mean=single(), last_std=single(),
+        power=single(), last_mean=single(), last_std=single(), spent=single(),
     )  # fmt: skip
 
 
@@ -95,6 +98,7 @@ def no_pairs(places: int) -> Pairs:
     return Pairs(
         np.full(places, EMPTY),
         np.zeros((places, 2), np.int64),
+        np.zeros((places, 2), np.float32),
         np.zeros((places, 2), np.float32),
         np.zeros((places, 2), np.float32),
     )
@@ -136,23 +140,23 @@ def absorb(
 
 @compiled
 def settle(
-    kept: Cells, links: Links, entries: Entries, pairs: Pairs, agreed: FloatArray, judged: FloatArray,
+    kept: Cells, links: Links, entries: Entries, pairs: Pairs, speakers: Speakers, peers: Peers,
     slots: IntArray, before: int,
 ) -> int:  # fmt: skip
     """Fold the entries of `slots` older than `before` [ns] onto `kept`; returns how many new pairs there are.
 
-    `agreed` and `judged` (vehicles,) collect how well each vehicle's values agree with the cells they fall into.
+    Values that pass meet those of others, which is what reputation is made of.
     """
     p, likelihood = np.empty(mugrid.BINS), np.empty(mugrid.BINS)
     added = 0
     for slot in slots:
         entry = links.head[slot]
         while entry != NONE and entries.time[entry] < before:
-            known = kept.vehicles[slot] >= c.TRUST_VEHICLES and kept.values[slot] >= c.TRUST_VEHICLES - 1
-            agreement = _fold(kept, entries, entry, p, likelihood)
-            if known and entries.kind[entry] == VALUE:
-                agreed[entries.vehicle[entry]] += entries.power[entry] * agreement
-                judged[entries.vehicle[entry]] += entries.power[entry]
+            _fold(kept, entries, entry, p, likelihood)
+            if entries.kind[entry] == VALUE:
+                vehicle, number = entries.vehicle[entry], entries.identity[entry, 0]
+                mean, std = float(entries.mean[entry]), float(entries.std[entry])
+                meet(speakers, peers, slot, vehicle, number, entries.time[entry], mean, std)
             added += _remember(pairs, entries, entry)
             entries.free[entries.unused[0]] = entry
             entries.unused[0] += 1
@@ -198,7 +202,7 @@ def _link(links: Links, entries: Entries, slot: int, entry: int) -> None:
 def _recall(entries: Entries, pairs: Pairs, entry: int) -> None:
     """How much of a vote is new, from what its vehicle said here before: in the window, or before the checkpoint."""
     vehicle, kind = entries.vehicle[entry], int(entries.kind[entry])
-    time, mean, std = 0, np.float32(0.0), np.float32(0.0)
+    time, mean, std, spent = 0, np.float32(0.0), np.float32(0.0), np.float32(0.0)
     seen, found = False, False
     earlier = entries.previous[entry]
     while earlier != NONE and not found:
@@ -207,6 +211,7 @@ def _recall(entries: Entries, pairs: Pairs, entry: int) -> None:
             if entries.kind[earlier] == kind:
                 found = True
                 time, mean, std = entries.time[earlier], entries.last_mean[earlier], entries.last_std[earlier]
+                spent = entries.spent[earlier]
         earlier = entries.previous[earlier]
     if not found:
         place = locate(pairs.keys, (entries.slot[entry] << _VEHICLE_BITS) | vehicle)
@@ -215,16 +220,22 @@ def _recall(entries: Entries, pairs: Pairs, entry: int) -> None:
             if pairs.time[place, kind] > 0:
                 found = True
                 time, mean, std = pairs.time[place, kind], pairs.mean[place, kind], pairs.std[place, kind]
+                spent = pairs.spent[place, kind]
     new_mean, new_std = entries.mean[entry], entries.std[entry]
     power = np.float32(1.0)
     if found:
         renewed = -math.expm1(-(entries.time[entry] - time) * 1e-9 / c.VOTE_RENEWAL_S)
-        power = np.float32(max(renewed, _novelty(kind, float(mean), float(std), float(new_mean), float(new_std))))
+        spent *= np.float32(1.0 - renewed)
+        novelty = 0.0
+        if entries.time[entry] - time >= c.REVISIT_S * 1e9:
+            novelty = _novelty(kind, float(mean), float(std), float(new_mean), float(new_std))
+        power = np.float32(max(renewed, min(novelty, c.VOTES - float(spent))))
         new_mean = mean + power * (new_mean - mean)
         new_std = std + power * (new_std - std)
     entries.power[entry] = power
     entries.last_mean[entry] = new_mean
     entries.last_std[entry] = new_std
+    entries.spent[entry] = spent + power
     entries.fresh[entry] = 0 if seen else 1
 
 
@@ -239,22 +250,24 @@ def _novelty(kind: int, mean: float, std: float, new_mean: float, new_std: float
 
 
 @compiled
-def _fold(cells: Cells, entries: Entries, entry: int, p: FloatArray, likelihood: FloatArray) -> float:
-    """Fold one entry onto its slot; returns its agreement with the belief before it: L̄ / (L̄ + 1), L̄ = Σ p·L̃."""
+def _fold(cells: Cells, entries: Entries, entry: int, p: FloatArray, likelihood: FloatArray) -> None:
+    """Fold one entry onto its slot."""
     slot, time, power = entries.slot[entry], entries.time[entry], entries.power[entry]
     kind, weight = int(entries.kind[entry]), entries.weight[entry]
     p[:] = cells.belief[slot]
+    seconds = 0.0
     if cells.visits[slot] == 0:
         cells.first[slot] = time
     else:
         seconds = (time - cells.time[slot]) * 1e-9
+        if cells.crowd[slot, 0] > 0.0 or cells.crowd[slot, 1] > 0.0:
+            cells.crowd[slot] *= np.float32(math.exp(-max(seconds, 0.0) / c.VOTE_RENEWAL_S))
         forget(p, seconds)
-        if kind == VALUE:
-            doubt(p, seconds, power * weight)
+    if 0.0 < weight < c.WITNESS_TRUST:
+        weight = _crowded(cells, slot, kind, power, weight)
+    if kind == VALUE and cells.visits[slot] > 0:
+        doubt(p, seconds, power * weight)
     spread(entries.evidence[entry], kind, likelihood)
-    expected = 0.0
-    for i in range(mugrid.BINS):
-        expected += p[i] * likelihood[i]
     vote(p, likelihood, 1.0 - (1.0 - c.CONTAMINATION) * weight, power)
     cells.belief[slot] = p.astype(np.float32)
     cells.time[slot] = time
@@ -264,15 +277,29 @@ def _fold(cells: Cells, entries: Entries, entry: int, p: FloatArray, likelihood:
         cells.values[slot] += power * weight
         if weight >= c.WITNESS_TRUST and entries.share[entry] >= c.WITNESS_SHARE:
             _witness(cells, slot, entries.vehicle[entry], time)
-    return expected / (expected + 1.0)
+
+
+@compiled
+def _crowded(cells: Cells, slot: int, kind: int, power: float, weight: float) -> np.float32:
+    """Weight of a vote among others that are not trusted either: the k-th new one counts 1/k², all together 1.6 votes.
+
+    So names cost nothing and bring nothing. A vehicle's repeated vote is discounted by its `power` already.
+    """
+    crowd = cells.crowd[slot, kind]
+    cells.crowd[slot, kind] = crowd + np.float32(power)
+    return np.float32(weight / (1.0 + crowd) ** 2)
 
 
 @compiled
 def _witness(cells: Cells, slot: int, vehicle: int, time: int) -> None:
-    """Note a witness: its own place if it has one, else that of the older one."""
-    place = 0 if cells.witnessed[slot, 0] <= cells.witnessed[slot, 1] else 1
-    if cells.witness[slot, 1 - place] == vehicle:
-        place = 1 - place
+    """Note a witness: at its own place if it has one, else at that of the oldest."""
+    place = 0
+    for k in range(WITNESSES):
+        if cells.witness[slot, k] == vehicle:
+            place = k
+            break
+        if cells.witnessed[slot, k] < cells.witnessed[slot, place]:
+            place = k
     cells.witness[slot, place] = vehicle
     cells.witnessed[slot, place] = time
 
@@ -286,10 +313,11 @@ def _remember(pairs: Pairs, entries: Entries, entry: int) -> int:
     pairs.time[place, kind] = entries.time[entry]
     pairs.mean[place, kind] = entries.last_mean[entry]
     pairs.std[place, kind] = entries.last_std[entry]
+    pairs.spent[place, kind] = entries.spent[entry]
     return added
 
 
 def witnesses(cells: Cells, slots: IntArray, since: int) -> IntArray:
-    """Distinct vehicles, at most two, that called each slot slippery after `since` [ns]; (k,)."""
+    """Distinct vehicles, at most WITNESSES, that called each slot slippery after `since` [ns]; (k,)."""
     spoken = (cells.witness[slots] != NOBODY) & (cells.witnessed[slots] > since)
     return np.asarray(spoken.sum(axis=1))

@@ -56,3 +56,26 @@ def test_old_ice_is_no_witness_for_new_ice() -> None:
     alerts.faded(START + 6 * HOUR)
     folded = fusion.fold(observations([6 * 3600.0 + k for k in range(3)], [3, 3, 3], value([0.2, 0.2, 0.2])))
     assert not alerts.folded(folded.slots)
+
+
+def test_what_many_called_dry_takes_three_witnesses() -> None:
+    fusion = Fusion(120.0)
+    alerts = Alerts(fusion)
+    fusion.fold(observations(np.arange(20) * 30.0, np.arange(20), value(np.full(20, 0.85))))
+    raised = []
+    for vehicle in range(8):
+        folded = fusion.fold(observations([900.0 + 10.0 * vehicle], [vehicle], value([0.2])))
+        raised.append(any(alert.raised for alert in alerts.folded(folded.slots)))
+    assert True in raised
+    assert raised.index(True) >= 2
+
+
+def test_an_alert_ends_only_when_grip_is_sure() -> None:
+    fusion, alerts, _ = icy([1, 2, 3])
+    ended = []
+    for vehicle in range(10, 18):
+        folded = fusion.fold(observations([200.0 + 10.0 * vehicle], [vehicle], value([0.85])))
+        ended += alerts.folded(folded.slots)
+    (only,) = ended
+    assert (only.raised, only.reason) == (False, "later visits found grip")
+    assert only.p_slippery < 0.05

@@ -163,7 +163,7 @@ def test_what_is_not_ours_is_counted_and_the_service_goes_on(
 
 
 def test_ice_raises_an_alert_after_few_passes_and_grip_clears_it(fleet: Fleet) -> None:
-    fleet.settle(*(batch(f"sim-{k:03}", 1, now(), [0.85]) for k in range(10)))
+    fleet.settle(*(batch(f"sim-{k:03}", 1, now() - 60 * SECOND, [0.85]) for k in range(10)))
     for passes in range(8):
         fleet.settle(batch(f"sim-{passes:03}", 2, now(), [0.2]))
         if not fleet.alerts.empty():
@@ -173,7 +173,7 @@ def test_ice_raises_an_alert_after_few_passes_and_grip_clears_it(fleet: Fleet) -
     assert (alert.cell, alert.raised) == (CELL, True)
     assert alert.p_slippery > 0.9
     for k in range(10):
-        fleet.settle(batch(f"sim-{k:03}", 3, now(), [0.85]))
+        fleet.settle(batch(f"sim-{100 + k}", 1, now(), [0.85]))
     cleared = fleet.alerts.get(timeout=10.0)
     assert (cleared.cell, cleared.raised, cleared.reason) == (CELL, False, "later visits found grip")
 

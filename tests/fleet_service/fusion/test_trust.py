@@ -1,0 +1,55 @@
+"""Reputation: who is believed, and that talking to each other does not help."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fleet_service.alerts import Alerts
+from fleet_service.fusion import Fusion
+from fleet_service.fusion import constants as c
+from fleet_service.fusion.trust import newcomer
+from tests.fleet_service.examples import belief, observations, slippery, value
+
+HONEST, LIARS = np.arange(20), np.arange(100, 108)
+
+
+def driven(private: int = 0) -> Fusion:
+    """Twenty honest vehicles and eight that agree on .25, in four cells; the eight also in `private` others."""
+    rng, fusion = np.random.default_rng(4), Fusion(120.0)
+    for minute in range(30):
+        who = np.concatenate([rng.choice(HONEST, 12), LIARS, np.repeat(LIARS, private)])
+        cells = np.concatenate([rng.integers(0, 4, 12 + len(LIARS)), 100 + rng.integers(0, 4, private * len(LIARS))])
+        mu = np.where(who < 100, 0.8 + 0.05 * rng.normal(size=len(who)), 0.25)
+        fusion.fold(observations(60.0 * minute + np.sort(rng.random(len(who))), who, value(mu), cell=cells))  # type: ignore[arg-type]
+    return fusion
+
+
+@pytest.mark.parametrize("private", [0, 5])
+def test_a_group_that_agrees_only_with_itself_loses_its_vote_wherever_it_meets(private: int) -> None:
+    fusion = driven(private)
+    assert max(fusion.trust(int(v)) for v in LIARS) < 0.1
+    assert min(fusion.trust(int(v)) for v in HONEST) > 0.8
+
+
+def test_a_newcomer_is_believed_less_once_others_are_known() -> None:
+    assert newcomer(False) == pytest.approx(0.75)
+    assert Fusion(120.0).trust(7) == pytest.approx(newcomer(False))
+    assert driven().trust(999) == pytest.approx(c.NEWCOMER)
+
+
+def test_any_number_of_newcomers_together_has_less_than_two_votes() -> None:
+    fusion = driven()
+    n = 200
+    folded = fusion.fold(observations(1900.0 + np.arange(n), 1000 + np.arange(n), value(np.full(n, 0.2)), cell=1))
+    assert slippery(belief(fusion, cell=1)) < 0.1
+    assert not Alerts(fusion).folded(folded.slots)
+
+
+def test_a_vehicle_that_keeps_changing_its_mind_has_two_votes() -> None:
+    fusion = Fusion(120.0)
+    fusion.fold(observations(np.arange(6) * 10.0, np.arange(6), value(np.full(6, 0.8))))
+    n = 60
+    flips = np.where(np.arange(n) % 2 == 0, 0.1, 1.1)
+    fusion.fold(observations(100.0 + np.arange(n), np.full(n, 50), value(flips)))
+    assert fusion.live.values[0] < 6 * 0.75 + 0.75 * (c.VOTES + 0.2)
