@@ -69,10 +69,12 @@ def write(path: Path, campaign: str, seeds: Sequence[int], figures: Sequence[Fig
 
 def markdown(figures: Sequence[Figure]) -> str:
     """The figures as a Markdown table; a bar that does not hold says so."""
-    signs = {"less": "≤", "more": "≥", "within": ""}
+    signs = {"less": "≤ ", "more": "≥ "}
     lines = ["| figure | value | bar | |", "|---|---|---|---|"]
     for f in figures:
-        bar = "" if f.bar is None else f"{f.bar[0]:g} – {f.bar[1]:g}" if isinstance(f.bar, tuple) else f"{f.bar:g}"
-        verdict = "" if f.bar is None else "holds" if f.holds else "DOES NOT HOLD"
-        lines.append(f"| `{f.name}` | {f.value:.4g} {f.unit} | {signs[f.better]} {bar} | {verdict} |")
+        bar, verdict = "", ""
+        if f.bar is not None:
+            bar = f"{f.bar[0]:g} – {f.bar[1]:g}" if isinstance(f.bar, tuple) else f"{signs[f.better]}{f.bar:g}"
+            verdict = "holds" if f.holds else "DOES NOT HOLD"
+        lines.append(f"| `{f.name}` | {f.value:.4g} {f.unit} | {bar} | {verdict} |")
     return "\n".join(lines)
