@@ -13,6 +13,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+import pyarrow.parquet as pq
+
 from deploy.demo import compare, page, picture, processes
 from deploy.demo.listener import Listener
 from edge_agent.simulation.scenarios import scenario_named
@@ -68,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"{args.vehicles} vehicles drive for {args.duration:.0f} s; after {appears_s:.0f} s an ice patch appears.")
     with processes.system(FOLDER) as (endpoint, _):
         listener, counts = drive(FOLDER, endpoint, args)
-        visits = compare.read_truth(FOLDER / "truth.parquet")
+        visits = pq.read_table(FOLDER / "truth.parquet")
         changed_ns = compare.started(visits) + int(appears_s * 1e9)
         comparison = compare.compare(listener.whole_map(), visits, changed_ns)
         show(FOLDER, endpoint, comparison)

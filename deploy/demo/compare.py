@@ -12,7 +12,6 @@ from pathlib import Path
 import duckdb
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from schemas.figures import Figure
 from schemas.numeric import BoolArray, FloatArray, IntArray
@@ -133,11 +132,6 @@ def archived(archive: Path) -> tuple[int, int, int]:
     found = duckdb.execute(query).fetchone()
     rows, distinct, vehicles = found if found else (0, 0, 0)
     return int(rows), int(distinct), int(vehicles)
-
-
-def read_truth(path: Path) -> pa.Table:
-    """Visits of the simulated vehicles, as the simulator knows them."""
-    return pq.read_table(path)
 
 
 def started(visits: pa.Table) -> int:

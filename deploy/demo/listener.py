@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import threading
 import time
 from dataclasses import dataclass, field
@@ -17,7 +16,7 @@ from schemas.wire import Alert
 
 def read_tile(payload: bytes) -> pa.Table:
     """The cells of one tile."""
-    return pa.ipc.open_stream(io.BytesIO(payload)).read_all()
+    return pa.ipc.open_stream(payload).read_all()
 
 
 @dataclass
