@@ -3,13 +3,13 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: setup demo test check lint types bench tune proto lock clean
+.PHONY: setup demo test check lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test
 
 setup: $(STAMP)  ## make .venv and install everything, pinned
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[demo,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[analytics,certs,demo,dev,metrics]'
 	touch $@
 
 demo: setup  ## router, fleet service and simulated vehicles; ends with the map beside the truth
@@ -25,10 +25,28 @@ lint: setup
 types: setup
 	$(BIN)/mypy
 
-check: lint types test  ## what CI runs
+check: lint types test faults-quick  ## what CI runs
+
+faults: setup  ## the fault campaigns, half an hour; writes .faults/figures.json
+	$(BIN)/python -m tests.faults
+
+faults-quick: setup  ## the same mechanisms in two minutes
+	$(BIN)/python -m tests.faults --quick
+
+soak: setup  ## half an hour of steady load: does anything grow?
+	$(BIN)/python -m tests.faults.soak
 
 bench: setup  ## cost of each part, side by side; writes .bench/figures.json
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[bench]'
 	$(BIN)/python -m tests.benchmarks
+
+analytics-bench: setup  ## archive and analytics on ten million rows, Spark beside; writes .analytics/figures.json
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[spark]'
+	$(BIN)/python -m tests.benchmarks.analytics
+
+spark-test: setup  ## Spark beside DuckDB; installs it, wants a Java
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[spark]'
+	$(BIN)/python -m pytest -q -m long tests/fleet_service/analytics/test_spark.py
 
 tune: setup  ## the ant colony over the memberships; writes the shipped file anew
 	$(BIN)/edge-agent tune --out edge_agent/tuning/tuned/aco-fckf.json
@@ -40,4 +58,4 @@ lock: setup  ## write the installed versions to constraints.txt
 	$(BIN)/python -m pip freeze --exclude-editable --exclude gripmap > constraints.txt
 
 clean:
-	rm -rf .venv .demo .bench build *.egg-info
+	rm -rf .venv .demo .bench .analytics .faults build *.egg-info

@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from edge_agent.estimators import create
+from edge_agent.banks import bank_of
 from edge_agent.observer import Records
 from edge_agent.pipeline import Pipeline
 from edge_agent.simulation import SimulatedFleet
@@ -36,7 +36,7 @@ def drive(vehicles: int, duration_s: float, seed: int, truth: Path) -> Columns:
     """Columns of all observations, with `vehicle`; writes the truth."""
     fleet = SimulatedFleet("demo", vehicles, seed, RATE_HZ)
     config = AgentConfig()
-    pipeline = Pipeline(create(config.estimator, fleet.vehicles), vehicles, config)
+    pipeline = Pipeline(bank_of(config.estimator, fleet.vehicles), vehicles, config)
     recorder = TruthRecorder(tuple(fleet.names))
     parts: list[Records] = []
     for block in range(int(duration_s * RATE_HZ / BLOCK)):

@@ -17,18 +17,19 @@ from edge_agent.sources import Block
 from schemas.wire import Kind
 
 STATUS_EVERY_S = 5.0
-STOPPED_DRAIN_S = 2.0  # a signalled agent is gone within 3 s
+STOPPED_DRAIN_S = 1.7  # a signalled agent is gone within 3 s, with a second for sessions that hang
 ENDED_DRAIN_S = 10.0  # at its own end it may wait for a busy service
 
 
 @dataclass
 class Progress:
-    """How far the loop is: seconds of signals, blocks, blocks that were behind, the longest lag [s]."""
+    """How far the loop is: seconds of signals, blocks, blocks that were behind, the longest and the last lag [s]."""
 
     signals_s: float = 0.0
     blocks: int = 0
     behind: int = 0
     lag_s: float = 0.0
+    now_s: float = 0.0
 
 
 def drive(
@@ -40,9 +41,13 @@ def drive(
     *,
     duration_s: float = float("inf"),
     clock: Callable[[], float] = time.monotonic,
+    progress: Progress | None = None,
 ) -> Progress:
-    """Run until the blocks end, `duration_s` has passed or `stop` is set; then close the open visits."""
-    progress, status_at = Progress(), STATUS_EVERY_S
+    """Run until the blocks end, `duration_s` has passed or `stop` is set; then close the open visits.
+
+    `progress` is kept up to date while it runs, for others to look at, and returned.
+    """
+    progress, status_at = progress or Progress(), STATUS_EVERY_S
     started = first = float("nan")
     for block in blocks:
         _, observations, states = pipeline.step(block)
@@ -54,7 +59,7 @@ def drive(
         progress.blocks += 1
         lag = clock() - started - progress.signals_s
         progress.behind += lag > length
-        progress.lag_s = max(progress.lag_s, lag)
+        progress.lag_s, progress.now_s = max(progress.lag_s, lag), max(lag, 0.0)
         if stop.wait(max(0.0, -lag)) or clock() - started >= duration_s:
             break
         if clock() - started >= status_at:

@@ -45,7 +45,7 @@ class Link:
         settings: ZenohSettings, vehicle: str, on_ack: Callable[[str, bytes], None], stop: threading.Event
     ) -> Link | None:
         """Wait for a router and open the session; None when `stop` was set before."""
-        session = open_session(settings, stop)
+        session = open_session(settings, stop, vehicle)
         return None if session is None else Link(session, vehicle, on_ack)
 
     @property

@@ -28,6 +28,7 @@ TICK_S: Final = 0.05  # how often the sender looks for due batches when nothing 
 QUEUE_LIMIT: Final = 20_000  # blocks of records; many minutes of a disk that does not answer
 WAITING_LIMIT: Final = 10_000  # batches kept in memory while the disk refuses
 RESEND_LIMIT: Final = 64  # batches offered again per round, so that fresh ones are not held up
+LOOK_S: Final = 0.5  # between two looks whether a lost router is back
 CLOSE_GRACE_S: Final = 0.5  # beyond the deadline, for a put or a close that hangs on a frozen router
 
 log = logging.getLogger(__name__)
@@ -63,6 +64,8 @@ class Publisher:
         self._offered: queue.Queue[Records] = queue.Queue(QUEUE_LIMIT)
         self._acks: queue.SimpleQueue[tuple[str, bytes]] = queue.SimpleQueue()
         self._links: dict[str, Link] = {}
+        self._connected: dict[str, bool] = {}
+        self._looked = -float("inf")
         self._waiting: list[Draft] = []
         self._closing, self._gone = threading.Event(), threading.Event()
         self._deadline = float("inf")
@@ -181,9 +184,20 @@ class Publisher:
     def _resend(self) -> None:
         if not self._links:
             return
+        if self._clock() - self._looked >= LOOK_S:
+            self._looked = self._clock()
+            self._hurry()
         for batch in self._spool.due(self._clock(), RESEND_LIMIT):
             link = self._links.get(batch.stream.vehicle)
             self.counts.resent_batches += link is not None and link.put(batch)
+
+    def _hurry(self) -> None:
+        """What was put while there was no router is lost: offer it anew as soon as there is one."""
+        for name, link in list(self._links.items()):
+            connected = link.connected
+            if connected and not self._connected.get(name, True):
+                self._spool.hurry(name, self._clock())
+            self._connected[name] = connected
 
     def _settle(self) -> None:
         while not self._acks.empty():

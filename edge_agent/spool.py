@@ -14,6 +14,7 @@ Time is monotonic seconds and comes in as an argument.
 from __future__ import annotations
 
 import heapq
+import os
 import random
 import secrets
 import sqlite3
@@ -28,6 +29,7 @@ from schemas.wire import Kind
 BOOT_LIMIT = 2**63  # boot fits a signed 64-bit column
 FIRST_RESEND_S = 2.0  # a service writes a segment each second: an answer younger than this is on its way
 LONGEST_RESEND_S = 6.0  # after an outage everything is offered again within this time
+HURRY_S = 1.0  # in which an agent that was cut off offers all that it holds
 JITTER = 0.25  # share of the delay, either way: agents that lost one router do not return in step
 DEFAULT_CAPACITY_BYTES = 256 * 2**20  # some days of one vehicle at a batch per second and kind
 EVICTION_ORDER = (Kind.STATE, Kind.OBSERVATION)  # an old state is worth least, an observation most
@@ -90,6 +92,7 @@ class _Entry:
     records: int
     size: int
     attempts: int = 0
+    due: float = 0.0
 
 
 @dataclass
@@ -124,6 +127,7 @@ class Spool:
         self.counts = SpoolCounts()
         self._random = random.Random(self.boot)
         self._entries: dict[int, _Entry] = {}
+        self._oldest: dict[Kind, dict[int, None]] = {kind: {} for kind in Kind}  # keys in their order
         self._streams: dict[Stream, _Sequence] = {}
         self._later: list[tuple[float, int]] = []
         self._ready: list[int] = []
@@ -144,6 +148,7 @@ class Spool:
 
     def _hold(self, key: int, entry: _Entry) -> None:
         self._entries[key] = entry
+        self._oldest[entry.stream.kind][key] = None
         sequence = self._streams.setdefault(entry.stream, _Sequence())
         sequence.held[entry.seq] = key
         sequence.next = max(sequence.next, entry.seq + 1)
@@ -151,6 +156,7 @@ class Spool:
 
     def _forget(self, key: int) -> _Entry:
         entry = self._entries.pop(key)
+        del self._oldest[entry.stream.kind][key]
         sequence = self._streams[entry.stream]
         del sequence.held[entry.seq]
         if not sequence.held and entry.stream.boot != self.boot:
@@ -210,22 +216,26 @@ class Spool:
         entry = self._entries[key]
         delay = min(max(LONGEST_RESEND_S, self.first_resend_s), self.first_resend_s * 2.0 ** min(entry.attempts, 16))
         entry.attempts += 1
-        heapq.heappush(self._later, (now + delay * self._random.uniform(1 - JITTER, 1 + JITTER), key))
+        self._schedule(key, now + delay * self._random.uniform(1 - JITTER, 1 + JITTER))
+
+    def _schedule(self, key: int, at: float) -> None:
+        """Offer a batch at a time; whatever was planned for it before no longer holds."""
+        self._entries[key].due = at
+        heapq.heappush(self._later, (at, key))
+
+    def hurry(self, vehicle: str, now: float) -> None:
+        """Offer everything of a vehicle anew within HURRY_S, oldest first: it has just found a router again."""
+        keys = [key for key, entry in self._entries.items() if entry.stream.vehicle == vehicle]
+        for place, key in enumerate(keys):
+            self._entries[key].attempts = 0
+            self._schedule(key, now + HURRY_S * (place + self._random.random()) / len(keys))
 
     def _evict(self) -> None:
         """Keep within the capacity: oldest state first, then oldest observation."""
-        gone: list[int] = []
-        excess = self._bytes - self.capacity_bytes
         for kind in EVICTION_ORDER:
-            for key, entry in self._entries.items():
-                if excess <= 0:
-                    break
-                if entry.stream.kind == kind:
-                    gone.append(key)
-                    excess -= entry.size
-        for key in gone:
-            entry = self._forget(key)
-            self.counts.evicted[entry.stream.kind] += entry.records
+            while self._bytes > self.capacity_bytes and self._oldest[kind]:
+                entry = self._forget(next(iter(self._oldest[kind])))
+                self.counts.evicted[kind] += entry.records
 
     def _delete_leaving(self) -> None:
         self._database.executemany("DELETE FROM batch WHERE id = ?", [(key,) for key in self._leaving])
@@ -254,7 +264,9 @@ class Spool:
     def due(self, now: float, limit: int) -> list[Held]:
         """At most `limit` batches whose time to be offered again has come, oldest first; each is postponed."""
         while self._later and self._later[0][0] <= now:
-            heapq.heappush(self._ready, heapq.heappop(self._later)[1])
+            at, key = heapq.heappop(self._later)
+            if key in self._entries and self._entries[key].due == at:
+                heapq.heappush(self._ready, key)
         keys: list[int] = []
         while self._ready and len(keys) < limit:
             key = heapq.heappop(self._ready)
@@ -287,7 +299,7 @@ def _within(held: dict[int, int], first: int, last: int) -> list[int]:
 def _open(path: Path) -> sqlite3.Connection:
     database: sqlite3.Connection | None = None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        _make_folder(path.parent)
         database = sqlite3.connect(path, timeout=0.0, check_same_thread=False)
         database.execute("PRAGMA locking_mode = EXCLUSIVE")
         database.execute("PRAGMA journal_mode = WAL")
@@ -301,3 +313,15 @@ def _open(path: Path) -> sqlite3.Connection:
         problem = f"{path} cannot be opened ({error})"
         raise InputError("spool", problem, "name a writable place, or move the file aside") from error
     return database
+
+
+def _make_folder(folder: Path) -> None:
+    """Make a folder, and the ones above it, such that power loss does not forget them. SQLite syncs the files in it."""
+    if not folder.exists():
+        _make_folder(folder.parent)
+        folder.mkdir(exist_ok=True)
+        handle = os.open(folder.parent, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Iterator
+from typing import Final
 
-from schemas.wire import Batch, Kind, StreamAck, encode_ack
+from schemas.decoding import Head
+from schemas.wire import Kind, StreamAck, encode_ack
 
+# A message is never larger than its receiver reads (wire.MAX_BYTES): 16 streams of 24 refusals of 150 bytes.
+STREAMS_PER_ACK: Final = 16
+ITEMS_PER_STREAM: Final = 24
 _Stream = tuple[int, Kind, int]
 
 
@@ -16,11 +22,11 @@ class Acks:
         self._durable: dict[str, dict[_Stream, set[int]]] = defaultdict(lambda: defaultdict(set))
         self._rejected: dict[str, dict[_Stream, list[tuple[int, int, str]]]] = defaultdict(lambda: defaultdict(list))
 
-    def durable(self, vehicle: str, batch: Batch) -> None:
+    def durable(self, vehicle: str, batch: Head) -> None:
         """The batch is on disk."""
         self._durable[vehicle][batch.boot, batch.kind, batch.region].add(batch.seq)
 
-    def rejected(self, vehicle: str, batch: Batch, row: int, reason: str) -> None:
+    def rejected(self, vehicle: str, batch: Head, row: int, reason: str) -> None:
         """The batch was refused for good."""
         self._rejected[vehicle][batch.boot, batch.kind, batch.region].append((batch.seq, row, reason))
 
@@ -30,13 +36,26 @@ class Acks:
         for vehicle in sorted(self._durable.keys() | self._rejected.keys()):
             durable, rejected = self._durable[vehicle], self._rejected[vehicle]
             streams = [
-                StreamAck(*stream, ranges(durable.get(stream, set())), tuple(rejected.get(stream, ())))
+                part
                 for stream in sorted(durable.keys() | rejected.keys())
+                for part in _parts(stream, ranges(durable.get(stream, set())), tuple(rejected.get(stream, ())))
             ]
-            out.append((vehicle, encode_ack(vehicle, streams)))
+            out += [
+                (vehicle, encode_ack(vehicle, streams[at : at + STREAMS_PER_ACK]))
+                for at in range(0, len(streams), STREAMS_PER_ACK)
+            ]
         self._durable.clear()
         self._rejected.clear()
         return out
+
+
+def _parts(
+    stream: _Stream, durable: tuple[tuple[int, int], ...], rejected: tuple[tuple[int, int, str], ...]
+) -> Iterator[StreamAck]:
+    """What is to be told about a stream, in pieces."""
+    for at in range(0, max(len(durable), len(rejected)), ITEMS_PER_STREAM):
+        some = slice(at, at + ITEMS_PER_STREAM)
+        yield StreamAck(*stream, durable[some], rejected[some])
 
 
 def ranges(numbers: set[int]) -> tuple[tuple[int, int], ...]:

@@ -11,21 +11,24 @@ that a sender reads is the text of the rule.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+import re
+from functools import lru_cache
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas import grid, keys
+from schemas.decoding import Head
 from schemas.errors import InputError
 from schemas.numeric import IntArray
-from schemas.wire import Batch, Columns, Kind
+from schemas.wire import Columns, Kind
 
 BATCH: Final = -1  # row number of a refusal that concerns the batch as a whole
-MAX_AHEAD: Final = 1 << 20  # seqs between watermark and newest: a bitmap of 128 kB; a full spool holds fewer batches
 MAX_VISIT_NS: Final = 86_400_000_000_000  # a car may park in its cell for a day
 YAW_TOLERANCE: Final = np.radians(75.0)  # between yaw and the sector's axis: 45° and what a bend turns in one visit
+ESTIMATOR_PATTERN: Final = r"[a-z0-9][a-z0-9-]{0,63}"
+KEYS_REMEMBERED: Final = 1 << 16  # a vehicle has two; reading one costs as much as all else that is asked of a message
 _TOPIC: Final = {Kind.OBSERVATION: "obs", Kind.STATE: "state"}
 
 
@@ -45,17 +48,18 @@ _POSE: Final = (
     Range("yaw", -1000.0, 1000.0),
 )
 _MU: Final = tuple(Range(name, 0.0, 2.0) for name in ("mu", "mu_lower", "mu_upper"))
+_HEALTH: Final = Range("health", 0, 2**31 - 1)
 RANGES: Final = {
     Kind.OBSERVATION: (
         *_POSE, *_MU,
         Range("mu_utilised", 0.0, 2.0), Range("yaw_std", 0.0, 10.0), Range("speed", 0.0, 100.0),
         Range("sector", 0, grid.SECTORS - 1), Range("tyre_season", 0, 3), Range("abs_active", -1, 1),
-        Range("air_temperature", -90.0, 80.0),
+        Range("air_temperature", -90.0, 80.0), _HEALTH,
     ),
     Kind.STATE: (
         *_POSE, *_MU,
         Range("vx", -100.0, 100.0), Range("vy", -100.0, 100.0), Range("yaw_rate", -20.0, 20.0),
-        Range("sideslip", -4.0, 4.0),
+        Range("sideslip", -4.0, 4.0), _HEALTH,
     ),
 }  # fmt: skip
 
@@ -76,7 +80,7 @@ class Refusal(NamedTuple):
     reason: str
 
 
-def check_identity(parsed: keys.Parsed, batch: Batch) -> Refusal | None:
+def check_identity(parsed: keys.Parsed, batch: Head) -> Refusal | None:
     """Whether the batch is the key owner's, for the key's region, with a usable sequence number."""
     if parsed.topic.name != _TOPIC[batch.kind] or parsed.who != batch.vehicle:
         return Refusal("vehicle", BATCH, "vehicle: is not the one of the key; publish on your own key")
@@ -84,15 +88,24 @@ def check_identity(parsed: keys.Parsed, batch: Batch) -> Refusal | None:
         return Refusal("region", BATCH, "region: is not the one of the key; never let a batch span regions")
     if batch.boot < 0 or not 1 <= batch.first_held <= batch.seq:
         return Refusal("seq", BATCH, "seq: boot >= 0 and 1 <= first_held <= seq do not hold; count from 1 without gaps")
+    if batch.estimator and not _is_estimator(batch.estimator):
+        return Refusal("estimator", BATCH, "estimator: is no name; use up to 64 of a-z, 0-9 and -")
     return None
 
 
+@lru_cache(1024)
+def _is_estimator(name: str) -> bool:
+    return re.fullmatch(ESTIMATOR_PATTERN, name) is not None
+
+
+@lru_cache(KEYS_REMEMBERED)
 def owner_of(key: str) -> keys.Parsed | None:
-    """Whose key this is, and for which region; None if it is no concrete key of ours."""
+    """Whose key this is, and for which region; None if it is no concrete key of a vehicle."""
     try:
-        return keys.parse(key)
+        parsed = keys.parse(key)
     except InputError:
         return None
+    return None if parsed.who is None else parsed
 
 
 def check_rows(kind: Kind, columns: Columns, region: IntArray, clock: Clock) -> tuple[IntArray, tuple[Refusal, ...]]:
@@ -139,11 +152,13 @@ def _broken_observation(columns: Columns, clock: Clock) -> list[tuple[NDArray[np
     with np.errstate(invalid="ignore"):  # an infinite yaw is out of range anyway
         turned = np.cos(columns["yaw"] - columns["sector"] * (np.pi / 2)) < np.cos(YAW_TOLERANCE)
     mu, lower, upper = columns["mu"], columns["mu_lower"], columns["mu_upper"]
+    no_peak = columns["told"] & (columns["log_likelihood"] != 0).all(axis=1)
     return [
         (_untimely(enter, leave, clock), "time", "leave_time: too old or in the future; set the clock"),
         ((leave < enter) | (leave - enter > MAX_VISIT_NS), "time", "leave_time: before or long after enter_time; mend"),
         (elsewhere, "cell", "cell: is not at the pose; use the z21 quadint of latitude and longitude"),
         (turned, "sector", "sector: is not the yaw's; 0 east, 1 north, 2 west, 3 south"),
+        (no_peak, "log_likelihood", "log_likelihood: has no maximum; give steps below it, so that it reads 0"),
         ((lower > mu) | (mu > upper) | (lower > upper), "mu", "mu: not mu_lower <= mu <= mu_upper; correct it"),
     ]  # fmt: skip
 
@@ -155,70 +170,3 @@ def _broken_state(columns: Columns, clock: Clock) -> list[tuple[NDArray[np.bool_
 
 def _untimely(first: IntArray, last: IntArray, clock: Clock) -> NDArray[np.bool_]:
     return (first < clock.now - clock.oldest) | (last > clock.now + clock.ahead)
-
-
-@dataclass
-class Stream:
-    """Which batches of one (vehicle, boot, kind, region) were admitted: watermark and gap bitmap.
-
-    Attributes:
-        low: every seq up to here is settled, or will never come.
-        seen: bit k is set if low + 1 + k was admitted.
-        pending: admitted, not yet on disk.
-    """
-
-    low: int = 0
-    seen: int = 0
-    pending: set[int] = field(default_factory=set)
-
-    def admitted(self, seq: int) -> bool:
-        """Whether this seq was admitted before."""
-        return seq <= self.low or bool(self.seen >> (seq - self.low - 1) & 1)
-
-    def admit(self, seq: int) -> bool:
-        """Note a seq; False if it is too far ahead for the bitmap (not noted)."""
-        if seq - self.low > MAX_AHEAD:
-            return False
-        if seq > self.low:
-            self.seen |= 1 << (seq - self.low - 1)
-            self._close()
-        return True
-
-    def raise_to(self, first_held: int) -> None:
-        """Older than `first_held` never comes."""
-        if first_held - 1 > self.low:
-            self.seen >>= first_held - 1 - self.low
-            self.low = first_held - 1
-        self._close()
-
-    def _close(self) -> None:
-        ones = (~self.seen & (self.seen + 1)).bit_length() - 1  # length of the run of set bits at the bottom
-        self.seen >>= ones
-        self.low += ones
-
-
-StreamKey = tuple[int, int, Kind, int]
-
-
-class Streams:
-    """All streams of one service, by (vehicle number, boot, kind, region)."""
-
-    def __init__(self) -> None:
-        self._streams: dict[StreamKey, Stream] = {}
-
-    def __getitem__(self, key: StreamKey) -> Stream:
-        return self._streams.setdefault(key, Stream())
-
-    def __len__(self) -> int:
-        return len(self._streams)
-
-
-def rows_of(batch: Batch) -> dict[str, Any]:
-    """Columns of a batch with the likelihood always (n, 32), and `told` (n,): whether it was there."""
-    columns: dict[str, Any] = dict(batch.columns)
-    if batch.kind is Kind.OBSERVATION:
-        sent = columns["log_likelihood"]
-        columns["told"] = np.full(batch.rows, sent.shape[1] > 0)
-        if not sent.shape[1]:
-            columns["log_likelihood"] = np.zeros((batch.rows, 32), np.uint8)
-    return columns

@@ -24,9 +24,9 @@ def borrowed(fusion: Fusion, tile: int, slots: IntArray, route: tuple[IntArray, 
     Belief: half the prior, half the mean of the visited neighbours. `vehicles` is the least of theirs, so that a
     borrowed value is never more public than what it was made from; times are the newest and oldest of theirs.
     """
-    beside = grid.neighbours(fusion.cell[slots]).reshape(-1)
+    beside = grid.neighbours(fusion.live.key[slots] // grid.SECTORS).reshape(-1)
     lender = np.repeat(slots, 8)
-    sector = fusion.sector[lender].astype(np.int64)
+    sector = fusion.live.key[lender] % grid.SECTORS
     free = (beside >= 0) & (grid.tile_of(beside) == tile) & (fusion.slots_of(np.maximum(beside, 0), sector) < 0)
     keys, lender = (beside * grid.SECTORS + sector)[free], lender[free]
     if route is not None:

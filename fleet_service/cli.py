@@ -1,4 +1,4 @@
-"""`fleet-service run | query | watch | evaluate`.
+"""`fleet-service run | query | watch | compact | certs | evaluate`.
 
 Heavy imports wait until a command needs them, so that help comes at once.
 """
@@ -6,13 +6,20 @@ Heavy imports wait until a command needs them, so that help comes at once.
 from __future__ import annotations
 
 import argparse
+import os
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from fleet_service.analytics import cli as analytics_cli
+from fleet_service.archive import cli as archive_cli
+from fleet_service.enrolment import command
 from schemas.errors import InputError
+from schemas.operator import log_as, teller
+
+LEAVE_AT_LAST_S = 2.7  # after a signal; the process is to be gone within 3 s
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -39,6 +46,7 @@ def _parser() -> argparse.ArgumentParser:
     run = commands.add_parser("run", help="take observations in, serve the map, keep the archive")
     run.add_argument("--config", metavar="FILE", help="JSON; every setting has a default")
     run.add_argument("--archive", metavar="DIR", type=Path, required=True, help="one service per archive")
+    run.add_argument("--weather", metavar="FILE", type=Path, help="Parquet of road weather to begin with")
     run.set_defaults(command=_run)
 
     query = commands.add_parser("query", help="ask the map once")
@@ -56,6 +64,10 @@ def _parser() -> argparse.ArgumentParser:
     watch.add_argument("--bbox", metavar="W,S,E,N", help="only tiles that touch this box")
     _connection(watch)
     watch.set_defaults(command=_watch)
+
+    archive_cli.add_commands(commands)
+    analytics_cli.add_command(commands)
+    command.add_command(commands)
 
     evaluate = commands.add_parser("evaluate", help="simulated fleets, beside truth and simple rules")
     evaluate.add_argument("--out", metavar="DIR", type=Path, required=True, help="figures, table and plots go there")
@@ -76,13 +88,31 @@ def _run(arguments: argparse.Namespace) -> int:
 
     stop = stop_on_signals()
     config = load(arguments.config, ServiceConfig)
+    log_as(config.log, sys.stderr, service=config.name)
+    if arguments.weather is not None:
+        config = config.model_copy(update={"weather": arguments.weather})
     try:
-        service = Service(config, arguments.archive, lambda line: print(line, flush=True))
+        say = teller(config.log, sys.stdout, service=config.name)
+        service = Service(config, arguments.archive, say)
     except OSError as error:
         problem = f"cannot use {error.filename} ({error.strerror})"
         raise InputError("archive", problem, "give a folder you may read and write") from error
+    gone = threading.Event()
+    threading.Thread(target=_leave_at_last, args=(stop, gone, say), daemon=True).start()
     service.run(stop)
+    gone.set()
     return 0
+
+
+def _leave_at_last(stop: threading.Event, gone: threading.Event, say: Callable[[str], None]) -> None:
+    """A session that hangs on a frozen router, or a long compaction, must not keep a stopped service.
+
+    Whatever it was doing may end at any instant: what is not acknowledged its senders keep.
+    """
+    stop.wait()
+    if not gone.wait(LEAVE_AT_LAST_S):
+        say("left at last: a session or a job did not end in time")
+        os._exit(0)
 
 
 def _query(arguments: argparse.Namespace) -> int:

@@ -16,6 +16,7 @@ from schemas import grid, keys, query, tables, transport, wire
 from schemas.config import ServiceConfig, ZenohSettings, load
 from schemas.errors import InputError
 from schemas.query import Format
+from schemas.tiles import decode_tile
 
 TIMEOUT_S: Final = 10.0
 SHOWN: Final = ("latitude", "longitude", "sector", "mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehicles",
@@ -65,7 +66,7 @@ def _session(connection: ZenohSettings) -> zenoh.Session:
 
 def _joined(form: Format, payloads: list[bytes]) -> Answer:
     if form is Format.ARROW:
-        parts = [pa.ipc.open_stream(payload).read_all() for payload in payloads]
+        parts = [decode_tile(payload) for payload in payloads]
         return Answer(pa.concat_tables(parts) if parts else tables.MAP_SCHEMA.empty_table(), None)
     documents = [json.loads(payload) for payload in payloads]
     if form is Format.JSON:
@@ -125,7 +126,7 @@ def watch(connection: ZenohSettings, bbox: str | None, stop: threading.Event, sa
     def changed(sample: zenoh.Sample) -> None:
         tile = near(str(sample.key_expr))
         if tile is not None:
-            say(_tile_line(tile, pa.ipc.open_stream(sample.payload.to_bytes()).read_all()))
+            say(_tile_line(tile, decode_tile(sample.payload.to_bytes())))
 
     def alerted(sample: zenoh.Sample) -> None:
         if near(str(sample.key_expr)) is not None:
@@ -137,6 +138,10 @@ def watch(connection: ZenohSettings, bbox: str | None, stop: threading.Event, sa
     with session:
         session.declare_subscriber(f"{keys.ROOT}/map/**", changed)
         session.declare_subscriber(f"{keys.ROOT}/alert/**", alerted)
+        for reply in session.get(f"{keys.ROOT}/alert/**"):  # after the subscription: none is missed in between
+            if reply.ok is not None and near(str(reply.ok.key_expr)) is not None:
+                for alert in wire.decode_standing(reply.ok.payload.to_bytes()):
+                    say(_alert_line(alert))
         say("watching")
         stop.wait()
 

@@ -7,21 +7,29 @@ it is not acknowledged, so that its sender keeps it and sends it again: that is 
 from __future__ import annotations
 
 import queue
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from itertools import compress
+from typing import Final, NamedTuple
 
 import numpy as np
 import zenoh
 
 from fleet_service import admit
 from fleet_service.acks import Acks
-from fleet_service.admit import Clock, Refusal, StreamKey, Streams
+from fleet_service.admit import Clock, Refusal
 from fleet_service.archive.pseudonyms import Pseudonyms, number
-from fleet_service.archive.segments import Rows
-from schemas.errors import WireError
+from fleet_service.archive.segments import Rows, stepped
+from fleet_service.limits import Limits
+from fleet_service.streams import StreamKey, Streams
+from schemas import keys
+from schemas.decoding import Decoded, Head, decode_many
 from schemas.grid import cell_of
-from schemas.wire import Batch, Kind, decode
+from schemas.numeric import IntArray
+from schemas.wire import Kind
+
+FIRST_TIME: Final = {Kind.OBSERVATION: "enter_time", Kind.STATE: "time"}  # by which a batch is too old
+FORGET_NS: Final = 600 * 10**9  # between two looks for streams too old to matter
 
 
 class Message(NamedTuple):
@@ -39,18 +47,20 @@ class Inbox:
     Args:
         capacity: messages at the most.
         counts: where drops are counted, under `overload`.
+        limits: who may send how much.
     """
 
-    def __init__(self, capacity: int, counts: Counter[str]) -> None:
+    def __init__(self, capacity: int, counts: Counter[str], limits: Limits) -> None:
         self._queue: queue.Queue[Message] = queue.Queue(capacity)
-        self._counts = counts
+        self._counts, self._limits = counts, limits
 
     def callback(self, kind: Kind) -> Callable[[zenoh.Sample], None]:
         """The subscriber's callback for one kind."""
 
         def take(sample: zenoh.Sample) -> None:
-            if sample.kind == zenoh.SampleKind.PUT:
-                self.put(Message(kind, str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding)))
+            key = str(sample.key_expr)
+            if sample.kind == zenoh.SampleKind.PUT and self._limits.lets(key, len(sample.payload)):
+                self.put(Message(kind, key, sample.payload.to_bytes(), str(sample.encoding)))
 
         return take
 
@@ -77,11 +87,13 @@ class Inbox:
 
 
 class Candidate(NamedTuple):
-    """A decoded batch that is new."""
+    """A decoded batch that is new: its sender, its stream, what it says of itself, and the time of its first record."""
 
     vehicle: str
     pseudonym: str
-    batch: Batch
+    stream: StreamKey
+    head: Head
+    time: int
 
 
 class Admitted(NamedTuple):
@@ -92,7 +104,7 @@ class Admitted(NamedTuple):
 
 
 class Intake:
-    """Decodes, asks the questions of `admit`, counts and settles refusals.
+    """Decodes, asks the questions of `admit`, counts and settles refusals. Python is touched per message, not per row.
 
     Args:
         streams: what was admitted before; is brought up to date.
@@ -103,124 +115,132 @@ class Intake:
 
     def __init__(self, streams: Streams, pseudonyms: Pseudonyms, counts: Counter[str], acks: Acks) -> None:
         self._streams, self._pseudonyms, self._counts, self._acks = streams, pseudonyms, counts, acks
+        self._pending: set[tuple[StreamKey, int]] = set()  # admitted, not yet on disk
+        self._forgot = 0
 
     def admit(self, messages: Sequence[Message], clock: Clock) -> dict[Kind, Admitted]:
         """Rows of the good and new batches, by kind."""
-        fresh: dict[Kind, dict[tuple[StreamKey, int], Candidate]] = defaultdict(dict)
-        for message in messages:
-            candidate = self._candidate(message, clock)
-            if candidate is not None:
-                batch = candidate.batch
-                if fresh[batch.kind].setdefault((self._stream(candidate), batch.seq), candidate) is not candidate:
-                    self._counts["duplicates"] += 1
-        return {kind: self._rows(kind, list(found.values()), clock) for kind, found in fresh.items() if found}
+        if clock.now - self._forgot > FORGET_NS:
+            self._forgot = clock.now
+            self._streams.forget(clock.now - clock.oldest)
+        out = {}
+        for kind in Kind:
+            ours = [m for m in messages if m.kind is kind]
+            if ours and (admitted := self._admit(kind, ours, clock)).candidates:
+                out[kind] = admitted
+        return out
 
     def settled(self, candidates: Sequence[Candidate]) -> None:
         """The candidates' rows are on disk: acknowledge them."""
         for candidate in candidates:
-            self._streams[self._stream(candidate)].pending.discard(candidate.batch.seq)
-            self._acks.durable(candidate.vehicle, candidate.batch)
+            self._pending.discard((candidate.stream, candidate.head.seq))
+            self._acks.durable(candidate.vehicle, candidate.head)
 
-    @staticmethod
-    def _stream(candidate: Candidate) -> StreamKey:
-        batch = candidate.batch
-        return number(candidate.pseudonym), batch.boot, batch.kind, batch.region
-
-    def _candidate(self, message: Message, clock: Clock) -> Candidate | None:
-        owner = admit.owner_of(message.key)
-        if owner is None or owner.who is None:
-            self._count("key")
-            return None
-        try:
-            batch = decode(message.payload, message.encoding, message.kind)
-        except WireError as error:
+    def _admit(self, kind: Kind, messages: list[Message], clock: Clock) -> Admitted:
+        owners = [admit.owner_of(message.key) for message in messages]
+        self._count("key", owners.count(None))
+        known = [at for at, owner in enumerate(owners) if owner is not None]
+        found = decode_many(kind, [(messages[at].payload, messages[at].encoding) for at in known])
+        for _, error in found.errors:
             self._count(error.field)
-            return None
-        vehicle, refusal = owner.who, admit.check_identity(owner, batch) or _untimely(batch, clock)
+        starts = np.cumsum(found.sizes) - found.sizes
+        times: list[int] = found.columns[FIRST_TIME[kind]][starts].tolist()
+        candidates: dict[tuple[StreamKey, int], Candidate] = {}
+        chosen: list[int] = []
+        for at, (place, head, time) in enumerate(zip(found.places, found.heads, times, strict=True)):
+            candidate = self._candidate(owners[known[place]], head, time, clock)
+            if candidate is not None:
+                if candidates.setdefault((candidate.stream, head.seq), candidate) is candidate:
+                    chosen.append(at)
+                else:
+                    self._counts["duplicates"] += 1
+        return self._rows(kind, list(candidates.values()), found, chosen, clock)
+
+    def _candidate(self, owner: keys.Parsed | None, head: Head, time: int, clock: Clock) -> Candidate | None:
+        assert owner is not None
+        assert owner.who is not None
+        refusal = admit.check_identity(owner, head)
+        if refusal is None and not clock.now - clock.oldest <= time <= clock.now + clock.ahead:
+            refusal = Refusal("time", 0, "time: too old or in the future; set the clock")
         if refusal is not None:
-            self._refuse(vehicle, batch, refusal)
+            self._refuse(owner.who, head, refusal)
             return None
         try:
-            pseudonym = self._pseudonyms.of(vehicle, _time(batch))
+            pseudonym = self._pseudonyms.of(owner.who, time)
         except OSError:  # no key, no row: the sender keeps the batch until the disk is well again
             self._counts["key_failures"] += 1
             return None
-        candidate = Candidate(vehicle, pseudonym, batch)
-        stream = self._streams[self._stream(candidate)]
-        stream.raise_to(batch.first_held)
-        if stream.admitted(batch.seq):
+        name = (number(pseudonym), head.boot, head.kind, head.region)
+        stream = self._streams[name]
+        stream.raise_to(head.first_held)
+        if stream.admitted(head.seq):
             self._counts["duplicates"] += 1
-            if batch.seq not in stream.pending:
-                self._acks.durable(vehicle, batch)
+            if (name, head.seq) not in self._pending:
+                self._acks.durable(owner.who, head)
             return None
-        return candidate
+        return Candidate(owner.who, pseudonym, name, head, time)
 
-    def _rows(self, kind: Kind, candidates: list[Candidate], clock: Clock) -> Admitted:
-        columns = [admit.rows_of(c.batch) for c in candidates]
-        sizes = np.array([c.batch.rows for c in candidates])
-        rows: Rows = {name: np.concatenate([column[name] for column in columns]) for name in columns[0]}
+    def _rows(
+        self, kind: Kind, candidates: list[Candidate], found: Decoded, chosen: list[int], clock: Clock
+    ) -> Admitted:
+        rows, sizes = _chosen(found, chosen)
         owner = np.repeat(np.arange(len(candidates)), sizes)
-        rows["region"] = np.array([c.batch.region for c in candidates], np.int64)[owner]
+        rows["region"] = np.array([c.head.region for c in candidates], np.int64)[owner]
         broken, rules = admit.check_rows(kind, rows, rows["region"], clock)
-        starts = np.cumsum(sizes) - sizes
-        rows["row"] = (np.arange(len(owner)) - starts[owner]).astype(np.int32)
+        rows["row"] = (np.arange(len(owner)) - (np.cumsum(sizes) - sizes)[owner]).astype(np.int32)
         bad: set[int] = set()
         for index in np.flatnonzero(broken >= 0).tolist():  # only refused rows are visited one by one
             if int(owner[index]) not in bad:
                 bad.add(int(owner[index]))
                 refusal = rules[broken[index]]._replace(row=int(rows["row"][index]))
-                self._refuse(candidates[owner[index]].vehicle, candidates[owner[index]].batch, refusal)
-        for place, candidate in enumerate(candidates):
-            if place not in bad and not self._note(candidate):
-                bad.add(place)
-        return self._kept(kind, candidates, rows, owner, bad, clock)
+                self._refuse(candidates[owner[index]].vehicle, candidates[owner[index]].head, refusal)
+        bad.update(place for place, c in enumerate(candidates) if place not in bad and not self._note(c))
+        if bad:
+            good = np.array([place not in bad for place in range(len(candidates))], bool)
+            rows = {name: column[good[owner]] for name, column in rows.items()}
+            candidates, sizes = list(compress(candidates, good)), sizes[good]
+        return Admitted(candidates, _named(kind, candidates, rows, sizes, clock))
 
     def _note(self, candidate: Candidate) -> bool:
-        stream, batch = self._streams[self._stream(candidate)], candidate.batch
-        if not stream.admit(batch.seq):
-            reason = "seq: too far beyond first_held; settle older batches first"
-            self._refuse(candidate.vehicle, batch, Refusal("seq", admit.BATCH, reason))
+        """Whether there is room to remember the batch; without, it is not acknowledged: older ones must come first."""
+        seq = candidate.head.seq
+        if not self._streams[candidate.stream].admit(seq, candidate.time):
+            self._counts["too_many_gaps"] += 1
             return False
-        stream.pending.add(batch.seq)
+        self._pending.add((candidate.stream, seq))
         return True
 
-    def _kept(
-        self,
-        kind: Kind,
-        candidates: list[Candidate],
-        rows: Rows,
-        owner: np.ndarray[Any, Any],
-        bad: set[int],
-        clock: Clock,
-    ) -> Admitted:
-        batches = [c.batch for c in candidates]
-        rows["vehicle"] = np.array([c.pseudonym for c in candidates])[owner]
-        rows["vehicle_number"] = np.array([number(c.pseudonym) for c in candidates], np.int64)[owner]
-        rows["estimator"] = np.array([b.estimator[:64] for b in batches])[owner]
-        for name in ("boot", "seq", "first_held"):
-            rows[name] = np.array([getattr(b, name) for b in batches], np.int64)[owner]
-        rows["received_at"] = np.full(len(owner), clock.now, np.int64)
-        if bad:
-            good = ~np.isin(owner, list(bad))
-            rows = {name: column[good] for name, column in rows.items()}
-        if kind is Kind.STATE:
-            rows["cell"] = cell_of(rows["latitude"], rows["longitude"])
-        return Admitted([c for place, c in enumerate(candidates) if place not in bad], rows)
-
-    def _refuse(self, vehicle: str, batch: Batch, refusal: Refusal) -> None:
+    def _refuse(self, vehicle: str, head: Head, refusal: Refusal) -> None:
         if refusal.rule != "vehicle":  # else the name in the batch is not the sender's, and nor is the stream
-            self._acks.rejected(vehicle, batch, refusal.row, refusal.reason)
+            self._acks.rejected(vehicle, head, refusal.row, refusal.reason)
         self._count(refusal.rule)
 
-    def _count(self, rule: str) -> None:
-        self._counts[f"refused.{rule}"] += 1
+    def _count(self, rule: str, times: int = 1) -> None:
+        if times:
+            self._counts[f"refused.{rule}"] += times
 
 
-def _time(batch: Batch) -> int:
-    return int(batch.columns["enter_time" if batch.kind is Kind.OBSERVATION else "time"][0])
+def _chosen(found: Decoded, chosen: list[int]) -> tuple[Rows, IntArray]:
+    """Rows of the chosen batches, and the sizes of these."""
+    rows: Rows = {**found.columns, "told": found.told}
+    if len(chosen) == len(found.sizes):
+        return rows, found.sizes
+    kept = np.zeros(len(found.sizes), bool)
+    kept[chosen] = True
+    mine = np.repeat(kept, found.sizes)
+    return {name: column[mine] for name, column in rows.items()}, found.sizes[kept]
 
 
-def _untimely(batch: Batch, clock: Clock) -> Refusal | None:
-    if clock.now - clock.oldest <= _time(batch) <= clock.now + clock.ahead:
-        return None
-    return Refusal("time", 0, "time: too old or in the future; set the clock")
+def _named(kind: Kind, candidates: list[Candidate], rows: Rows, sizes: IntArray, clock: Clock) -> Rows:
+    """Rows with what their batches say of themselves, as the archive wants them."""
+    owner = np.repeat(np.arange(len(candidates)), sizes)
+    heads = [c.head for c in candidates]
+    rows["vehicle"] = np.array([c.pseudonym for c in candidates], np.str_)[owner]
+    rows["vehicle_number"] = np.array([c.stream[0] for c in candidates], np.int64)[owner]
+    rows["estimator"] = np.array([head.estimator[:64] for head in heads], np.str_)[owner]
+    for name in ("boot", "seq", "first_held"):
+        rows[name] = np.array([getattr(head, name) for head in heads], np.int64)[owner]
+    rows["received_at"] = np.full(len(owner), clock.now, np.int64)
+    if kind is Kind.STATE:
+        rows["cell"] = cell_of(rows["latitude"], rows["longitude"])
+    return stepped(rows)

@@ -14,6 +14,7 @@ from fleet_service.fusion.belief import SLIPPERY_SHARE
 from schemas import grid, mugrid, tables
 from schemas.numeric import Float32Array, FloatArray, IntArray
 
+CountArray = NDArray[np.integer[Any]]
 LOWER, UPPER = 0.05, 0.95  # of the interval
 GRAVITY: Final = 9.81  # [m/s²]
 PRIOR_UPPER: Final = float(mugrid.quantiles(mugrid.PRIOR, UPPER))
@@ -22,6 +23,7 @@ PRIOR_WIDTH: Final = PRIOR_UPPER - float(mugrid.quantiles(mugrid.PRIOR, LOWER))
 # the interval; else all that is known is a lower bound.
 MEASURED_DROP: Final = 0.02
 MEASURED_WIDTH: Final = 0.5
+PARTS: Final = 32  # of a tile's index before they are joined: each costs as much as thirty slots
 
 
 class MapState:
@@ -33,14 +35,16 @@ class MapState:
 
     def __init__(self, fusion: Fusion) -> None:
         self.fusion = fusion
-        self._slots: dict[int, list[int]] = defaultdict(list)
+        self._slots: dict[int, list[NDArray[np.int32]]] = defaultdict(
+            list
+        )  # in parts, which are joined when they are asked for
         self._indexed = 0
         self._dirty: set[int] = set()
 
     def changed(self, slots: IntArray) -> None:
         """Note cells that were folded into."""
         self._index()
-        self._dirty.update(np.unique(grid.tile_of(self.fusion.cell[slots])).tolist())
+        self._dirty.update(np.unique(tile_of(self.fusion, slots)).tolist())
 
     def take_dirty(self) -> list[int]:
         """Tiles that changed since the last call."""
@@ -55,13 +59,30 @@ class MapState:
     def slots(self, tile: int) -> IntArray:
         """Slots of a tile, in the order in which they were first visited."""
         self._index()
-        return np.array(self._slots.get(tile, []), np.int64)
+        if tile not in self._slots:
+            return np.zeros(0, np.int64)
+        parts = self._slots[tile]
+        parts[:] = [np.concatenate(parts)]
+        return parts[0].astype(np.int64)
 
     def _index(self) -> None:
-        new = self.fusion.cell[self._indexed : self.fusion.size]
-        for slot, tile in enumerate(grid.tile_of(new).tolist(), self._indexed):
-            self._slots[tile].append(slot)
+        if self._indexed == self.fusion.size:
+            return
+        new = np.arange(self._indexed, self.fusion.size)
+        tiles = tile_of(self.fusion, new)
+        order = np.argsort(tiles, kind="stable")
+        names, begin = np.unique(tiles[order], return_index=True)
+        for tile, part in zip(names.tolist(), np.split(new[order].astype(np.int32), begin[1:]), strict=True):
+            parts = self._slots[tile]
+            parts.append(part)
+            if len(parts) > PARTS:
+                parts[:] = [np.concatenate(parts)]
         self._indexed = self.fusion.size
+
+
+def tile_of(fusion: Fusion, slots: IntArray) -> IntArray:
+    """Tile of each slot."""
+    return grid.tile_of(fusion.live.key[slots] // grid.SECTORS)
 
 
 def basis_of(belief: FloatArray, values: Float32Array) -> list[str]:
@@ -75,15 +96,16 @@ def basis_of(belief: FloatArray, values: Float32Array) -> list[str]:
 def cell_table(fusion: Fusion, slots: IntArray, now: int) -> pa.Table:
     """The cells of `slots` as they are believed at `now` [ns], in the schema of the map."""
     belief, live = fusion.beliefs(slots, now), fusion.live
+    key = live.key[slots]
     return map_table(
-        fusion.cell[slots], fusion.sector[slots], belief, basis_of(belief, live.values[slots]), live.vehicles[slots],
+        key // grid.SECTORS, key % grid.SECTORS, belief, basis_of(belief, live.values[slots]), live.vehicles[slots],
         live.visits[slots], live.first[slots], live.time[slots], now,
     )  # fmt: skip
 
 
 def map_table(
-    cell: IntArray, sector: IntArray | NDArray[np.int8], belief: FloatArray, basis: list[str], vehicles: IntArray,
-    observations: IntArray, first: IntArray, last: IntArray, now: int,
+    cell: IntArray, sector: IntArray, belief: FloatArray, basis: list[str], vehicles: CountArray,
+    observations: CountArray, first: IntArray, last: IntArray, now: int,
 ) -> pa.Table:  # fmt: skip
     """Columns (k,) and beliefs (k, 32) as a table of the map."""
     latitude, longitude = grid.centre(cell)

@@ -10,25 +10,34 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Final
 
 import zenoh
 
+from fleet_service.clock import SteadyClock
 from fleet_service.engine import Engine
+from fleet_service.enrolment.fleet import Enrolment
+from fleet_service.gauges import Pulse, metrics, troubles
 from fleet_service.ingest import Inbox, Message
-from schemas import grid, keys, query, transport, wire
-from schemas.config import ServiceConfig
-from schemas.errors import InputError
+from fleet_service.limits import Limits
+from fleet_service.replies import Replies
+from fleet_service.upkeep import archive_jobs, upkeep
+from fleet_service.weather import Heard
+from schemas import grid, keys, transport, wire
+from schemas.config import ServiceConfig, load
+from schemas.monitor import serving
+from schemas.operator import Line
+from schemas.query import MapQuery
 from schemas.wire import Alert, Kind
 
 MESSAGES_PER_TURN: Final = 4096  # so that a flood does not delay alerts, segments and tiles by more than a moment
 IDLE_S: Final = 0.05  # longest wait for a message; bounds how late a segment or a tile can be
 STATUS_S: Final = 5.0
 LEAVE_S: Final = 1.5  # of the three seconds in which a service is gone
-TEXT: Final = "text/plain"
+LAG_S: Final = 1.0  # of the system's clock that is worth telling
 
 
 class Service:
@@ -44,27 +53,51 @@ class Service:
     """
 
     def __init__(self, config: ServiceConfig, root: Path, say: Callable[[str], None]) -> None:
-        self._config, self._say = config, say
+        self._config, self._root, self._say = config, root, say
+        known = None if config.fleet is None else set(load(config.fleet, Enrolment).vehicles)
         self.engine = Engine(config, root)
-        self.inbox = Inbox(config.queue_batches, self.engine.counts)
-        self._put_at = self._flushed_at = self._said_at = time.monotonic()
+        self._clock = SteadyClock(self.engine.seen)
+        limits = Limits(config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, known, self.engine.counts)
+        self._replies = Replies(self._answer, self.engine.counts)
+        self.inbox = Inbox(config.queue_batches, self.engine.counts, limits)
+        self._session: zenoh.Session | None = None
+        self._turned_at = self._put_at = self._flushed_at = self._said_at = time.monotonic()
         self._said = 0
 
     def run(self, stop: threading.Event) -> None:
         """Serve until `stop` is set; then flush, acknowledge and leave."""
-        session = transport.open_session(self._config.zenoh, stop)
-        if session is None:
-            self.engine.close()
-            return
         try:
-            with session, self._declared(session):
-                fusion = self.engine.fusion
-                self._say(f"ready: {self._config.name}, {fusion.size} cells from the archive")
-                while not stop.is_set():
-                    self._turn(session, stop)
-                self._leave(session)
+            with self._seen() as address:
+                session = transport.open_session(self._config.zenoh, stop, self._config.name)
+                if session is not None:
+                    self._serve(session, stop, f", {address}" if address else "")
         finally:
             self.engine.close()
+
+    def _serve(self, session: zenoh.Session, stop: threading.Event, address: str) -> None:
+        with (
+            session,
+            upkeep(archive_jobs(self.engine, self._config, self._root), self.engine.counts, self._say),
+            self._declared(session),
+        ):
+            self._session = session
+            self._say(f"ready: {self._config.name}, {self.engine.fusion.size} cells from the archive{address}")
+            while not stop.is_set():
+                self._turn(session, stop)
+            self._leave(session)
+
+    def _seen(self) -> AbstractContextManager[str | None]:
+        """Metrics and health, where the settings want them."""
+        config, engine, root = self._config, self.engine, self._root
+
+        def pulse() -> Pulse:
+            routers = len(list(self._session.info.routers_zid())) if self._session else 0
+            return Pulse(time.monotonic() - self._turned_at, len(self.inbox), routers, self._clock.lag() * 1e-9)
+
+        return serving(
+            config.metrics_host, config.metrics_port,
+            lambda: metrics(engine, pulse(), config, root), lambda: troubles(engine, pulse(), config),
+        )  # fmt: skip
 
     @contextmanager
     def _declared(self, session: zenoh.Session) -> Iterator[None]:
@@ -75,8 +108,13 @@ class Service:
             for kind in Kind
             for region in regions
         ]
+        inputs += [session.declare_subscriber(f"{keys.ROOT}/weather/{region}", self._weather) for region in regions]
         queryables = [
-            session.declare_queryable(f"{keys.ROOT}/map/{region}/*", self._reply, complete=True) for region in regions
+            session.declare_queryable(f"{keys.ROOT}/map/{region}/*", self._replies, complete=True) for region in regions
+        ]
+        queryables += [
+            session.declare_queryable(f"{keys.ROOT}/alert/{region}/*", self._standing, complete=True)
+            for region in regions
         ]
         try:
             yield
@@ -87,18 +125,33 @@ class Service:
                 queryable.undeclare()
             token.undeclare()
 
+    def _standing(self, asked: zenoh.Query) -> None:
+        """Tell who came late which alerts stand."""
+        expression = asked.key_expr
+        with asked:
+            for tile, alerts in self.engine.standing(
+                lambda tile: expression.intersects(zenoh.KeyExpr(keys.alert_key(tile)))
+            ):
+                asked.reply(keys.alert_key(tile), alerts, encoding=wire.STANDING_ENCODING)
+
+    def _weather(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            heard = Heard(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding))
+            self.engine.weather.hear(heard)
+
     def _turn(self, session: zenoh.Session, stop: threading.Event) -> None:
         if self.engine.full:
             stop.wait(IDLE_S)
         else:
             self._take(session, self.inbox.drain(IDLE_S, MESSAGES_PER_TURN))
-        now = time.monotonic()
+        now = self._turned_at = time.monotonic()
         if now - self._flushed_at >= self._config.segment_s:
             self._flushed_at = now
             self._settle(session)
+            self.engine.overcast(self._clock.now())
         if now - self._put_at >= self._config.put_s:
             self._put_at = now
-            self._put_alerts(session, self.engine.fading(time.time_ns()))
+            self._put_alerts(session, self.engine.fading(self._clock.now()))
             self._put_tiles(session)
         if now - self._said_at >= STATUS_S:
             self._status(now)
@@ -117,14 +170,14 @@ class Service:
 
     def _take(self, session: zenoh.Session, messages: list[Message]) -> None:
         if messages:
-            self._put_alerts(session, self.engine.take(messages, time.time_ns()))
+            self._put_alerts(session, self.engine.take(messages, self._clock.now(), self._clock.slack()))
 
     def _settle(self, session: zenoh.Session) -> None:
         for vehicle, ack in self.engine.flush():
             put(session, keys.ack_key(vehicle), ack, wire.ACK_ENCODING)
 
     def _put_tiles(self, session: zenoh.Session) -> None:
-        for tile, stream in self.engine.tiles(time.time_ns()):
+        for tile, stream in self.engine.tiles(self._clock.now()):
             put(session, keys.map_key(tile), stream, wire.ARROW)
 
     def _put_alerts(self, session: zenoh.Session, alerts: list[Alert]) -> None:
@@ -135,28 +188,18 @@ class Service:
         counts = self.engine.counts
         rate = (counts[Kind.OBSERVATION] - self._said) / max(now - self._said_at, 1e-9)
         self._said_at, self._said = now, counts[Kind.OBSERVATION]
+        behind = self._clock.lag() * 1e-9
         rest = ", ".join(f"{name} {n}" for name, n in sorted(counts.items()) if n and name not in set(Kind))
-        self._say(
+        text = (
             f"status: {counts[Kind.OBSERVATION]} observations ({rate:.0f}/s), {counts[Kind.STATE]} states, "
             f"{self.engine.fusion.size} cells, {self.engine.alerts} alerts, queue {len(self.inbox)}"
             + (f"; {rest}" if rest else "")
+            + (f"; the system's clock is {behind:.0f} s behind" if behind >= LAG_S else "")
         )
+        self._say(Line(text, cells=self.engine.fusion.size, queue=len(self.inbox), counts=dict(counts)))
 
-    def _reply(self, asked: zenoh.Query) -> None:
-        with asked:
-            try:
-                pairs: Iterable[tuple[str, str]] = asked.parameters  # type: ignore[assignment] # stub: no iterable
-                wanted = query.parse({name: value for name, value in pairs if not name.startswith("_")})  # Zenoh's own
-                expression = asked.key_expr
-                tiles = self.engine.answer(
-                    wanted, lambda tile: expression.intersects(zenoh.KeyExpr(keys.map_key(tile))), time.time_ns()
-                )
-            except InputError as error:
-                self.engine.counts["bad_queries"] += 1
-                asked.reply_err(str(error), encoding=TEXT)
-                return
-            for tile, payload in tiles:
-                asked.reply(keys.map_key(tile), payload, encoding=wanted.format.encoding)
+    def _answer(self, wanted: MapQuery, near: Callable[[int], bool]) -> list[tuple[int, bytes]]:
+        return self.engine.answer(wanted, near, self._clock.now())
 
 
 def put(session: zenoh.Session, key: str, payload: bytes, encoding: str) -> None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from schemas.errors import InputError
 
 NAME_PATTERN = r"^[a-z][a-z0-9-]{2,62}$"
+REGION_PATTERN = r"^([0-3]{4}|\*)/([0-3]{3}|\*)/([0-3]{3}|\*)$"
 VehicleName = Annotated[str, Field(pattern=NAME_PATTERN)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
@@ -25,10 +26,22 @@ class ZenohSettings(Settings):
     """How to reach the routers; `config` is handed to Zenoh as it is (same keys as a Zenoh configuration file)."""
 
     connect: list[str] = Field(default=["tcp/127.0.0.1:7447"], description="router endpoints, tried in turn")
-    config: dict[str, Any] = Field(default_factory=dict, description="any Zenoh setting, e.g. transport/link/tls")
+    config: dict[str, Any] = Field(
+        default_factory=dict, description="any Zenoh setting; {name} in it is the session's name"
+    )
 
 
-class AgentConfig(Settings):
+class Watched(Settings):
+    """How a running part shows itself."""
+
+    metrics_port: int | None = Field(
+        default=None, ge=0, le=65535, description="/metrics (OpenMetrics) and /healthz; 0: a free port; null: off"
+    )
+    metrics_host: str = Field(default="127.0.0.1", description="address for them; anyone who reaches it may read")
+    log: Literal["text", "json"] = Field(default="text", description="lines for people, or JSON lines for programs")
+
+
+class AgentConfig(Watched):
     """Settings of an edge agent."""
 
     zenoh: ZenohSettings = ZenohSettings()
@@ -53,12 +66,12 @@ class AgentConfig(Settings):
     tyre_season: int = Field(default=0, ge=0, le=3, description="0 unknown, 1 summer, 2 winter, 3 all-season")
 
 
-class ServiceConfig(Settings):
+class ServiceConfig(Watched):
     """Settings of a fleet service."""
 
     zenoh: ZenohSettings = ZenohSettings()
     name: VehicleName = Field(default="shard-0", description="name of this service; part of its segment names")
-    regions: list[str] = Field(
+    regions: list[Annotated[str, Field(pattern=REGION_PATTERN)]] = Field(
         default=["*/*/*"],
         min_length=1,
         max_length=8,
@@ -67,13 +80,41 @@ class ServiceConfig(Settings):
     segment_s: Positive = Field(default=0.5, le=1.0, description="longest time an admitted row waits for its segment")
     put_s: Positive = Field(default=1.0, description="shortest time between two puts of one tile")
     lateness_s: Positive = Field(default=120.0, description="later observations are archived, not fused")
+    weather: Path | None = Field(
+        default=None, description="Parquet file of road weather to begin with; reports over Zenoh come on top"
+    )
     public_vehicles: int = Field(
         default=1, ge=1, description="answers and tiles show only cells of so many distinct vehicles (privacy)"
     )
     clock_ahead_s: Positive = Field(default=30.0, description="records further in the future are refused")
     oldest_s: Positive = Field(default=30 * 86400.0, description="records older than this are refused")
+    compact_s: float = Field(
+        default=3600.0, ge=0.0, allow_inf_nan=False, description="time between two compactions of the archive; 0: never"
+    )
+    checkpoint_s: float = Field(
+        default=300.0,
+        ge=0.0,
+        allow_inf_nan=False,
+        description="time between two checkpoints, which a restart begins from",
+    )
+    snapshot_s: float = Field(
+        default=3600.0, ge=0.0, allow_inf_nan=False, description="time between two snapshots of the map; 0: never"
+    )
+    raw_days: int = Field(
+        default=0, ge=0, description="days of raw rows that stay in the archive, 31 at least; roll-ups stay; 0: all"
+    )
+    put_to: str | None = Field(default=None, description="URI where compacted files are put too, e.g. s3://bucket/a")
     queue_batches: int = Field(
         default=20_000, ge=1, description="batches waiting at the most; more wait unacknowledged"
+    )
+    vehicle_kb_s: Positive = Field(
+        default=250.0, description="[kB/s] that a vehicle may send in the long run, 1500 records; more waits with it"
+    )
+    vehicle_burst_kb: Positive = Field(
+        default=1000.0, ge=64.0, description="[kB] at once, as after an outage; the largest batch must fit"
+    )
+    fleet: Path | None = Field(
+        default=None, description="enrolment file; reports of vehicles that are not on it are not looked at"
     )
 
 

@@ -6,11 +6,13 @@ import functools
 import hashlib
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import ParamSpec, TypeAlias, TypeVar, cast
 
 import numba
 import numpy as np
+from numba.core.caching import FunctionCache
 from numpy.typing import NDArray
 
 FloatArray: TypeAlias = NDArray[np.float64]
@@ -27,11 +29,32 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
     """Compile `function` with numba: cached on disk, no fast-math, IEEE division (x/0 is inf, not an exception).
 
     Without fast-math and threads the result of a row does not depend on how many rows there are,
-    which is what makes a bank of N = 1 and of N = thousands bit-equal.
+    which is what makes a bank of N = 1 and of N = thousands bit-equal. Where the cache's disk is full, a kernel is
+    compiled at each start.
     """
+    return _compile(function, release_gil=False)
+
+
+def released(function: Callable[P, R]) -> Callable[P, R]:
+    """`compiled`, and other Python threads run meanwhile: for long kernels that touch only what they are handed."""
+    return _compile(function, release_gil=True)
+
+
+def _compile(function: Callable[P, R], *, release_gil: bool) -> Callable[P, R]:
     if "NUMBA_CACHE_DIR" not in os.environ:
         numba.config.CACHE_DIR = _kernel_cache(function.__module__.partition(".")[0])  # type: ignore[attr-defined]
-    return cast(Callable[P, R], numba.njit(cache=True, error_model="numpy")(function))
+    kernel = numba.njit(cache=True, error_model="numpy", nogil=release_gil)(function)
+    kernel._cache = _Cache(function)  # type: ignore[attr-defined, no-untyped-call] # no public way
+    return cast(Callable[P, R], kernel)
+
+
+class _Cache(FunctionCache):
+    """Numba's own, but for a full disk: it raises there, and would take the process with it."""
+
+    def save_overload(self, sig: object, data: object) -> None:
+        """Save, if the disk lets us."""
+        with suppress(OSError):
+            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
 
 
 @functools.cache

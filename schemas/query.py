@@ -13,6 +13,8 @@ from schemas import wire
 from schemas.errors import InputError
 
 MAX_ROUTE_POINTS: Final = 500
+MAX_TEXT: Final = 32 * 1024  # of all parameters; a route of 500 points with seven decimals takes 13 kB
+FIRST_YEAR: Final = 1971  # nanoseconds since 1970 stay positive, whatever the zone
 _FIXES: Final = {
     "bbox": "give bbox=west,south,east,north in degrees, west < east and south < north",
     "route": f"give route=lon,lat|lon,lat with 2 to {MAX_ROUTE_POINTS} points in degrees",
@@ -78,6 +80,8 @@ class MapQuery(BaseModel):
     def _zoned(cls, value: datetime | None) -> datetime | None:
         if value is not None and value.tzinfo is None:
             raise ValueError("has no time zone")
+        if value is not None and value.year < FIRST_YEAR:
+            raise ValueError("lies before all reports")
         return value
 
 
@@ -87,6 +91,8 @@ def parse(parameters: Mapping[str, str]) -> MapQuery:
     Raises:
         InputError: an unknown parameter, or one that cannot be read; names it and the fix.
     """
+    if sum(len(name) + len(value) for name, value in parameters.items()) > MAX_TEXT:
+        raise InputError("query", f"is longer than {MAX_TEXT} characters", "ask for less at once")
     try:
         return MapQuery.model_validate(dict(parameters))
     except ValidationError as error:
@@ -95,4 +101,4 @@ def parse(parameters: Mapping[str, str]) -> MapQuery:
         unknown, own = first["type"] == "extra_forbidden", first["type"] == "value_error"
         because = f" ({first['msg'].removeprefix('Value error, ')})" if own else ""
         problem = "is no parameter" if unknown else f"{parameters[name][:60]!r} is not usable{because}"
-        raise InputError(name, problem, _FIXES.get(name, f"use {', '.join(MapQuery.model_fields)}")) from error
+        raise InputError(name[:60], problem, _FIXES.get(name, f"use {', '.join(MapQuery.model_fields)}")) from error

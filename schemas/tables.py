@@ -11,28 +11,36 @@ from schemas.signals import UNITS, per_wheel
 
 
 class Field(NamedTuple):
-    """One column."""
+    """One column; the service keeps floats as multiples of `step`, where there is one.
+
+    A step is a power of two far below the value's own uncertainty; finer digits are noise, and a quarter of the bytes.
+    """
 
     name: str
     type: pa.DataType
     unit: str
     meaning: str
+    step: float | None = None
 
 
 NS = pa.timestamp("ns", tz="UTC")
+US = pa.timestamp("us", tz="UTC")  # what is kept on disk: Spark refuses nanoseconds in Parquet
+US_STEP: Final = 1_000  # [ns]
 LIKELIHOOD = pa.binary(mugrid.BINS)
 F32, F64, I8, I32, I64 = pa.float32(), pa.float64(), pa.int8(), pa.int32(), pa.int64()
 
+_MU_STEP, _DEGREE_STEP, _RADIAN_STEP, _SPEED_STEP = 2.0**-10, 2.0**-23, 2.0**-9, 2.0**-6  # the second is 13 mm
+
 _MU = (
-    Field("mu", F32, "-", "peak adhesion coefficient, median; NaN where not said"),
-    Field("mu_lower", F32, "-", "5 % quantile of mu"),
-    Field("mu_upper", F32, "-", "95 % quantile of mu"),
+    Field("mu", F32, "-", "peak adhesion coefficient, median; NaN where not said", _MU_STEP),
+    Field("mu_lower", F32, "-", "5 % quantile of mu", _MU_STEP),
+    Field("mu_upper", F32, "-", "95 % quantile of mu", _MU_STEP),
 )
 _POSE = (
-    Field("latitude", F64, "deg", "WGS 84"),
-    Field("longitude", F64, "deg", "WGS 84"),
-    Field("position_std", F32, "m", "standard deviation of the position, each axis"),
-    Field("yaw", F32, "rad", "counter-clockwise from east"),
+    Field("latitude", F64, "deg", "WGS 84", _DEGREE_STEP),
+    Field("longitude", F64, "deg", "WGS 84", _DEGREE_STEP),
+    Field("position_std", F32, "m", "standard deviation of the position, each axis", 2.0**-5),
+    Field("yaw", F32, "rad", "counter-clockwise from east", _RADIAN_STEP),
 )
 
 # What one vehicle learned about one cell in one visit.
@@ -42,15 +50,15 @@ OBSERVATION: Final = (
     Field("cell", I64, "quadint z21", "the cell"),
     Field("sector", I8, "0 east, 1 north, 2 west, 3 south", "heading sector"),
     *_POSE,
-    Field("yaw_std", F32, "rad", "standard deviation of yaw"),
-    Field("speed", F32, "m/s", "mean speed over the visit"),
+    Field("yaw_std", F32, "rad", "standard deviation of yaw", 2.0**-12),
+    Field("speed", F32, "m/s", "mean speed over the visit", _SPEED_STEP),
     *_MU,
-    Field("mu_utilised", F32, "-", "largest grip used in the visit, any wheel: mu is at least this"),
+    Field("mu_utilised", F32, "-", "largest grip used in the visit, any wheel: mu is at least this", _MU_STEP),
     Field("log_likelihood", LIKELIHOOD, "1/16 nat below the maximum",
           "log p(measurements | mu) on the 32 bins of the friction grid; absent where the sender has none"),
     Field("health", I32, "flags", "schemas.signals.Health"),
     Field("tyre_season", I8, "0 unknown, 1 summer, 2 winter, 3 all-season", "tyres of the vehicle"),
-    Field("air_temperature", F32, "degC", "outside; NaN where not measured"),
+    Field("air_temperature", F32, "degC", "outside; NaN where not measured", 2.0**-4),
     Field("abs_active", I8, "-1 unknown, 0 no, 1 yes", "a slip controller intervened"),
 )  # fmt: skip
 
@@ -58,10 +66,10 @@ OBSERVATION: Final = (
 STATE: Final = (
     Field("time", NS, "ns since 1970, UTC", "of the sample"),
     *_POSE,
-    Field("vx", F32, "m/s", "longitudinal speed at the centre of gravity"),
-    Field("vy", F32, "m/s", "lateral speed at the centre of gravity"),
-    Field("yaw_rate", F32, "rad/s", "positive to the left"),
-    Field("sideslip", F32, "rad", "atan2(vy, vx)"),
+    Field("vx", F32, "m/s", "longitudinal speed at the centre of gravity", _SPEED_STEP),
+    Field("vy", F32, "m/s", "lateral speed at the centre of gravity", _SPEED_STEP),
+    Field("yaw_rate", F32, "rad/s", "positive to the left", 2.0**-12),
+    Field("sideslip", F32, "rad", "atan2(vy, vx)", 2.0**-12),
     *_MU,
     Field("health", I32, "flags", "schemas.signals.Health"),
 )
@@ -84,6 +92,18 @@ BOOKKEEPING: Final = (
     Field("weight", F32, "-", "weight of the vehicle's vote that was used"),
 )
 
+# Road weather of a region, as it came and as the map used it.
+WEATHER: Final = (
+    Field("region", I64, "quadint z10", "the region"),
+    Field("time", NS, "ns since 1970, UTC", "from when it holds"),
+    Field("air_temperature", F32, "degC", "NaN where unknown"),
+    Field("road_temperature", F32, "degC", "of the surface; NaN where unknown"),
+    Field("precipitation", F32, "mm/h", "as water; NaN where unknown"),
+    Field("prior", pa.list_(F32), "-", "probabilities of the 32 bins of the friction grid; null where there is none"),
+    Field("received_at", NS, "ns since 1970, UTC", "clock of the service"),
+    Field("acts_from", NS, "ns since 1970, UTC", "from when the map used it: nothing younger had been folded"),
+)
+
 MAP_CELL: Final = (
     Field("cell", I64, "quadint z21", "the cell"),
     Field("sector", I8, "0 east, 1 north, 2 west, 3 south", "heading sector"),
@@ -104,6 +124,25 @@ MAP_CELL: Final = (
     Field("east", F64, "deg", "border of the cell"),
     Field("north", F64, "deg", "border of the cell"),
     Field("safe_deceleration", F32, "m/s^2", "what the road bears with 95 % probability, g mu_lower; level road"),
+)
+
+# Parts of an hour's statistics of one cell and sector; those of the same hour are merged as each column says.
+CELL_HOUR: Final = (
+    Field("cell", I64, "quadint z21", "the cell"),
+    Field("sector", I8, "0 east, 1 north, 2 west, 3 south", "heading sector"),
+    Field("hour", US, "us since 1970, UTC", "begin of the hour of leave_time"),
+    Field("observations", I64, "-", "count; add"),
+    Field("late", I64, "-", "of them not fused; add"),
+    Field("vehicles", I64, "-", "distinct vehicles of this part; they do not add, see vehicle_bits"),
+    Field("vehicle_bits", I64, "64 bits", "or; distinct vehicles are about -64 ln(share of zeros)"),
+    Field("mu_count", I64, "-", "observations that said mu; add"),
+    Field("mu_sum", F64, "-", "sum of mu; add"),
+    Field("mu_sum_squares", F64, "-", "sum of squares of mu; add"),
+    Field("mu_min", F32, "-", "least mu; +inf where none was said; take the least"),
+    Field("mu_max", F32, "-", "largest mu; -inf where none was said; take the largest"),
+    Field("utilised_max", F32, "-", "largest grip used: mu was at least this; take the largest"),
+    Field("mu_histogram", pa.list_(I32), "-", "counts of mu on the 32 bins of the friction grid; add per bin"),
+    Field("log_likelihood_sum", pa.list_(I32), "1/16 nat", "sum of log_likelihood on the 32 bins; add per bin"),
 )
 
 ESTIMATES: Final = (
@@ -141,8 +180,19 @@ def arrow_schema(*fields: Field) -> pa.Schema:
     return pa.schema([pa.field(f.name, f.type, metadata={"unit": f.unit, "meaning": f.meaning}) for f in fields])
 
 
+CELL_HOUR_SCHEMA: Final = arrow_schema(*CELL_HOUR)
+
+
+def kept(*fields: Field) -> tuple[Field, ...]:
+    """Columns as they lie on disk: times in microseconds."""
+    return tuple(f._replace(type=US, unit="us since 1970, UTC") if f.type == NS else f for f in fields)
+
+
 MAP_SCHEMA: Final = arrow_schema(*MAP_CELL)
 ESTIMATES_SCHEMA: Final = arrow_schema(*ESTIMATES)
-OBSERVATION_ARCHIVE: Final = arrow_schema(*OBSERVATION, *IDENTITY, *BOOKKEEPING)
+MAP_KEPT: Final = kept(*MAP_CELL, Field("snapshot_time", NS, "", "when the map was so"))
+MAP_ARCHIVE: Final = arrow_schema(*MAP_KEPT)
+OBSERVATION_ARCHIVE: Final = arrow_schema(*kept(*OBSERVATION, *IDENTITY, *BOOKKEEPING))
+WEATHER_ARCHIVE: Final = arrow_schema(*kept(*WEATHER))
 STATE_CELL: Final = Field("cell", I64, "quadint z21", "cell of the position")
-STATE_ARCHIVE: Final = arrow_schema(*STATE, *IDENTITY, STATE_CELL, *BOOKKEEPING[:1])
+STATE_ARCHIVE: Final = arrow_schema(*kept(*STATE, *IDENTITY, STATE_CELL, *BOOKKEEPING[:1]))

@@ -7,8 +7,10 @@ a receiver stalls; the lease says after how long a silent peer counts as gone.
 from __future__ import annotations
 
 import json
+import logging
 import threading
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Final
 
 import zenoh
@@ -26,34 +28,51 @@ CLIENT: Final[Mapping[str, Any]] = {
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 2000, "period_increase_factor": 1.5},
 }
 RETRY_S: Final = 0.5
+NAME: Final = "{name}"
+_TLS: Final = "transport/link/tls"
+
+log = logging.getLogger(__name__)
 
 
-def configuration(settings: ZenohSettings) -> zenoh.Config:
+def configuration(settings: ZenohSettings, name: str = "") -> zenoh.Config:
     """Zenoh configuration: the defaults above, the endpoints, then the pass-through section.
 
+    Args:
+        settings: of the configuration file; `{name}` in the section stands for
+        name: whose session it is, so that one file serves many vehicles with a certificate each.
+
     Raises:
-        InputError: Zenoh refuses a setting.
+        InputError: Zenoh refuses a setting, or a certificate that it names is not there.
     """
     config = zenoh.Config()
     chosen = {**CLIENT, "connect/endpoints": settings.connect, **settings.config}
     for key, value in chosen.items():
+        text = json.dumps(value)
         try:
-            config.insert_json5(key, json.dumps(value))
+            config.insert_json5(key, text.replace(NAME, name))
         except zenoh.ZError as error:
-            problem = f"Zenoh refuses {json.dumps(value)[:60]}"
+            problem = f"Zenoh refuses {text[:60]}"
             raise InputError(f"zenoh.config.{key}", problem, "see Zenoh's configuration reference") from error
+    for key, value in json.loads(config.get_json(_TLS)).items():
+        if key.endswith(("certificate", "private_key")) and value is not None and not Path(value).is_file():
+            fix = "make it with `fleet-service certs`, or correct the path"
+            raise InputError(f"zenoh.config.{_TLS}/{key}", f"there is no file {value}", fix)
     return config
 
 
-def open_session(settings: ZenohSettings, stop: threading.Event | None = None) -> zenoh.Session | None:
+def open_session(settings: ZenohSettings, stop: threading.Event | None = None, name: str = "") -> zenoh.Session | None:
     """Open a session; wait for the router as long as it takes, until `stop` is set (then None).
 
-    A session that lost its router reconnects by itself.
+    A session that lost its router reconnects by itself. Why it waits is logged, once for each reason.
     """
-    stop = stop or threading.Event()
+    stop, told = stop or threading.Event(), set[str]()
     while not stop.is_set():
         try:
-            return zenoh.open(configuration(settings))
-        except zenoh.ZError:
+            return zenoh.open(configuration(settings, name))
+        except zenoh.ZError as error:
+            reason = str(error)
+            if reason not in told:
+                told.add(reason)
+                log.warning("no session at %s yet: %s", ", ".join(settings.connect), reason)
             stop.wait(RETRY_S)
     return None

@@ -1,29 +1,32 @@
-"""Bytes ↔ columns. Python is touched per message and per column, never per record.
+"""Batches, acknowledgements and alerts as bytes. Reading batches: `schemas.decoding`.
 
 A batch travels as protobuf (`application/protobuf;gripmap.v1.ObservationBatch`) or as the JSON mapping of the same
-message (`application/json`), so that a person can publish with one line. A column that the sender left out is filled:
-floats with NaN, the cell and the sector from the pose, the leaving time from the entering one.
+message (`application/json`), so that a person can publish with one line.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cache
 from typing import Any, Final
 
 import numpy as np
 from google.protobuf import json_format
-from google.protobuf.message import DecodeError, Message
+from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from schemas import grid, mugrid, tables
+from schemas import tables
 from schemas.errors import WireError
 from schemas.proto import gripmap_pb2 as pb
 
 JSON: Final = "application/json"
+_PLAIN: Final = ("application/protobuf", "zenoh/bytes", "")  # protobuf of which the key says what it is
 ARROW: Final = "application/vnd.apache.arrow.stream"
 GEOJSON: Final = "application/geo+json"
 MAX_ROWS: Final = 50
+MAX_STANDING_BYTES: Final = 8 << 20  # every cell and sector of a z14 tile under an alert: 65 536 of them
 MAX_BYTES: Final = 64 * 1024  # fifty records take 8 kB as protobuf, 40 kB as JSON
 
 
@@ -36,13 +39,8 @@ class Kind(StrEnum):
 
 Columns = dict[str, NDArray[Any]]
 
-_MESSAGES: Final[dict[Kind, type[Any]]] = {Kind.OBSERVATION: pb.ObservationBatch, Kind.STATE: pb.StateBatch}
+MESSAGES: Final[dict[Kind, type[Any]]] = {Kind.OBSERVATION: pb.ObservationBatch, Kind.STATE: pb.StateBatch}
 _FIELDS: Final = {Kind.OBSERVATION: tables.OBSERVATION, Kind.STATE: tables.STATE}
-_NEEDED: Final = {
-    Kind.OBSERVATION: ("enter_time", "latitude", "longitude"),
-    Kind.STATE: ("time", "latitude", "longitude"),
-}
-_ABSENT: Final = {"abs_active": -1}  # what an absent integer reads as, where it is not 0
 _PB_KIND: Final = {Kind.OBSERVATION: pb.KIND_OBSERVATION, Kind.STATE: pb.KIND_STATE}
 _KIND_OF: Final = {number: kind for kind, number in _PB_KIND.items()}
 
@@ -52,11 +50,14 @@ def encoding_of(message: type[Any]) -> str:
     return f"application/protobuf;{message.DESCRIPTOR.full_name}"
 
 
-ENCODING: Final = {kind: encoding_of(message) for kind, message in _MESSAGES.items()}
+ENCODING: Final = {kind: encoding_of(message) for kind, message in MESSAGES.items()}
 ACK_ENCODING: Final = encoding_of(pb.Ack)
 ALERT_ENCODING: Final = encoding_of(pb.Alert)
+STANDING_ENCODING: Final = encoding_of(pb.StandingAlerts)
+WEATHER_ENCODING: Final = encoding_of(pb.Weather)
 
 
+@cache
 def column_types(kind: Kind) -> dict[str, np.dtype[Any]]:
     """Name and numpy type of every column of a batch; times are int64 ns, the likelihood is uint8 (n, 32)."""
     special: dict[Any, type] = {tables.NS: np.int64, tables.LIKELIHOOD: np.uint8}
@@ -96,7 +97,7 @@ def encode(batch: Batch) -> bytes:
         raise WireError("rows", f"a batch of {n} records", f"send 1 to {MAX_ROWS}")
     if unknown := batch.columns.keys() - types.keys():
         raise WireError(sorted(unknown)[0], "is no column of this kind", f"use {', '.join(types)}")
-    message = _MESSAGES[batch.kind](
+    message = MESSAGES[batch.kind](
         vehicle=batch.vehicle, boot=batch.boot, region=batch.region, seq=batch.seq,
         first_held=batch.first_held, estimator=batch.estimator,
     )  # fmt: skip
@@ -111,92 +112,24 @@ def encode(batch: Batch) -> bytes:
     return data
 
 
-def decode(payload: bytes, encoding: str, kind: Kind) -> Batch:
-    """Read a batch; the inverse of `encode` for every column that was sent.
+def parse(payload: bytes, encoding: str, message: type[Any], expected: str) -> Any:  # noqa: ANN401 protobuf messages are untyped
+    """A message from its bytes, protobuf of the `expected` encoding or JSON.
 
     Raises:
-        WireError: too large, not the message, no needed column, or columns of unequal length.
+        WireError: too large, another encoding, or not the message.
     """
-    message = _parse(payload, encoding, _MESSAGES[kind](), ENCODING[kind])
-    columns = _columns(message, kind)
-    region = message.region or int(grid.region_of(_first_cell(columns)))
-    return Batch(
-        kind, message.vehicle, message.boot, region, message.seq, max(message.first_held, 1), columns, message.estimator
-    )
-
-
-def _parse(payload: bytes, encoding: str, message: Any, expected: str) -> Any:  # noqa: ANN401 protobuf messages are untyped
     if len(payload) > MAX_BYTES:
         raise WireError("payload", f"{len(payload)} bytes", f"send at most {MAX_BYTES}")
     try:
+        if encoding == expected or encoding in _PLAIN:
+            return message.FromString(payload)
         if encoding == JSON:
-            return json_format.Parse(payload, message, max_recursion_depth=8)
-        if encoding not in (expected, "application/protobuf", "zenoh/bytes", ""):
-            raise WireError("encoding", f"{encoding[:80]!r}", f"use {expected} or {JSON}")
-        message.ParseFromString(payload)
+            return json_format.Parse(payload, message(), max_recursion_depth=8)
     except (DecodeError, json_format.ParseError, UnicodeDecodeError, RecursionError, OverflowError) as error:
         reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
         problem = f"is no {message.DESCRIPTOR.name} ({reason})"
         raise WireError("payload", problem, "encode it as its .proto says") from error
-    return message
-
-
-def _columns(message: Message, kind: Kind) -> Columns:
-    needed = _NEEDED[kind]
-    n = len(getattr(message, needed[0]))
-    if not 1 <= n <= MAX_ROWS:
-        raise WireError(needed[0], f"{n} records", f"send 1 to {MAX_ROWS}")
-    columns: Columns = {}
-    for name, dtype in column_types(kind).items():
-        sent = getattr(message, name)
-        if name == "log_likelihood":
-            columns[name] = _likelihood(sent, n)
-        elif len(sent) == n:
-            columns[name] = _numbers(name, sent, dtype)
-        elif len(sent) or name in needed:
-            raise WireError(name, f"has {len(sent)} records, {needed[0]} has {n}", "give every column the same length")
-        else:
-            columns[name] = np.full(n, np.nan if dtype.kind == "f" else _ABSENT.get(name, 0), dtype)
-    return _derive(message, columns, kind)
-
-
-def _numbers(name: str, sent: Any, dtype: np.dtype[Any]) -> NDArray[Any]:  # noqa: ANN401
-    try:
-        return np.fromiter(sent, dtype, len(sent))
-    except OverflowError as error:
-        raise WireError(name, f"does not fit {dtype}", "use the values that the .proto names") from error
-
-
-def _likelihood(sent: bytes, n: int) -> NDArray[np.uint8]:
-    if len(sent) not in (0, n * mugrid.BINS):
-        raise WireError("log_likelihood", f"{len(sent)} bytes for {n} records", f"send {mugrid.BINS} a record, or none")
-    return np.frombuffer(sent, np.uint8).reshape(n, -1)
-
-
-def _derive(message: Message, columns: Columns, kind: Kind) -> Columns:
-    """Fill what follows from the pose, where the sender left it out."""
-    if kind is Kind.OBSERVATION:
-        if not message.leave_time:  # type: ignore[attr-defined]
-            columns["leave_time"] = columns["enter_time"].copy()
-        if not message.cell:  # type: ignore[attr-defined]
-            columns["cell"] = grid.cell_of(*_finite_position(columns))
-        if not message.sector and np.isfinite(columns["yaw"]).all():  # type: ignore[attr-defined]
-            columns["sector"] = grid.sector_of(columns["yaw"])
-    return columns
-
-
-def _first_cell(columns: Columns) -> int:
-    if "cell" in columns:
-        return int(columns["cell"][0])
-    latitude, longitude = _finite_position(columns)
-    return int(grid.cell_of(latitude[0], longitude[0]))
-
-
-def _finite_position(columns: Columns) -> tuple[NDArray[Any], NDArray[Any]]:
-    for name in ("latitude", "longitude"):
-        if not np.isfinite(columns[name]).all() or np.abs(columns[name]).max() > 180.0:
-            raise WireError(name, "is not a position", "send finite degrees")
-    return columns["latitude"], columns["longitude"]
+    raise WireError("encoding", f"{encoding[:80]!r}", f"use {expected} or {JSON}")
 
 
 @dataclass(frozen=True)
@@ -228,7 +161,7 @@ def decode_ack(payload: bytes) -> tuple[str, list[StreamAck]]:
     Raises:
         WireError: not an Ack, or of a kind that this version does not know.
     """
-    message = _parse(payload, ACK_ENCODING, pb.Ack(), ACK_ENCODING)
+    message = parse(payload, ACK_ENCODING, pb.Ack, ACK_ENCODING)
     if any(stream.kind not in _KIND_OF for stream in message.streams):
         raise WireError("kind", "is unknown", "use KIND_OBSERVATION or KIND_STATE")
     return message.vehicle, [
@@ -270,5 +203,29 @@ def decode_alert(payload: bytes) -> Alert:
     Raises:
         WireError: not an Alert.
     """
-    message = _parse(payload, ALERT_ENCODING, pb.Alert(), ALERT_ENCODING)
+    return _alert(parse(payload, ALERT_ENCODING, pb.Alert, ALERT_ENCODING))
+
+
+def encode_standing(alerts: Sequence[Alert]) -> bytes:
+    """Protobuf bytes of the alerts that stand in a tile."""
+    return pb.StandingAlerts(alerts=[pb.Alert(**vars(alert)) for alert in alerts]).SerializeToString()
+
+
+def decode_standing(payload: bytes) -> list[Alert]:
+    """Read the alerts that stand in a tile.
+
+    Raises:
+        WireError: no StandingAlerts.
+    """
+    if len(payload) > MAX_STANDING_BYTES:
+        raise WireError("payload", f"{len(payload)} bytes", f"send at most {MAX_STANDING_BYTES}")
+    message = pb.StandingAlerts()
+    try:
+        message.ParseFromString(payload)
+    except DecodeError as error:
+        raise WireError("payload", "is no StandingAlerts", "encode it as its .proto says") from error
+    return [_alert(alert) for alert in message.alerts]
+
+
+def _alert(message: Any) -> Alert:  # noqa: ANN401 protobuf messages are untyped
     return Alert(**{name: getattr(message, name) for name in Alert.__dataclass_fields__})

@@ -7,16 +7,17 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-import pyarrow.parquet as pq
 import pytest
 import zenoh
 
 from deploy.router import open_router
 from edge_agent.cli import main as edge_agent
+from fleet_service.archive import reading
 from fleet_service.service import Service
 from schemas import mugrid
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.transport import open_session
+from schemas.wire import Kind
 from tests.waiting import until
 
 VEHICLES = ("anna", "bert", "cleo")
@@ -102,7 +103,7 @@ def test_slippery_drives_become_a_slippery_map_that_survives_a_restart(system: S
     excited = [cell for cell in cells if cell["basis"] == "measured"]
     assert excited
     assert max(abs(float(str(cell["mu"])) - ICE) for cell in excited) <= 0.06
-    assert min(float(str(cell["p_slippery"])) for cell in excited) >= 0.9
+    assert min(float(str(cell["p_slippery"])) for cell in excited) >= 0.8
     rows = archived(system.folder)
     assert len(set(rows)) == len(rows)
     system.stop()
@@ -116,13 +117,9 @@ def test_slippery_drives_become_a_slippery_map_that_survives_a_restart(system: S
 
 def archived(folder: Path) -> list[tuple[object, ...]]:
     """Identities of all archived observations."""
-    rows: list[tuple[object, ...]] = []
-    for path in sorted((folder / "archive" / "inbox").glob("*.parquet")):
-        table = pq.read_table(path)
-        if "log_likelihood" in table.column_names:
-            columns = ("vehicle", "boot", "region", "seq", "row")
-            rows += list(zip(*(table[name].to_pylist() for name in columns), strict=True))
-    return rows
+    columns = ("vehicle", "boot", "region", "seq", "row")
+    tables = reading.read(folder / "archive", Kind.OBSERVATION, columns)
+    return [row for table in tables for row in zip(*(table[name].to_pylist() for name in columns), strict=True)]
 
 
 def test_a_straight_drive_leaves_bounds_and_the_prior_s_upper_end(system: System) -> None:

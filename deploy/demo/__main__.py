@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 from deploy.demo import compare, page, picture, processes
 from deploy.demo.listener import Listener
 from edge_agent.simulation.scenarios import scenario_named
+from fleet_service.archive.compaction import compact
 from schemas import figures
 from schemas.config import ZenohSettings
 from schemas.transport import open_session
@@ -49,11 +50,12 @@ def show(folder: Path, endpoint: str, comparison: compare.Comparison) -> None:
     bbox = ",".join(f"{value:.6f}" for value in (sides[0].min(), sides[1].min(), sides[2].max(), sides[3].max()))
     print("\nA client that knows only Zenoh asks for the map:", flush=True)
     subprocess.run([sys.executable, "-m", "deploy.demo.plain_client", endpoint, bbox], check=True)
+    compact(folder / "archive")
     print(f"""
 The observations, as any Parquet reader sees them:
   import duckdb
   print(duckdb.sql("select sector, count(*), median(mu), count(distinct vehicle)
-                    from '{folder}/archive/inbox/*.parquet' where mu_utilised > .2 group by sector"))""")
+                    from '{folder}/archive/observations/*/*/*.parquet' where mu_utilised > .2 group by sector"))""")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -9,13 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import duckdb
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
+from fleet_service.archive import reading
 from schemas.figures import Figure
 from schemas.numeric import BoolArray, FloatArray, IntArray
-from schemas.wire import Alert
+from schemas.wire import Alert, Kind
 
 EXCITED = 0.6
 SLIPPERY = 0.4
@@ -127,11 +128,12 @@ def newly_slippery(visits: pa.Table, changed_ns: int) -> BoolArray:
 
 def archived(archive: Path) -> tuple[int, int, int]:
     """Rows, distinct rows and distinct vehicles of the archived observations."""
-    query = f"""select count(*), count(distinct (vehicle, boot, region, seq, "row")), count(distinct vehicle)
-                from read_parquet('{archive}/inbox/*.parquet', union_by_name=true) where enter_time is not null"""
-    found = duckdb.execute(query).fetchone()
-    rows, distinct, vehicles = found if found else (0, 0, 0)
-    return int(rows), int(distinct), int(vehicles)
+    identity = ["vehicle", "boot", "region", "seq", "row"]
+    tables = list(reading.read(archive, Kind.OBSERVATION, identity))
+    if not tables:
+        return 0, 0, 0
+    whole = pa.concat_tables(tables)
+    return whole.num_rows, whole.group_by(identity).aggregate([]).num_rows, len(pc.unique(whole["vehicle"]))
 
 
 def started(visits: pa.Table) -> int:

@@ -19,5 +19,5 @@ def write(comparison: Comparison, table: str, path: Path) -> None:
     rows = comparison.cells.select(COLUMNS).to_pylist()
     for row, truth, shape in zip(rows, comparison.truth, np.round(quarters(comparison), 2).tolist(), strict=True):
         row |= {"truth": float(truth), "shape": shape}
-    data = json.dumps({"cells": rows, "table": table}).replace("</", "<\\/")  # no value can end the script
+    data = json.dumps({"cells": rows, "table": table}).replace("<", "\\u003c")  # no value can end or open a tag
     path.write_text(TEMPLATE.read_text().replace("/*DATA*/null", data))

@@ -11,9 +11,7 @@ Neighbouring triangles meet at each other's peaks, so memberships of a mismatch 
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -91,7 +89,7 @@ class Memberships:
 
     @classmethod
     def from_json(cls, document: object) -> Memberships:
-        """The memberships in a parsed JSON document; other keys (provenance) are ignored.
+        """The memberships in a parsed JSON document.
 
         Raises:
             InputError: a field is missing or is not a list of numbers.
@@ -105,18 +103,3 @@ class Memberships:
                 )
             fields[name] = tuple(float(x) for x in value)
         return cls(**fields)
-
-
-def load_memberships(path: Path | str) -> Memberships:
-    """Read a memberships file (JSON), the memberships being the whole document or under the key "memberships".
-
-    Raises:
-        InputError: the file cannot be read or is not such a document.
-    """
-    try:
-        document = json.loads(Path(path).read_text())
-    except (OSError, ValueError) as error:
-        raise InputError("memberships", f"cannot read {path} ({error})", "write it with edge-agent tune") from error
-    if isinstance(document, dict) and isinstance(document.get("memberships"), dict):
-        document = document["memberships"]
-    return Memberships.from_json(document)

@@ -8,31 +8,19 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from schemas.config import NAME_PATTERN, AgentConfig
 from schemas.errors import InputError
-from schemas.vehicle import Vehicle
+from schemas.operator import Line, tell
 
 if TYPE_CHECKING:
     from types import FrameType
 
     from edge_agent.agent import Progress
-    from edge_agent.estimators import Bank
     from edge_agent.publisher import Publisher
-
-
-def bank_of(estimator: str, vehicles: Sequence[Vehicle]) -> Bank:
-    """The estimator bank of a name.
-
-    Raises:
-        InputError: no such estimator.
-    """
-    from edge_agent.estimators import create
-
-    return create(estimator, vehicles)
 
 
 def checked_name(name: str) -> str:
@@ -58,7 +46,8 @@ def publisher_of(names: Sequence[str], config: AgentConfig, estimator: str) -> P
     from edge_agent.spool import Spool
     from schemas.transport import configuration
 
-    configuration(config.zenoh)  # a bad setting is to be an error here, not in a thread
+    for name in names:  # a bad setting, or a missing certificate, is to be an error here, not in a thread
+        configuration(config.zenoh, name)
     spool = Spool(config.spool, capacity_bytes=round(config.spool_mb * 1e6), first_resend_s=config.resend_s)
     publisher = Publisher(names, spool, config, estimator)
     publisher.start()
@@ -94,19 +83,20 @@ def leave(publisher: Publisher, progress: Progress, drain_s: float) -> None:
 
     clean = publisher.close(drain_s)
     if not clean:
-        print("warning: a session did not close; leaving it behind", file=sys.stderr, flush=True)
+        tell("warning: a session did not close; leaving it behind", sys.stderr)
     print(json.dumps(summary(progress, publisher)), flush=True)
     if not clean:
         os._exit(0)
 
 
-def status(progress: Progress, publisher: Publisher) -> None:
-    """One line on how it goes, on stderr."""
+def status(progress: Progress, publisher: Publisher, say: Callable[[str], None]) -> None:
+    """One line on how it goes."""
+    from edge_agent.agent import summary
+
     counts = publisher.counts
     late = f", behind real time by {progress.lag_s:.1f} s at the most" if progress.behind else ""
-    print(
+    text = (
         f"{progress.signals_s:7.1f} s  {publisher.links} sessions, {sum(counts.published.values())} records published, "
-        f"{sum(counts.acknowledged.values())} acknowledged, {publisher.unsettled()} unsettled{late}",
-        file=sys.stderr,
-        flush=True,
+        f"{sum(counts.acknowledged.values())} acknowledged, {publisher.unsettled()} unsettled{late}"
     )
+    say(Line(text, event="status", **summary(progress, publisher)))

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
 
-from edge_agent.agent import ENDED_DRAIN_S, STOPPED_DRAIN_S, drive
-from edge_agent.cli.common import bank_of, leave, publisher_of, status, stop_on_signal
+from edge_agent.agent import ENDED_DRAIN_S, STOPPED_DRAIN_S, Progress, drive
+from edge_agent.banks import bank_of
+from edge_agent.cli.common import leave, publisher_of, status, stop_on_signal
+from edge_agent.gauges import metrics, troubles
 from edge_agent.pipeline import Pipeline
+from edge_agent.publisher import Publisher
 from edge_agent.sources import Block
 from schemas.config import AgentConfig
+from schemas.monitor import serving
+from schemas.operator import log_as, tell, teller
 from schemas.signals import CHANNELS
 from schemas.vehicle import Vehicle
 
@@ -34,12 +40,25 @@ def drive_live(
 ) -> int:
     """Drive in real time, do what is due `at_end`, take leave; prints a line of counts and returns 0."""
     chosen = estimator or config.estimator
+    log_as(config.log, sys.stderr)
     _warm_up(chosen, vehicles[0], config)
-    pipeline = Pipeline(bank_of(chosen, vehicles), len(vehicles), config)
-    publisher = publisher_of(names, config, chosen)
-    report = partial(status, publisher=publisher)
-    with stop_on_signal() as stop:
-        progress = drive(blocks, pipeline, publisher, stop, report, duration_s=duration_s)
+    progress, running = Progress(), list[Publisher]()
+    with (
+        stop_on_signal() as stop,
+        serving(
+            config.metrics_host,
+            config.metrics_port,
+            lambda: [metric for publisher in running for metric in metrics(publisher, progress)],
+            lambda: troubles(running[0], progress) if running else ["the agent is starting"],
+        ) as address,
+    ):
+        if address:
+            tell(f"metrics: {address}/metrics", sys.stderr)
+        pipeline = Pipeline(bank_of(chosen, vehicles), len(vehicles), config)
+        publisher = publisher_of(names, config, chosen)
+        running.append(publisher)
+        report = partial(status, publisher=publisher, say=teller(config.log, sys.stderr))
+        drive(blocks, pipeline, publisher, stop, report, duration_s=duration_s, progress=progress)
         at_end()
         leave(publisher, progress, STOPPED_DRAIN_S if stop.is_set() else ENDED_DRAIN_S)
     return 0

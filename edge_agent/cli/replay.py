@@ -1,14 +1,17 @@
-"""`edge-agent replay`: a recorded drive through an estimator, as fast as it goes; onto the map with --publish."""
+"""`edge-agent replay`: recorded drives through an estimator, as fast as it goes; one onto the map with --publish."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 import time
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from edge_agent.backfill import Outcome
     from edge_agent.estimates_file import EstimatesFile
     from edge_agent.estimators import Bank
     from edge_agent.sources.replay import Log
@@ -16,14 +19,18 @@ if TYPE_CHECKING:
 
 DRAIN_S = 30.0  # for a busy service; what is not settled by then stays in the spool
 NS = 1_000_000_000
+PROGRESS_S = 1.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("log", type=Path, help="signal log (Parquet)")
-    parser.add_argument("--vehicle", type=Path, required=True, help="vehicle file (JSON)")
+    parser.add_argument("log", type=Path, nargs="+", help="signal log (Parquet)")
+    parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON) (default: LOG.json beside LOG.parquet)")
     parser.add_argument("--estimator", help="estimator by name (default: the configuration's, aco-fckf)")
-    parser.add_argument("--out", type=Path, required=True, help="estimates to write (Parquet)")
+    parser.add_argument(
+        "--out", type=Path, required=True, help="estimates to write (Parquet); of several logs, a folder"
+    )
+    parser.add_argument("--jobs", type=int, default=1, help="logs at a time (default 1)")
     parser.add_argument("--publish", action="store_true", help="send observations and states, wait for acknowledgement")
     parser.add_argument("--config", type=Path, help="agent configuration (JSON), for --publish")
     parser.add_argument("--name", help="name to publish under (default: the vehicle file's)")
@@ -32,17 +39,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Replay; 0 when everything was written, and acknowledged if it was to be published, else 1."""
-    from edge_agent.cli.common import bank_of
+    from edge_agent.backfill import backfill, beside, tasks_of
+    from edge_agent.banks import bank_of
     from edge_agent.estimates_file import EstimatesFile
     from edge_agent.sources.replay import read_log
     from schemas.config import AgentConfig, load
+    from schemas.errors import InputError
     from schemas.vehicle import load_vehicle
 
     config = load(args.config, AgentConfig)
     estimator = args.estimator or config.estimator
-    vehicle = load_vehicle(args.vehicle)
+    if len(args.log) > 1 or args.out.is_dir():
+        if args.publish:
+            raise InputError(
+                "publish", f"{len(args.log)} logs into a folder", "publish one log, to one file, at a time"
+            )
+        tasks = tasks_of(args.log, args.vehicle, args.out)
+        return _told(backfill(tasks, estimator, args.jobs), len(tasks))
+    path = args.log[0]
+    vehicle = load_vehicle(args.vehicle or beside(path))
     bank = bank_of(estimator, [vehicle])
-    log = read_log(args.log)
+    log = read_log(path)
     start_ns = _start(args.start, log)
     with EstimatesFile(args.out) as file:
         if args.publish:
@@ -50,6 +67,21 @@ def run(args: argparse.Namespace) -> int:
         for block in log.blocks(start_ns):
             file.write(block.t, bank.advance(block.t, block.signals))
     return 0
+
+
+def _told(outcomes: Iterator[Outcome], count: int) -> int:
+    """Say how it goes on stderr; 2 where a log could not be read, else 0."""
+    bad, samples, began, last = 0, 0, time.monotonic(), 0.0
+    for done, outcome in enumerate(outcomes, 1):
+        samples += outcome.samples
+        if outcome.error is not None:
+            bad += 1
+            print(f"error: {outcome.task.log}: {outcome.error}", file=sys.stderr, flush=True)
+        spent = time.monotonic() - began
+        if spent - last >= PROGRESS_S or done == count:
+            last, rate = spent, samples / max(spent, 1e-9)
+            print(f"{done} of {count} logs, {samples} samples, {rate:.0f}/s", file=sys.stderr, flush=True)
+    return 2 if bad else 0
 
 
 def _published(

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import math
 
-from edge_agent.dynamics.body import accelerations
+import numpy as np
+
 from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import P
-from edge_agent.dynamics.slip import slips, wheel_velocity
+from edge_agent.dynamics.slip import slips, wheel_position
 from edge_agent.dynamics.tyres import combined_dugoff, combined_magic
 from schemas.numeric import FloatArray, compiled
 
@@ -19,10 +20,26 @@ DUGOFF = 0.0  # in place of a Magic Formula shape c, which is above 1
 
 
 @compiled
+def turned(delta: FloatArray) -> FloatArray:
+    """Steering angles (4,) [rad] as (4, 2): cosine and sine, which many states share."""
+    out = np.empty((4, 2))
+    for wheel in range(4):
+        out[wheel, 0], out[wheel, 1] = math.cos(delta[wheel]), math.sin(delta[wheel])
+    return out
+
+
+@compiled
+def _slips(radius: float, ahead: float, aside: float, cos: float, sin: float, omega: float) -> tuple[float, float]:
+    """Slips of a wheel whose centre moves by ahead, aside [m/s] in body axes, at cos(delta), sin(delta)."""
+    along, across = cos * ahead + sin * aside, cos * aside - sin * ahead
+    return slips(radius, along / radius if math.isnan(omega) else omega, along, across)
+
+
+@compiled
 def tyre_forces(
     row: FloatArray,
     motion: FloatArray,
-    delta: FloatArray,
+    steering: FloatArray,
     omega: FloatArray,
     mu: FloatArray,
     shape: float,
@@ -31,40 +48,68 @@ def tyre_forces(
 ) -> None:
     """Fill force_x, force_y (4,) [N] at motion (5,) = v_x, v_y, r, a_x, a_y; the accelerations give the loads.
 
-    shape: c of the Magic Formula (e = 0), or DUGOFF. A wheel whose speed is NaN rolls freely.
+    steering: (4, 2) of `turned`; omega, mu (4,); shape: c of the Magic Formula (e = 0), or DUGOFF. A wheel whose speed
+    is NaN rolls freely.
     """
     loads = wheel_loads(row, motion[3], motion[4])
     for wheel in range(4):
-        along, across = wheel_velocity(row, wheel, motion[0], motion[1], motion[2], delta[wheel])
-        turning = omega[wheel]
-        slip_x, slip_y = slips(row[P.RADIUS], along / row[P.RADIUS] if math.isnan(turning) else turning, along, across)
-        load = loads[wheel]
-        stiff_x, stiff_y = row[P.SLOPE_X] * load, row[P.SLOPE_Y] * load
+        x, y = wheel_position(row, wheel)
+        ahead, aside = motion[0] - y * motion[2], motion[1] + x * motion[2]
+        slip_x, slip_y = _slips(row[P.RADIUS], ahead, aside, steering[wheel, 0], steering[wheel, 1], omega[wheel])
+        stiff_x, stiff_y = row[P.SLOPE_X] * loads[wheel], row[P.SLOPE_Y] * loads[wheel]
         if shape == DUGOFF:
-            pair = combined_dugoff(slip_x, slip_y, stiff_x, stiff_y, mu[wheel], load)
+            pair = combined_dugoff(slip_x, slip_y, stiff_x, stiff_y, mu[wheel], loads[wheel])
         else:
-            pair = combined_magic(slip_x, slip_y, stiff_x, stiff_y, mu[wheel], load, shape, 0.0)
+            pair = combined_magic(slip_x, slip_y, stiff_x, stiff_y, mu[wheel], loads[wheel], shape, 0.0)
         force_x[wheel], force_y[wheel] = pair
 
 
 @compiled
 def response(
     row: FloatArray,
-    motion: FloatArray,
-    delta: FloatArray,
+    vx: float,
+    vy: float,
+    rate: float,
+    ax: float,
+    ay: float,
+    steering: FloatArray,
     omega: FloatArray,
     known_x: FloatArray,
     mu: FloatArray,
-    shape: float,
-    force_x: FloatArray,
-    force_y: FloatArray,
 ) -> tuple[float, float, float]:
-    """(a_x, a_y [m/s^2], yaw acceleration [rad/s^2]) of the tyres' forces; arguments as `tyre_forces`.
+    """(a_x, a_y [m/s^2], yaw acceleration [rad/s^2]) of four Dugoff tyres' forces; arguments as `tyre_forces`.
 
-    known_x (4,) [N] replaces the tyre's longitudinal force where it is not NaN.
+    known_x (4,) [N] replaces the tyre's longitudinal force where it is not NaN. Written out per wheel, with numbers and
+    no arrays between: this is where the papers' filters spend their time.
     """
-    tyre_forces(row, motion, delta, omega, mu, shape, force_x, force_y)
-    for wheel in range(4):
-        if not math.isnan(known_x[wheel]):
-            force_x[wheel] = known_x[wheel]
-    return accelerations(row, force_x, force_y, delta)
+    fl, fr, rl, rr = wheel_loads(row, ax, ay)
+    a, b, front, rear = row[P.TO_FRONT], row[P.TO_REAR], 0.5 * row[P.TRACK_FRONT], 0.5 * row[P.TRACK_REAR]
+    tyre, aside = (row[P.RADIUS], row[P.SLOPE_X], row[P.SLOPE_Y]), vy + a * rate
+    x_fl, y_fl = _pull(tyre, fl, mu[0], vx - front * rate, aside, steering[0, 0], steering[0, 1], omega[0], known_x[0])
+    x_fr, y_fr = _pull(tyre, fr, mu[1], vx + front * rate, aside, steering[1, 0], steering[1, 1], omega[1], known_x[1])
+    aside = vy - b * rate
+    x_rl, y_rl = _pull(tyre, rl, mu[2], vx - rear * rate, aside, steering[2, 0], steering[2, 1], omega[2], known_x[2])
+    x_rr, y_rr = _pull(tyre, rr, mu[3], vx + rear * rate, aside, steering[3, 0], steering[3, 1], omega[3], known_x[3])
+    moment = a * (y_fl + y_fr) - b * (y_rl + y_rr) + front * (x_fr - x_fl) + rear * (x_rr - x_rl)
+    mass = row[P.MASS]
+    return (x_fl + x_fr + x_rl + x_rr) / mass, (y_fl + y_fr + y_rl + y_rr) / mass, moment / row[P.YAW_INERTIA]
+
+
+@compiled
+def _pull(
+    tyre: tuple[float, float, float],
+    load: float,
+    mu: float,
+    ahead: float,
+    aside: float,
+    cos: float,
+    sin: float,
+    omega: float,
+    known_x: float,
+) -> tuple[float, float]:
+    """Force (ahead, left) [N] in body axes of one wheel; tyre = radius, slope_x, slope_y."""
+    radius, slope_x, slope_y = tyre
+    slip_x, slip_y = _slips(radius, ahead, aside, cos, sin, omega)
+    force_x, force_y = combined_dugoff(slip_x, slip_y, slope_x * load, slope_y * load, mu, load)
+    force_x = force_x if math.isnan(known_x) else known_x
+    return cos * force_x - sin * force_y, sin * force_x + cos * force_y

@@ -66,7 +66,7 @@ def combined_magic(
         return 0.0, 0.0
     theta_x = stiffness_x * slip_x / grip
     theta_y = stiffness_y * slip_y / grip
-    theta = math.hypot(theta_x, theta_y)
+    theta = math.sqrt(theta_x * theta_x + theta_y * theta_y)
     if theta < TINY:
         return 0.0, 0.0
     gain = grip * magic_formula(theta, c, e) / theta
@@ -83,7 +83,7 @@ def combined_dugoff(
         return 0.0, 0.0
     theta_x = stiffness_x * slip_x / grip
     theta_y = stiffness_y * slip_y / grip
-    theta = math.hypot(theta_x, theta_y)
+    theta = math.sqrt(theta_x * theta_x + theta_y * theta_y)
     if theta < TINY:
         return 0.0, 0.0
     gain = grip * dugoff(theta) / theta

@@ -23,10 +23,10 @@ import numpy as np
 from edge_agent.adaptation.rules import ALPHA, RATE, infer_two, rule_table
 from edge_agent.dynamics.parameters import parameter_table
 from edge_agent.estimators import flags
-from edge_agent.estimators.friction_mixture.bank import FlagArray
 from edge_agent.estimators.gaussian import pair
 from edge_agent.estimators.gaussian.bank import (
     GaussianBank,
+    Stretch,
     lost,
     prior_interval,
     sliding,
@@ -36,7 +36,7 @@ from edge_agent.estimators.gaussian.bank import (
 )
 from edge_agent.estimators.gaussian.intake import BEGUN, STEPPED, Track, grip_used, take
 from edge_agent.estimators.gaussian.pair import X
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray, compiled, released
 from schemas.vehicle import Vehicle
 
 DRY = 0.85  # the friction that is set: the paper's first experiment
@@ -65,19 +65,11 @@ def bank(vehicles: Sequence[Vehicle], friction: float = DRY) -> GaussianBank[Mem
     return GaussianBank(parameter_table(vehicles), memory, _advance)
 
 
-@compiled
-def _advance(
-    memory: Memory,
-    track: Track,
-    rows: FloatArray,
-    t: FloatArray,
-    signals: FloatArray,
-    out: FloatArray,
-    _wheels: FloatArray,
-    health: FlagArray,
-) -> None:
+@released
+def _advance(memory: Memory, track: Track, stretch: Stretch, first: int, last: int) -> None:
+    rows, t, signals, out, _wheels, health = stretch
     motion = memory.motion
-    for n in range(t.shape[1]):
+    for n in range(first, last):
         for k in range(t.shape[0]):
             motion.told[n, 1] = 0.0
             told, kind, gone = take(track, rows[n], n, t[k, n], signals[k, n])

@@ -27,18 +27,18 @@ import numpy as np
 
 from edge_agent.adaptation.windows import push, weighted_noise
 from edge_agent.dynamics.body import accelerations
-from edge_agent.dynamics.chassis import tyre_forces
+from edge_agent.dynamics.chassis import turned, tyre_forces
 from edge_agent.dynamics.drive_wheel import blended, drive_wheel, slip_share
 from edge_agent.dynamics.parameters import P, parameter_table
 from edge_agent.dynamics.slip import wheel_velocity
 from edge_agent.estimators import flags
 from edge_agent.estimators.adaptive_federated_ckf import DRY
-from edge_agent.estimators.friction_mixture.bank import FlagArray
 from edge_agent.estimators.friction_mixture.sample import rolling_speed
 from edge_agent.estimators.gaussian.bank import (
     FIRST_V_STD,
     UNKNOWN_V_STD,
     GaussianBank,
+    Stretch,
     lost,
     prior_interval,
     sliding,
@@ -49,7 +49,7 @@ from edge_agent.estimators.gaussian.bank import (
 from edge_agent.estimators.gaussian.intake import BEGUN, STEPPED, Track, grip_used, take
 from edge_agent.filters.sigma import cubature
 from edge_agent.filters.squareroot import deviations, predict, sigma_points, update, weighted_mean
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray, compiled, released
 from schemas.signals import S
 from schemas.vehicle import Vehicle
 
@@ -104,20 +104,12 @@ def bank(vehicles: Sequence[Vehicle], friction: float = DRY) -> GaussianBank[Mem
     return GaussianBank(parameter_table(vehicles), memory, _advance)
 
 
-@compiled
-def _advance(
-    memory: Memory,
-    track: Track,
-    rows: FloatArray,
-    t: FloatArray,
-    signals: FloatArray,
-    out: FloatArray,
-    _wheels: FloatArray,
-    health: FlagArray,
-) -> None:
+@released
+def _advance(memory: Memory, track: Track, stretch: Stretch, first: int, last: int) -> None:
+    rows, t, signals, out, _wheels, health = stretch
     points, work = np.empty((2 * A_STATES, A_STATES)), np.empty((A_ROWS + A_STATES, 4 * A_STATES))
     force_y = np.empty(4)
-    for n in range(t.shape[1]):
+    for n in range(first, last):
         for k in range(t.shape[0]):
             memory.told[n, 1] = 0.0
             told, kind, gone = take(track, rows[n], n, t[k, n], signals[k, n])
@@ -175,7 +167,7 @@ def _forces(
     """Compensated forces (4,) [N] in the motion x (3,), from the tyre model and the forces `observed` by A."""
     motion = np.array([x[X.VX], x[X.VY], x[X.YAW_RATE], use[S.AX], use[S.AY]])
     delta, omega, share = use[S.DELTA : S.DELTA + 4], use[S.OMEGA : S.OMEGA + 4], np.empty(4)
-    tyre_forces(row, motion, delta, omega, mu, SHAPE, force_x, force_y)
+    tyre_forces(row, motion, turned(delta), omega, mu, SHAPE, force_x, force_y)
     for wheel in range(4):
         along, _ = wheel_velocity(row, wheel, x[X.VX], x[X.VY], x[X.YAW_RATE], delta[wheel])
         # a wheel whose speed is missing has no slip to judge by: its force is the observed one

@@ -21,15 +21,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edge_agent.dynamics.chassis import DUGOFF, response
+from edge_agent.dynamics.chassis import response, turned
 from edge_agent.dynamics.parameters import GRAVITY, parameter_table
 from edge_agent.estimators import flags
-from edge_agent.estimators.friction_mixture.bank import FlagArray
 from edge_agent.estimators.gaussian import pair
 from edge_agent.estimators.gaussian.bank import (
     PRIOR_MU,
     PRIOR_MU_STD,
     GaussianBank,
+    Stretch,
     hold_mu,
     interval,
     lost,
@@ -46,7 +46,7 @@ from edge_agent.filters.sigma import cubature
 from edge_agent.filters.squareroot import deviations, update, weighted_mean
 from edge_agent.filters.svd import axis_points
 from schemas.mugrid import LOWER, UPPER
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray, compiled, released
 from schemas.signals import S
 from schemas.vehicle import Vehicle
 
@@ -78,19 +78,11 @@ def bank(vehicles: Sequence[Vehicle]) -> GaussianBank[Memory]:
     return GaussianBank(parameter_table(vehicles), memory, _advance, wheels=True)
 
 
-@compiled
-def _advance(
-    memory: Memory,
-    track: Track,
-    rows: FloatArray,
-    t: FloatArray,
-    signals: FloatArray,
-    out: FloatArray,
-    wheels: FloatArray,
-    health: FlagArray,
-) -> None:
+@released
+def _advance(memory: Memory, track: Track, stretch: Stretch, first: int, last: int) -> None:
+    rows, t, signals, out, wheels, health = stretch
     motion = memory.motion
-    for n in range(t.shape[1]):
+    for n in range(first, last):
         for k in range(t.shape[0]):
             motion.told[n, 1] = 0.0
             told, kind, gone = take(track, rows[n], n, t[k, n], signals[k, n])
@@ -154,17 +146,16 @@ def _measure(
     x, now, use = memory.motion.mean[n], track.now[n], track.use[n]
     points, outcomes, predicted = np.empty((2 * WHEELS, WHEELS)), np.empty((2 * WHEELS, ROWS)), np.empty(ROWS)
     state, measured = np.empty((WHEELS, 2 * WHEELS)), np.empty((ROWS, 2 * WHEELS))
-    known, force_x, force_y, mu = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
+    known, mu = np.empty(4), np.empty(4)
     innovation, std = np.empty(ROWS), np.empty(ROWS)
-    at = np.array([x[X.VX], x[X.VY], x[X.YAW_RATE], x[X.AX], x[X.AY]])
     for wheel in range(4):
         known[wheel] = wheel_force(row, track.before[n], use, wheel, gone)
     axis_points(mean, root, memory.xi, points)
-    delta, omega = use[S.DELTA : S.DELTA + 4], use[S.OMEGA : S.OMEGA + 4]
+    steering, omega = turned(use[S.DELTA : S.DELTA + 4]), use[S.OMEGA : S.OMEGA + 4]
     for p in range(points.shape[0]):
         for wheel in range(4):
             mu[wheel] = min(max(points[p, wheel], LOWER), UPPER)
-        ax, ay, turn = response(row, at, delta, omega, known, mu, DUGOFF, force_x, force_y)
+        ax, ay, turn = response(row, x[X.VX], x[X.VY], x[X.YAW_RATE], x[X.AX], x[X.AY], steering, omega, known, mu)
         outcomes[p, 0], outcomes[p, 1], outcomes[p, 2] = ax, ay, memory.yaw_rate[n] + gone * turn
     weighted_mean(outcomes, memory.weight, predicted)
     deviations(points, mean, memory.weight, state, 0)

@@ -23,10 +23,8 @@ import numpy as np
 
 from edge_agent.adaptation.fuzzy import adapted_within
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.dynamics.chassis import DUGOFF
 from edge_agent.dynamics.parameters import parameter_table
 from edge_agent.estimators import flags
-from edge_agent.estimators.friction_mixture.bank import FlagArray
 from edge_agent.estimators.friction_mixture.sample import rolling_speed
 from edge_agent.estimators.gaussian.bank import (
     FIRST_V_STD,
@@ -34,6 +32,7 @@ from edge_agent.estimators.gaussian.bank import (
     PRIOR_MU_STD,
     UNKNOWN_V_STD,
     GaussianBank,
+    Stretch,
     hold_mu,
     interval,
     lost,
@@ -46,7 +45,7 @@ from edge_agent.estimators.gaussian.intake import BEGUN, STEPPED, Track, grip_us
 from edge_agent.estimators.gaussian.planar import carry
 from edge_agent.filters.sigma import cubature
 from edge_agent.filters.squareroot import predict, sigma_points, update
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray, compiled, released
 from schemas.signals import S
 from schemas.vehicle import Vehicle
 
@@ -101,6 +100,27 @@ class Memory(NamedTuple):
     straight: bool
 
 
+class Scratch(NamedTuple):
+    """What a step writes before it reads it."""
+
+    points: FloatArray  # (12, 6)
+    noise: FloatArray  # (6, 6), zero off the diagonal
+    state: FloatArray  # (6, 6)
+    rows: FloatArray  # (3, 6)
+    innovation: FloatArray  # (3,)
+    std: FloatArray  # (3,)
+    work: FloatArray  # (12, 24)
+
+
+@compiled
+def new_scratch() -> Scratch:
+    """Room for one thread."""
+    return Scratch(
+        np.empty((2 * STATES, STATES)), np.zeros((STATES, STATES)), np.empty((STATES, STATES)),
+        np.empty((ROWS, STATES)), np.empty(ROWS), np.empty(ROWS), np.zeros((2 * STATES, 4 * STATES)),
+    )  # fmt: skip
+
+
 def bank(vehicles: Sequence[Vehicle], memberships: Memberships, setting: Setting | None = None) -> GaussianBank[Memory]:
     """N of these filters; `setting` replaces the one for ordinary sensors and an unknown road."""
     n, rule = len(vehicles), cubature(STATES)
@@ -114,25 +134,16 @@ def bank(vehicles: Sequence[Vehicle], memberships: Memberships, setting: Setting
     return GaussianBank(parameter_table(vehicles), memory, _advance)
 
 
-@compiled
-def _advance(
-    memory: Memory,
-    track: Track,
-    rows: FloatArray,
-    t: FloatArray,
-    signals: FloatArray,
-    out: FloatArray,
-    _wheels: FloatArray,
-    health: FlagArray,
-) -> None:
-    points, work = np.empty((2 * STATES, STATES)), np.zeros((2 * STATES, 4 * STATES))
-    noise = np.zeros((STATES, STATES))
-    for n in range(t.shape[1]):
+@released
+def _advance(memory: Memory, track: Track, stretch: Stretch, first: int, last: int) -> None:
+    rows, t, signals, out, _wheels, health = stretch
+    scratch = new_scratch()
+    for n in range(first, last):
         for k in range(t.shape[0]):
             memory.told[n, 1] = 0.0
             told, kind, gone = take(track, rows[n], n, t[k, n], signals[k, n])
             if kind == STEPPED:
-                _step(memory, track, rows[n], n, gone, points, noise, work)
+                _step(memory, track, rows[n], n, gone, scratch)
                 if lost(memory.mean[n], memory.root[n], X.VX, X.VY, X.YAW_RATE):
                     told, kind = told | flags.RESET, BEGUN
             if kind == BEGUN:
@@ -168,19 +179,16 @@ def _begin(memory: Memory, track: Track, row: FloatArray, n: int, sample: FloatA
 
 
 @compiled
-def _step(
-    memory: Memory, track: Track, row: FloatArray, n: int, gone: float, points: FloatArray, noise: FloatArray,
-    work: FloatArray,
-) -> None:  # fmt: skip
+def _step(memory: Memory, track: Track, row: FloatArray, n: int, gone: float, scratch: Scratch) -> None:
+    points, noise, work = scratch.points, scratch.noise, scratch.work
     mean, root, now = memory.mean[n], memory.root[n], track.now[n]
     sigma_points(mean, root, memory.xi, points)
-    for p in range(points.shape[0]):
-        carry(row, points[p], points[p], track.before[n], track.use[n], gone, False, DUGOFF)
+    carry(row, points, memory.factor[n], track.before[n], track.use[n], gone, False)
     pace = gone / STEP_S
     for i in range(STATES):
         noise[i, i] = memory.process[i] * pace**0.5
     predict(points, memory.weight, memory.weight, noise, mean, root, work)
-    innovation, std, rows = np.empty(ROWS), np.empty(ROWS), np.empty((ROWS, STATES))
+    innovation, std, rows = scratch.innovation, scratch.std, scratch.rows
     keep = 0.5 ** (gone / WINDOW_S)
     for r in range(ROWS):
         # the measurement is linear: the deviations of its points are rows of the factor
@@ -195,7 +203,8 @@ def _step(
                 memory.factor[n, r], memory.actual[n, r], memory.theoretical[n, r], memory.inputs, memory.outputs,
                 pace, LEAST_FACTOR, LARGEST_FACTOR,
             )  # fmt: skip
-    used, log_likelihood, square = update(mean, root, root.copy(), rows, innovation, std, work)
+    scratch.state[:] = root
+    used, log_likelihood, square = update(mean, root, scratch.state, rows, innovation, std, work)
     memory.told[n, 0] = square / max(used, 1)
     memory.told[n, 1] = log_likelihood
     hold_mu(mean, root, X.MU, PRIOR_MU_STD)

@@ -10,20 +10,20 @@ bounded adaptation in the direction of the errata.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from edge_agent.adaptation.memberships import Memberships, load_memberships
+from edge_agent.adaptation.memberships import Memberships
 from edge_agent.dynamics.parameters import parameter_table
 from edge_agent.estimators import adaptive_federated_ckf, compensated_wckf, federated_ckf, paper_aco_fckf, sr_ukf
 from edge_agent.estimators.friction_mixture.advance import Design
 from edge_agent.estimators.friction_mixture.bank import EstimatorBank
-from edge_agent.estimators.friction_mixture.constants import NODES, STATES, constant_row
-from edge_agent.estimators.friction_mixture.nodes import node_table
+from edge_agent.estimators.friction_mixture.constants import NODES, C, constant_row, nominal_states
+from edge_agent.estimators.friction_mixture.curve import curve_tables
+from edge_agent.estimators.friction_mixture.node import Nominal
+from edge_agent.estimators.friction_mixture.nodes import node_table, side_table
 from edge_agent.estimators.gaussian.bank import Bank
-from edge_agent.filters.sigma import cubature
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.vehicle import Vehicle
@@ -38,7 +38,8 @@ ESTIMATORS = {
     "compensated-wckf": "paper 002: electric drive wheels, then motion by compensated tyre forces; friction is set",
     "sr-ukf": "paper 003: square-root unscented filter for four-wheel friction with wheel torque",
 }
-TUNED = Path(__file__).parents[1] / "tuning" / "tuned" / "aco-fckf.json"
+# whose memberships come from the ant colony, and the name of the file that `banks.bank_of` takes them from
+TUNED: Final = {"aco-fckf": "aco-fckf", "paper-aco-fckf": "paper-aco-fckf"}
 
 # the papers' estimators without fuzzy sets that could be tuned
 PLAIN: Final[dict[str, Callable[[Sequence[Vehicle]], Bank]]] = {
@@ -52,13 +53,14 @@ PLAIN: Final[dict[str, Callable[[Sequence[Vehicle]], Bank]]] = {
 def design_of(memberships: Memberships, *, adaptive: bool, constants: FloatArray | None = None) -> Design:
     """The tables of a filter; `constants` (len(C),) replaces the table of constants in studies."""
     mu, prior = node_table(NODES)
-    rule = cubature(STATES)
+    constants = constant_row() if constants is None else constants
     return Design(
-        constants=constant_row() if constants is None else constants,
+        constants=constants,
         mu=mu,
         prior=prior,
-        xi=rule.xi,
-        w_cov=rule.w_cov,
+        sides=side_table(mu, prior, constants[C.UNLIKE]),
+        curve=curve_tables(constants[C.SHAPE], constants[C.CURVATURE]),
+        nominal=Nominal(*nominal_states(constants)),
         inputs=np.array(memberships.inputs),
         outputs=np.array(memberships.outputs),
         scales=np.exp(np.array(memberships.ln_scales)),
@@ -72,11 +74,11 @@ def create(name: str, vehicles: Sequence[Vehicle], *, memberships: Memberships |
     Args:
         name: a key of ESTIMATORS.
         vehicles: nominal vehicles, N of them.
-        memberships: replaces the estimator's own; for tuning and studies.
+        memberships: the fuzzy sets; needed by the estimators in TUNED, and replacing the untuned ones of others.
 
     Raises:
-        InputError: the name is unknown, no vehicle is given, the tuned memberships cannot be read, or memberships are
-            given to an estimator that has none.
+        InputError: the name is unknown, no vehicle is given, tuned memberships are missing, or memberships are given
+            to an estimator that has none.
     """
     if name not in ESTIMATORS:
         raise InputError("estimator", f"{name!r} is unknown", f"choose one of {', '.join(ESTIMATORS)}")
@@ -86,8 +88,10 @@ def create(name: str, vehicles: Sequence[Vehicle], *, memberships: Memberships |
         if memberships is not None:
             raise InputError("memberships", f"{name} has no fuzzy sets to replace", "leave them out")
         return PLAIN[name](vehicles)
-    if name == "paper-aco-fckf":
-        return paper_aco_fckf.bank(vehicles, load_memberships(TUNED) if memberships is None else memberships)
     if memberships is None:
-        memberships = load_memberships(TUNED) if name == "aco-fckf" else Memberships()
+        if name in TUNED:
+            raise InputError("memberships", f"{name} needs tuned ones", "make it with edge_agent.banks.bank_of")
+        memberships = Memberships()
+    if name == "paper-aco-fckf":
+        return paper_aco_fckf.bank(vehicles, memberships)
     return EstimatorBank(parameter_table(vehicles), design_of(memberships, adaptive=name != "ckf"))

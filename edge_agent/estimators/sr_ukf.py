@@ -26,11 +26,10 @@ from typing import NamedTuple
 import numpy as np
 
 from edge_agent.dynamics.body import advance_velocity
-from edge_agent.dynamics.chassis import DUGOFF, response
+from edge_agent.dynamics.chassis import DUGOFF, response, turned, tyre_forces
 from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import GRAVITY, P, parameter_table
 from edge_agent.estimators import flags
-from edge_agent.estimators.friction_mixture.bank import FlagArray
 from edge_agent.estimators.friction_mixture.sample import rolling_speed
 from edge_agent.estimators.gaussian.bank import (
     FIRST_V_STD,
@@ -38,6 +37,7 @@ from edge_agent.estimators.gaussian.bank import (
     PRIOR_MU_STD,
     UNKNOWN_V_STD,
     GaussianBank,
+    Stretch,
     hold_mu,
     interval,
     lost,
@@ -53,7 +53,7 @@ from edge_agent.filters.downdate import update_by_downdate
 from edge_agent.filters.sigma import unscented
 from edge_agent.filters.squareroot import deviations, predict, sigma_points, weighted_mean
 from schemas.mugrid import LOWER, UPPER
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray, compiled, released
 from schemas.signals import S
 from schemas.vehicle import Vehicle
 
@@ -94,18 +94,10 @@ def bank(vehicles: Sequence[Vehicle]) -> GaussianBank[Memory]:
     return GaussianBank(parameter_table(vehicles), memory, _advance, wheels=True)
 
 
-@compiled
-def _advance(
-    memory: Memory,
-    track: Track,
-    rows: FloatArray,
-    t: FloatArray,
-    signals: FloatArray,
-    out: FloatArray,
-    wheels: FloatArray,
-    health: FlagArray,
-) -> None:
-    for n in range(t.shape[1]):
+@released
+def _advance(memory: Memory, track: Track, stretch: Stretch, first: int, last: int) -> None:
+    rows, t, signals, out, wheels, health = stretch
+    for n in range(first, last):
         for k in range(t.shape[0]):
             memory.told[n, 1] = 0.0
             told, kind, gone = take(track, rows[n], n, t[k, n], signals[k, n])
@@ -141,18 +133,21 @@ def _begin(memory: Memory, track: Track, row: FloatArray, n: int, sample: FloatA
 
 
 @compiled
-def _model(
-    row: FloatArray, x: FloatArray, use: FloatArray, mean: FloatArray, share: float, known: FloatArray,
-    force_x: FloatArray,
-) -> tuple[float, float]:  # fmt: skip
-    """(a_y, yaw acceleration) and force_x (4,) of the tyres at x (7,); friction deviates by `share` of its own."""
-    mu, force_y = np.empty(4), np.empty(4)
+def _friction(x: FloatArray, mean: FloatArray, share: float, mu: FloatArray) -> None:
+    """mu (4,) of a point x (7,), which deviates from the mean's by `share` of its own, within the range of friction."""
     for wheel in range(4):
         told = mean[MU + wheel] + share * (x[MU + wheel] - mean[MU + wheel])
         mu[wheel] = min(max(told, LOWER), UPPER)
-    at = np.array([x[X.VX], x[X.VY], x[X.YAW_RATE], use[S.AX], use[S.AY]])
-    delta, omega = use[S.DELTA : S.DELTA + 4], use[S.OMEGA : S.OMEGA + 4]
-    _, ay, turn = response(row, at, delta, omega, known, mu, DUGOFF, force_x, force_y)
+
+
+@compiled
+def _felt(
+    row: FloatArray, x: FloatArray, use: FloatArray, steering: FloatArray, mu: FloatArray, unknown: FloatArray
+) -> tuple[float, float]:
+    """(a_y, yaw acceleration) of the tyres at x (7,)."""
+    _, ay, turn = response(
+        row, x[X.VX], x[X.VY], x[X.YAW_RATE], use[S.AX], use[S.AY], steering, use[S.OMEGA : S.OMEGA + 4], unknown, mu,
+    )  # fmt: skip
     return ay, turn
 
 
@@ -161,13 +156,15 @@ def _step(memory: Memory, track: Track, row: FloatArray, n: int, gone: float) ->
     mean, root, use = memory.mean[n], memory.root[n], track.use[n]
     count = memory.xi.shape[0]
     points, work = np.empty((count, STATES)), np.empty((ROWS + STATES, count + 2 * STATES))
-    noise, unknown, force_x = np.zeros((STATES, STATES)), np.full(4, math.nan), np.empty(4)
+    noise, unknown, mu = np.zeros((STATES, STATES)), np.full(4, math.nan), np.empty(4)
+    steering = turned(use[S.DELTA : S.DELTA + 4])
     middle, share = mean.copy(), told_share(math.hypot(use[S.AX], use[S.AY]) / GRAVITY)
     keep = math.exp(-abs(mean[X.VX]) * gone / FORGET_M)
     sigma_points(mean, root, memory.xi, points)
     for p in range(count):
         x = points[p]
-        _, turn = _model(row, x, use, middle, share, unknown, force_x)
+        _friction(x, middle, share, mu)
+        _, turn = _felt(row, x, use, steering, mu, unknown)
         x[X.VX], x[X.VY] = advance_velocity(x[X.VX], x[X.VY], use[S.AX], use[S.AY], x[X.YAW_RATE], gone)
         x[X.YAW_RATE] += gone * turn
         for wheel in range(MU, STATES):
@@ -198,10 +195,14 @@ def _measure(
     outcomes, predicted, unknown = np.empty((count, ROWS)), np.empty(ROWS), np.full(4, math.nan)
     state, measured = np.empty((STATES, count)), np.empty((ROWS, count))
     innovation, std = np.empty(ROWS), np.empty(ROWS)
-    middle = mean.copy()
+    middle, steering, mu, force_y = mean.copy(), turned(use[S.DELTA : S.DELTA + 4]), np.empty(4), np.empty(4)
+    motion = np.array([0.0, 0.0, 0.0, use[S.AX], use[S.AY]])
     for p in range(count):
         outcomes[p, 0], outcomes[p, 1] = rolling(row, use, points[p], X.YAW_RATE), points[p, X.YAW_RATE]
-        outcomes[p, 2], _ = _model(row, points[p], use, middle, share, unknown, outcomes[p, 3:])
+        _friction(points[p], middle, share, mu)
+        outcomes[p, 2], _ = _felt(row, points[p], use, steering, mu, unknown)
+        motion[:3] = points[p, :3]
+        tyre_forces(row, motion, steering, use[S.OMEGA : S.OMEGA + 4], mu, DUGOFF, outcomes[p, 3:], force_y)
     weighted_mean(outcomes, memory.w_mean, predicted)
     deviations(points, mean, memory.w_cov, state, 0)
     deviations(outcomes, predicted, memory.w_cov, measured, 0)

@@ -9,6 +9,8 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 
 from edge_agent.evaluation.campaign import DEFAULT, Results
+from edge_agent.evaluation.measures import COMPONENTS, bounds
+from edge_agent.evaluation.reliability import LEVELS, shares
 from schemas.figures import Figure
 from schemas.numeric import FloatArray
 
@@ -36,7 +38,7 @@ def of(scenario: str, measure: str, estimator: str = DEFAULT) -> Callable[[Resul
 
 def noise(experiment: str, measure: str) -> Callable[[Results], float]:
     """Mean over seeds of a measure of paper 004's own experiments."""
-    return lambda results: mean(results.noise.get(experiment, {}).get(measure))
+    return lambda results: mean(results.noise.get((experiment, "paper-aco-fckf"), {}).get(measure))
 
 
 def mean(values: FloatArray | None) -> float:
@@ -114,11 +116,26 @@ def figures(results: Results, *, quick: bool) -> list[Figure]:
     for kind, table in (("ideal", results.ideal), ("real", results.real)):
         for (scenario, estimator), found in table.items():
             listed += _context(f"{kind}.{scenario}.{estimator}", found)
-    for experiment, found in results.noise.items():
-        listed += _context(f"noise.004.{experiment}.paper-aco-fckf", found)
+    for (experiment, estimator), found in results.noise.items():
+        listed += _context(f"noise.004.{experiment}.{estimator}", found)
+    for (case, estimator), found in results.faults.items():
+        listed += _context(f"faults.{case}.{estimator}", found)
+    listed += _consistency(results)
     return listed + [
         Figure(f"foreign.{kind}.coverage90", mean(value), SHARE) for kind, value in results.foreign.items()
     ]
+
+
+def _consistency(results: Results) -> list[Figure]:
+    """Bounds of NEES and NIS, and the reliability of every estimator over all scenarios."""
+    listed = []
+    for measure in COMPONENTS if results.seeds else ():
+        for end, value in zip(("lower", "upper"), bounds(measure, results.seeds), strict=True):
+            listed.append(Figure(f"bounds.{measure}.{end}", value, SHARE))
+    for estimator, parts in results.ranks.items():
+        for level, share in zip(LEVELS, shares(np.concatenate(parts)), strict=True):
+            listed.append(Figure(f"reliability.{estimator}.below_{100 * level:02.0f}", float(share), SHARE))
+    return listed
 
 
 def _context(prefix: str, found: dict[str, FloatArray]) -> list[Figure]:

@@ -7,17 +7,21 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from edge_agent.estimators import ESTIMATORS, Bank, Estimates, adaptive_federated_ckf, compensated_wckf, create
+from edge_agent.banks import bank_of
+from edge_agent.estimators import ESTIMATORS, Bank, Estimates, adaptive_federated_ckf, compensated_wckf
+from edge_agent.evaluation import faults
 from edge_agent.evaluation.batch import Batch, estimates, ideal, realistic, repeated
-from edge_agent.evaluation.measures import arrival, false_changes, measures, sides
+from edge_agent.evaluation.measures import arrival, consistency, false_changes, measures, sides
 from edge_agent.evaluation.paper_004 import experiments
-from edge_agent.evaluation.scenarios import FOREIGN, OTHERS, PAPERS, foreign
+from edge_agent.evaluation.reliability import watched
+from edge_agent.evaluation.scenarios import FOREIGN, OTHERS, PAPERS, VEHICLES, foreign
 from schemas.numeric import FloatArray
 
 DEFAULT = "aco-fckf"
 QUICK_ESTIMATORS = (DEFAULT, "paper-aco-fckf")
 HARD = ("split", "abs", "spin")  # unlike roads and wheels past the peak have bars of their own
 QUICK_SCENARIOS = ("004.dlc", "003.split", "default.jump.accel")
+FAULTY_SEEDS = 4  # drives per manoeuvre under each sensor fault: three manoeuvres, thirteen faults, all estimators
 
 
 @dataclass(frozen=True)
@@ -34,31 +38,38 @@ class Results:
 
     real: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)
     ideal: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)
-    noise: dict[str, dict[str, FloatArray]] = field(default_factory=dict)  # paper 004's two experiments
+    noise: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)  # paper 004's experiments
     foreign: dict[str, FloatArray] = field(default_factory=dict)  # coverage of the default, by kind of tyre
+    faults: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)  # by (fault, estimator)
+    ranks: dict[str, list[FloatArray]] = field(default_factory=dict)  # of the truth in the posterior, by estimator
+    seeds: int = 0
     drives: dict[tuple[str, str], Drive] = field(default_factory=dict)
 
 
 def run(seeds: Sequence[int], *, quick: bool, tell: Callable[[str], None]) -> Results:
     """All measurements; `tell` is given one line of progress at a time."""
-    results = Results()
+    results = Results(seeds=len(seeds))
     names = QUICK_ESTIMATORS if quick else tuple(ESTIMATORS)
     results.noise, plotted = experiments(seeds)
     for key, (batch, said) in plotted.items():
         results.drives[key, "paper-aco-fckf"] = Drive(batch, said)
     tell("paper 004, its two noise experiments")
-    for name, scenario in (PAPERS | OTHERS).items():
+    for name, scenario in (PAPERS | OTHERS | VEHICLES).items():
         if quick and name not in QUICK_SCENARIOS:
             continue
         batch = realistic(scenario, seeds)
         exact = repeated(ideal(scenario), 1) if name in PAPERS and not quick else None
         for estimator in names if name in PAPERS else (DEFAULT,):
-            said = estimates(create(estimator, batch.vehicles), batch)
-            results.real[name, estimator] = _all(name, batch, said)
+            said, ranks = watched(bank_of(estimator, batch.vehicles), batch)
+            results.real[name, estimator] = _all(name, batch, said) | consistency(batch, said)
+            results.ranks.setdefault(estimator, []).append(ranks.ravel())
             results.drives[name, estimator] = Drive(batch, said)
             if exact is not None:
                 results.ideal[name, estimator] = _all(name, exact, estimates(_as_in_paper(estimator, exact), exact))
         tell(f"{name}: {scenario.about or scenario.manoeuvre}, {len(seeds)} drives")
+    manoeuvres = tuple(faults.DRIVES)[: 1 if quick else None]
+    results.faults = faults.campaign(seeds[:FAULTY_SEEDS], names, manoeuvres)
+    tell(f"{len(faults.CASES) - 1} sensor faults")
     if not quick:
         results.foreign = _foreign_tyres(seeds, tell)
     return results
@@ -71,7 +82,7 @@ def _as_in_paper(estimator: str, batch: Batch) -> Bank:
         return adaptive_federated_ckf.bank(batch.vehicles, friction)
     if estimator == "compensated-wckf":
         return compensated_wckf.bank(batch.vehicles, friction)
-    return create(estimator, batch.vehicles)
+    return bank_of(estimator, batch.vehicles)
 
 
 def _all(name: str, batch: Batch, said: Estimates) -> dict[str, FloatArray]:
@@ -93,7 +104,7 @@ def _foreign_tyres(seeds: Sequence[int], tell: Callable[[str], None]) -> dict[st
     for scenario in (PAPERS | OTHERS).values():
         for place, kind in enumerate(kinds):
             batch = realistic(foreign(scenario, kind), seeds[place :: len(kinds)] or seeds[:1])
-            said = estimates(create(DEFAULT, batch.vehicles), batch)
+            said = estimates(bank_of(DEFAULT, batch.vehicles), batch)
             found[kind].extend(measures(batch, said)["coverage90"])
     tell("all scenarios on foreign tyres")
     return {kind: np.array(values) for kind, values in found.items()}

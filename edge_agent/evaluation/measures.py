@@ -1,7 +1,8 @@
 """What is measured of estimates against truth; every measure gives one number per drive, (N,).
 
 Legend: NEES squared error of (v_x, v_y) over its stated variance, per component [1], 1 where the stated spread is
-right; NIS squared innovation over its stated variance, per row [1].
+right; NIS squared innovation over its stated variance, per row [1]. Their mean over N drives at one instant has
+95 % of its values within chi-squared bounds if the filter is right (Bar-Shalom, Li, Kirubarajan 2001, 5.4).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ LAST_S = 1.0  # "the last second"
 NEAR = 0.1  # of friction: arrived, or wrong
 HOLD_S = 0.2  # a wrong interval that lasts so long is a false change
 SLOWEST_M_S = 1.0
+COMPONENTS = {"nees": 2, "nis": 3}  # independent squares in each; no estimator measures fewer than three rows
 
 
 def errors(batch: Batch, said: Estimates) -> dict[str, FloatArray]:
@@ -42,16 +44,38 @@ def measures(batch: Batch, said: Estimates) -> dict[str, FloatArray]:
     for name, error in errors(batch, said).items():
         found[f"mae_{name}"] = np.abs(error).mean(axis=0)
         found[f"rmse_{name}"] = np.sqrt((error**2).mean(axis=0))
+    found["rmse_mu"] = np.sqrt(((said.mu - batch.mu) ** 2).mean(axis=0))
     found["mae_mu"] = np.abs(said.mu - batch.mu).mean(axis=0)
     found["mu_error"] = np.abs(said.mu - batch.mu)[end].mean(axis=0)
     found["coverage90"] = covered(batch, said).mean(axis=0)
     found["end_coverage90"] = covered(batch, said)[end].mean(axis=0)
     found["width"] = (said.mu_upper - said.mu_lower).mean(axis=0)
     found["nis"] = said.innovation_nis.mean(axis=0)
-    square = (errors(batch, said)["vx"] / said.vx_std) ** 2 + (errors(batch, said)["vy"] / said.vy_std) ** 2
-    found["nees"] = 0.5 * square.mean(axis=0)
-    for level, bound in (("05", said.mu_lower), ("50", said.mu), ("95", said.mu_upper)):
-        found[f"below_{level}"] = (batch.mu <= bound).mean(axis=0)
+    found["nees"] = nees(batch, said).mean(axis=0)
+    return found
+
+
+def nees(batch: Batch, said: Estimates) -> FloatArray:
+    """Squared error of (v_x, v_y) over its stated variance, per component, (T, N)."""
+    off = errors(batch, said)
+    return np.asarray(0.5 * ((off["vx"] / said.vx_std) ** 2 + (off["vy"] / said.vy_std) ** 2))
+
+
+def bounds(measure: str, drives: int) -> tuple[float, float]:
+    """Where the mean of "nees" or "nis" over so many drives lies 95 times in 100 if the filter is right."""
+    from scipy.stats import chi2
+
+    count = COMPONENTS[measure] * drives
+    return float(chi2.ppf(0.025, count)) / count, float(chi2.ppf(0.975, count)) / count
+
+
+def consistency(batch: Batch, said: Estimates) -> dict[str, FloatArray]:
+    """Share of instants whose mean NEES, and NIS, over the drives lies within its bounds, (1,) each."""
+    found = {}
+    for name, value in (("nees", nees(batch, said)), ("nis", said.innovation_nis)):
+        low, high = bounds(name, value.shape[1])
+        mean = value.mean(axis=1)
+        found[f"{name}_within"] = np.array([((low <= mean) & (mean <= high)).mean()])
     return found
 
 

@@ -8,16 +8,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from edge_agent.adaptation.memberships import Memberships, load_memberships
-from edge_agent.estimators.registry import TUNED
+from edge_agent.adaptation.memberships import Memberships
+from edge_agent.estimators import TUNED
 from edge_agent.evaluation.campaign import DEFAULT, Drive, Results
+from edge_agent.evaluation.measures import bounds, nees
+from edge_agent.tuning.tuned import shipped
 from schemas.figures import Figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-
-INDEPENDENT = 100  # errors behind the bounds of NEES and NIS: more look tighter than correlated errors are
 
 
 def draw(results: Results, figures: Sequence[Figure], folder: Path) -> list[Path]:
@@ -40,7 +39,7 @@ def draw(results: Results, figures: Sequence[Figure], folder: Path) -> list[Path
 def _scenario(scenario: str, drives: dict[str, Drive], path: Path) -> Path:
     from matplotlib import pyplot as plt
 
-    figure, axes = plt.subplots(5, 1, figsize=(9, 12), sharex=True, layout="constrained")
+    figure, axes = plt.subplots(6, 1, figsize=(9, 14), sharex=True, layout="constrained")
     first = next(iter(drives.values()))
     t = first.batch.t[:, 0]
     for axis, (name, label) in zip(
@@ -58,8 +57,11 @@ def _scenario(scenario: str, drives: dict[str, Drive], path: Path) -> Path:
                 t, drive.said.mu_lower[:, 0], drive.said.mu_upper[:, 0], color=line.get_color(), alpha=0.2, lw=0
             )
         axes[4].plot(t, drive.said.adaptation[:, 0], lw=0.8)
+        axes[5].semilogy(t, nees(drive.batch, drive.said).mean(axis=1), lw=0.8)
     axes[3].set(ylabel="μ and its 90 % band", ylim=(0.0, 1.25))
-    axes[4].set(ylabel="factor on R", xlabel="t [s]")
+    axes[4].set(ylabel="factor on R")
+    axes[5].axhspan(*bounds("nees", first.batch.t.shape[1]), color="k", alpha=0.15, lw=0)
+    axes[5].set(ylabel="NEES, all drives", xlabel="t [s]", ylim=(1e-3, 1e3))
     axes[0].set_title(scenario)
     axes[0].legend(fontsize="x-small", ncols=3)
     figure.savefig(path, dpi=80)
@@ -68,10 +70,10 @@ def _scenario(scenario: str, drives: dict[str, Drive], path: Path) -> Path:
 
 
 def _consistency(figures: Sequence[Figure], path: Path) -> Path:
-    """NEES and NIS per scenario and estimator, with the 95 % bounds of so many independent errors."""
+    """NEES and NIS per scenario and estimator, with the 95 % bounds of their mean over the drives at one instant."""
     from matplotlib import pyplot as plt
-    from scipy.stats import chi2
 
+    ends = {figure.name: figure.value for figure in figures if figure.name.startswith("bounds.")}
     drawn, axes = plt.subplots(2, 1, figsize=(9, 8), sharex=True, layout="constrained")
     for axis, measure in zip(axes, ("nees", "nis"), strict=True):
         found: dict[str, dict[str, float]] = {}
@@ -81,8 +83,7 @@ def _consistency(figures: Sequence[Figure], path: Path) -> Path:
                 found.setdefault(estimator, {})[scenario] = figure.value
         for estimator, values in found.items():
             axis.plot(list(values), list(values.values()), "o", label=estimator)
-        low, high = (float(chi2.ppf(level, INDEPENDENT)) / INDEPENDENT for level in (0.025, 0.975))
-        axis.axhspan(low, high, color="k", alpha=0.15, lw=0)
+        axis.axhspan(ends[f"bounds.{measure}.lower"], ends[f"bounds.{measure}.upper"], color="k", alpha=0.15, lw=0)
         axis.set(ylabel=measure.upper(), yscale="log")
     axes[0].legend(fontsize="x-small", ncols=3)
     axes[1].tick_params(axis="x", rotation=90)
@@ -95,8 +96,9 @@ def _memberships(path: Path) -> Path:
     """The fuzzy sets before and after the ant colony."""
     from matplotlib import pyplot as plt
 
-    figure, axes = plt.subplots(2, 2, figsize=(9, 5), layout="constrained")
-    for row, (name, sets) in enumerate((("before", Memberships()), ("after", load_memberships(TUNED)))):
+    figure, axes = plt.subplots(3, 2, figsize=(9, 7), layout="constrained")
+    tuned = ((f"after, {name}", shipped(file)) for name, file in TUNED.items())
+    for row, (name, sets) in enumerate((("before", Memberships()), *tuned)):
         _triangles(axes[row, 0], sets.inputs, f"{name}: mismatch")
         _triangles(axes[row, 1], sets.outputs, f"{name}: step of ln R")
     figure.savefig(path, dpi=80)
@@ -111,18 +113,18 @@ def _triangles(axis: Axes, peaks: tuple[float, ...], title: str) -> None:
 
 
 def _reliability(figures: Sequence[Figure], path: Path) -> Path:
-    """Share of truths below the stated 5 %, 50 % and 95 % quantiles, mean over scenarios."""
+    """Share of truths below each stated quantile, over all scenarios."""
     from matplotlib import pyplot as plt
 
-    found: dict[str, dict[float, list[float]]] = {}
+    found: dict[str, dict[float, float]] = {}
     for figure in figures:
-        if figure.name.startswith("real.") and ".below_" in figure.name and not figure.name.endswith(".sd"):
-            prefix, _, level = figure.name.rpartition(".below_")
-            found.setdefault(prefix.rpartition(".")[2], {}).setdefault(int(level) / 100, []).append(figure.value)
+        if figure.name.startswith("reliability."):
+            estimator, _, level = figure.name.removeprefix("reliability.").rpartition(".below_")
+            found.setdefault(estimator, {})[int(level) / 100] = figure.value
     drawn, axis = plt.subplots(figsize=(5, 5), layout="constrained")
     axis.plot([0, 1], [0, 1], "k:")
     for estimator, levels in found.items():
-        axis.plot(list(levels), [float(np.mean(v)) for v in levels.values()], "o-", label=estimator)
+        axis.plot(list(levels), list(levels.values()), "o-", ms=3, label=estimator)
     axis.set(xlabel="stated", ylabel="share of truths below", title="reliability of friction")
     axis.legend(fontsize="x-small")
     drawn.savefig(path, dpi=80)

@@ -36,7 +36,9 @@ class Fault:
     @property
     def indices(self) -> list[int]:
         """Which channels of a block are meant."""
-        return [i for i, name in enumerate(CHANNELS) if name == self.channel or name.startswith(self.channel + "_")]
+        if self.channel in CHANNELS:  # "yaw" is a channel of its own, and not the yaw rate
+            return [CHANNELS.index(self.channel)]
+        return [i for i, name in enumerate(CHANNELS) if name.startswith(self.channel + "_")]
 
 
 Effect = Callable[[FloatArray, BoolArray, float], None]

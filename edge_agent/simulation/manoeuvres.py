@@ -151,6 +151,16 @@ def accelerating_sine(now: Moment) -> tuple[float, float]:
     return sine(now)[0], min(hold(now, now.speed + 5.0 * smooth_step((now.t - 6.0) / 4.0)), 2.0)
 
 
+def gaining_lane_changes(now: Moment) -> tuple[float, float]:
+    """Lane changes while gaining 10 m/s within fifteen seconds."""
+    return two_lane_changes(now)[0], min(hold(now, now.speed + 10.0 * smooth_step(now.t / 15.0)), 2.0)
+
+
+def gaining_slalom(now: Moment) -> tuple[float, float]:
+    """The slalom while gaining 7 m/s within fifteen seconds."""
+    return slalom(now)[0], min(hold(now, now.speed + 7.0 * smooth_step(now.t / 15.0)), 2.0)
+
+
 def low_turn(now: Moment) -> tuple[float, float]:
     """60 degrees of the steering wheel within .3 s, held; road wheel one sixteenth of it."""
     return math.radians(60.0) / 16.0 * smooth_step(now.t / 0.3), hold(now)
@@ -196,6 +206,8 @@ MANOEUVRES: Final = {
     "j-turn": Manoeuvre(j_turn, kmh(70), 8.0, 0.85, "step of the steering, ISO 7401 in kind"),
     "two-lane-changes": Manoeuvre(two_lane_changes, kmh(30), 25.0, jump(0.5, 0.3, 110.0), "wet, then snow: paper 000"),
     "accelerating-sine": Manoeuvre(accelerating_sine, 20.0, 13.0, 0.70, "sine, then faster: paper 002"),
+    "gaining-lane-changes": Manoeuvre(gaining_lane_changes, kmh(4), 20.0, 0.90, "lane changes, faster: paper 001"),
+    "gaining-slalom": Manoeuvre(gaining_slalom, kmh(4.68), 20.0, 0.90, "slalom, faster: paper 001"),
     "low-turn": Manoeuvre(low_turn, kmh(40), 8.0, 0.35, "a turn on snow: paper 003"),
     "firm-acceleration": Manoeuvre(firm_acceleration, kmh(20), 5.0, 0.85, "0.6 g: paper 003"),
     "brisk-acceleration": Manoeuvre(brisk_acceleration, kmh(20), 6.0, jump(0.85, 0.50, 30.0), "0.45 g onto wet"),

@@ -73,6 +73,7 @@ class Q(IntEnum):
     POWER = len(P) + 10  # [W]
     BRUSH = len(P) + 11  # 1: the tyre's curve is that of the brush model, not the Magic Formula
     SOFTENING = len(P) + 12  # stiffness falls with friction, as (mu/FIRM)^softening; 0: it does not know friction
+    REAR_STEER = len(P) + 13  # angle of the rear wheels over that of the front wheels; 0: they do not steer
 
 
 PARAMETERS: Final = len(P) + len(Q)
@@ -203,14 +204,16 @@ def advance(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: floa
 def command(p: FloatArray, u: FloatArray, steer: float, force: float) -> None:
     """Fill STEER, DRIVE and BRAKE of `u` from a mean road-wheel angle [rad] and a longitudinal force [N].
 
-    The steered wheels follow Ackermann: they point at one centre on the line of the rear axle.
+    The steered wheels follow Ackermann: they point at one centre on the line of the rear axle. Where the rear wheels
+    steer too, `steer` is the angle of a car without that on the same circle: the front wheels turn more, or less.
     """
     base = p[P.TO_FRONT] + p[P.TO_REAR]
     curvature = math.tan(steer) / base
+    front = base * curvature / (1.0 - p[Q.REAR_STEER])
     for i in range(4):
         side = 1.0 if i % 2 == 0 else -1.0
         inner = 1.0 - side * 0.5 * p[P.TRACK_FRONT] * curvature
-        u[U.STEER, i] = math.atan(base * curvature / inner) if i < 2 else 0.0
+        u[U.STEER, i] = math.atan(front / inner) if i < 2 else p[Q.REAR_STEER] * math.atan(front / inner)
         drive_share = p[P.DRIVE_FRONT] if i < 2 else 1.0 - p[P.DRIVE_FRONT]
         brake_share = p[Q.BRAKE_FRONT] if i < 2 else 1.0 - p[Q.BRAKE_FRONT]
         u[U.DRIVE, i] = 0.5 * drive_share * max(force, 0.0) * p[P.RADIUS]

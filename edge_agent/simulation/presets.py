@@ -35,6 +35,7 @@ class TrueVehicle:
     power: float = 90e3
     brush: bool = False  # the brush model's curve in place of the Magic Formula's
     softening: float = 0.0  # power of friction by which the stiffness falls; real tyres 0 to .3
+    rear_steer: float = 0.0  # angle of the rear wheels over that of the front wheels; negative at low speed
 
     def row(self) -> FloatArray:
         """The parameters for `plant`, shape (PARAMETERS,), in the order of P and Q."""
@@ -43,7 +44,7 @@ class TrueVehicle:
         own = (self.shape, self.curvature, self.degression, self.lag, self.roll_leak, self.pitch_leak)
         return np.array([
             *nominal, *own, self.drag, self.rolling, self.slip_limit, self.brake_front, self.power,
-            float(self.brush), self.softening,
+            float(self.brush), self.softening, self.rear_steer,
         ])  # fmt: skip
 
 
@@ -99,6 +100,14 @@ def true_vehicle(vehicle: str | Vehicle | TrueVehicle) -> TrueVehicle:
     if vehicle not in PRESETS:
         raise InputError("vehicle", f"there is no vehicle preset {vehicle!r}", f"choose one of {', '.join(PRESETS)}")
     return PRESETS[vehicle]
+
+
+def matched(vehicle: TrueVehicle) -> TrueVehicle:
+    """The vehicle without what the papers' model leaves out: drag, rolling resistance, lagging loads, degressive tyres.
+
+    The tyre's curve is a Magic Formula as steep in the middle as Dugoff's.
+    """
+    return replace(vehicle, shape=1.5, curvature=-1.0, degression=0.0, lag=1e-3, drag=0.0, rolling=0.0)
 
 
 def nominal(truth: TrueVehicle, rng: np.random.Generator) -> Vehicle:

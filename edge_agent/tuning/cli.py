@@ -1,8 +1,12 @@
-"""`edge-agent tune`: search the memberships, beside a random search of equal budget, and write what was found."""
+"""`edge-agent tune`: search the memberships, beside a random search of equal budget, and write what was found.
+
+With --study: paper 004's own filter under right and wrong R, several searches each way, as figures, table and plot.
+"""
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -22,6 +26,7 @@ from schemas.errors import InputError
 ESTIMATOR: Final = "aco-fckf"
 ANTS, ITERATIONS, DURATION_S = 12, 10, 6.0
 QUICK_ANTS, QUICK_ITERATIONS, QUICK_DURATION_S = 3, 2, 2.0
+REPEATS, QUICK_REPEATS = 8, 2  # searches each way of the study
 POSITIONS: Final = 7  # per vertex: the default and three to each side
 
 
@@ -37,6 +42,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="interval score of friction, or log-likelihood of the innovations (default %(default)s)",
     )
     parser.add_argument("--out", type=Path, default=Path(f"{ESTIMATOR}.json"), help="default %(default)s")
+    parser.add_argument(
+        "--study", type=Path, metavar="DIR",
+        help="the study of paper 004's filter instead: figures.json, study.md, convergence.png, paper-aco-fckf.json",
+    )  # fmt: skip
     parser.add_argument("--quick", action="store_true", help="a few ants on short drives: tries the way, tunes nothing")
 
 
@@ -48,6 +57,8 @@ def run(args: argparse.Namespace) -> int:
         if value < least:
             raise InputError(name, f"{value} is too small", f"use {least} or more")
     duration = QUICK_DURATION_S if args.quick else DURATION_S
+    if args.study is not None:
+        return _study(args, ants, iterations)
 
     print_line(f"simulating {len(TRAIN)} drives to search on, {len(HELD_OUT)} to judge by, {duration:g} s each")
     train, held_out = record(TRAIN, duration), record(HELD_OUT, duration)
@@ -64,6 +75,40 @@ def run(args: argparse.Namespace) -> int:
     )
     save(args.out, _document(found["colony"], args.objective, scores, budget, command, args.seed))
     print(f"wrote {args.out}")
+    return 0
+
+
+def _study(args: argparse.Namespace, ants: int, iterations: int) -> int:
+    """The study, written into a folder."""
+    from edge_agent.tuning import study_report
+
+    if importlib.util.find_spec("matplotlib") is None:
+        raise InputError("study", "its plot needs matplotlib", "install gripmap[demo]")
+    try:
+        args.study.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError("study", f"cannot make {args.study} ({error.strerror})", "name another folder") from error
+    seeds = range(args.seed, args.seed + (QUICK_REPEATS if args.quick else REPEATS))
+    done = study_report.run(
+        ants=ants, iterations=iterations, positions=POSITIONS, seeds=seeds,
+        duration_s=QUICK_DURATION_S if args.quick else DURATION_S,
+        reporter=lambda way: reporter(way, iterations, time.monotonic, print_line),
+    )  # fmt: skip
+    listed = study_report.figures(done)
+    figures.write(args.study / "figures.json", "edge-agent tune --study", list(seeds), listed)
+    text = study_report.markdown(listed)
+    (args.study / "study.md").write_text(text, encoding="utf-8")
+    study_report.draw(listed, ants, args.study / "convergence.png")
+    names = dict(zip(WAYS, ("untuned", "random", "colony"), strict=True))
+    scores = {way: Comparison(**study_report.scores(done, name)) for way, name in names.items()}
+    evaluations = {way: sum(result.evaluations for result in results) for way, results in done.found.items()}
+    command = f"edge-agent tune --seed {args.seed} --ants {ants} --iterations {iterations} --study DIR"
+    document = _document(
+        done.best("colony"), "innovation", scores, Budget(ants=ants, iterations=iterations, evaluations=evaluations),
+        command + " --quick" * args.quick, args.seed, "paper-aco-fckf",
+    )  # fmt: skip
+    save(args.study / "paper-aco-fckf.json", document)
+    print_line(text)
     return 0
 
 
@@ -110,15 +155,16 @@ def _score(memberships: Memberships, drives: Recorded) -> Score:
 
 
 def _document(
-    memberships: Memberships, objective: str, scores: dict[str, Comparison], budget: Budget, command: str, seed: int
-) -> Document:
+    memberships: Memberships, objective: str, scores: dict[str, Comparison], budget: Budget, command: str, seed: int,
+    estimator: str = ESTIMATOR,
+) -> Document:  # fmt: skip
     header = figures.header("tune", [seed])
     provenance = Provenance.model_validate(
         {name: header[name] for name in ("date", "commit", "machine", "versions")}
         | {"command": command, "seed": seed, "budget": budget}
     )
     return Document(
-        estimator=ESTIMATOR,
+        estimator=estimator,
         memberships=memberships.to_json(),
         objective=objective,
         scores=scores,

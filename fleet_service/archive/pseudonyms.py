@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import secrets
 from datetime import UTC, datetime
+from functools import lru_cache
 from hashlib import blake2b
 from pathlib import Path
 from typing import Final
@@ -19,6 +20,7 @@ _DIGEST_BYTES: Final = 8  # 64 bits: a collision among 10⁶ vehicles has probab
 _DAY_NS: Final = 86_400_000_000_000
 
 
+@lru_cache(1 << 16)
 def number(pseudonym: str) -> int:
     """A pseudonym as a signed 64-bit number."""
     return int.from_bytes(bytes.fromhex(pseudonym), signed=True)

@@ -3,64 +3,115 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import reduce
+from operator import and_
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
 
-from fleet_service.admit import Streams
-from fleet_service.archive import segments
+from fleet_service.archive import layout, reading, segments
 from fleet_service.archive.pseudonyms import number
 from fleet_service.fusion import Folded, Fusion, Observations, evidence
 from fleet_service.fusion.constants import EPOCH_NS
+from fleet_service.fusion.space import places
+from fleet_service.streams import Streams
 from schemas import grid
 from schemas.numeric import IntArray
+from schemas.tables import US, US_STEP
 from schemas.wire import Kind
 
 IDENTITY: Final = ["vehicle", "boot", "region", "seq"]
+_FIRST_TIME: Final = {Kind.OBSERVATION: "enter_time", Kind.STATE: "time"}  # by which a batch is too old
+COLUMNS: Final = [
+    *("leave_time", "cell", "sector", "latitude", "longitude", "position_std", "yaw", "mu", "mu_lower", "mu_upper"),
+    *("mu_utilised", "log_likelihood", *IDENTITY, "row", "received_at", "late", "weight"),
+]  # of what the fusion takes
+MARGIN_DEG: Final = 0.002  # around a box: over 100 m, more than a visit's position error moves what it tells
 ROWS_PER_SEQ: Final = 64  # more than a batch has rows: seq and row become one number that keeps their order
 
 
-def restore_streams(root: Path, streams: Streams) -> None:
-    """Note every archived batch as admitted."""
-    for kind in segments.SCHEMAS:
-        for table in segments.read(root, kind, (*IDENTITY, "first_held")):
-            batches = table.group_by(IDENTITY).aggregate([("first_held", "max")])
-            for row in batches.to_pylist():
-                stream = streams[number(row["vehicle"]), row["boot"], kind, row["region"]]
-                stream.raise_to(row["first_held_max"])
-                stream.admit(row["seq"])
+def restore_streams(root: Path, streams: Streams) -> int:
+    """Note every archived batch as admitted; returns the latest time at which one was received [ns], or 0."""
+    seen = 0
+    for kind, first in _FIRST_TIME.items():
+        tables = list(reading.read(root, kind, (*IDENTITY, "first_held", first, "received_at")))
+        table = pa.concat_tables(tables) if tables else segments.SCHEMAS[kind].empty_table()
+        seen = max(seen, int(segments.nanoseconds(table["received_at"]).max(initial=0)))
+        vehicle = _numbers(table["vehicle"].to_numpy().astype(str))
+        boot, region, seq, first_held = (table[name].to_numpy() for name in (*IDENTITY[1:], "first_held"))
+        streams.restore(kind, vehicle, boot, region, seq, first_held, segments.nanoseconds(table[first]))
+    return seen
+
+
+def _numbers(pseudonyms: NDArray[np.str_]) -> IntArray:
+    distinct, index = np.unique(pseudonyms, return_inverse=True)
+    return np.array([number(p) for p in distinct.tolist()], np.int64)[index]
 
 
 def observations(rows: segments.Rows, vehicle: IntArray) -> Observations:
-    """Columns of the archive as the fusion takes them; `vehicle` (n,) are the numbers of the pseudonyms."""
+    """Columns of the archive as the fusion takes them; `vehicle` (n,) are the numbers of the pseudonyms.
+
+    Times are those that the archive keeps, in whole microseconds.
+    """
     _, second = grid.sectors_touched(np.nan_to_num(rows["yaw"]))
     first = rows["sector"].astype(np.int8)
     beside = np.where(np.isnan(rows["yaw"]) | (second == first), -1, second).astype(np.int8)
     return Observations(
-        rows["leave_time"], rows["cell"], first, beside, vehicle, rows["boot"], rows["region"],
+        rows["leave_time"] // US_STEP * US_STEP, rows["cell"], first, beside, vehicle, rows["boot"], rows["region"],
         rows["seq"] * ROWS_PER_SEQ + rows["row"], evidence(rows, rows["told"]),
+        *places(rows["cell"], rows["latitude"], rows["yaw"], rows["position_std"]),
     )  # fmt: skip
 
 
-def replay(root: Path, fusion: Fusion, received_until: int | None = None) -> Iterator[Folded]:
+class Since(NamedTuple):
+    """Which rows a replay folds: received after `received` and until `until` [ns], near `box` [deg].
+
+    Cells do not depend on each other once weights are known, so that those well inside a box come out as in a whole
+    replay.
+    """
+
+    received: int | None = None
+    until: int | None = None
+    box: tuple[float, float, float, float] | None = None
+
+    def where(self) -> pc.Expression | None:
+        """The rows as a filter, or None for all."""
+        parts = []
+        received_at = pc.field("received_at")
+        if self.received is not None:
+            parts.append(received_at > _time(self.received))
+        if self.until is not None:
+            parts.append(received_at <= _time(self.until))
+        if self.box is not None:
+            west, south, east, north = self.box
+            parts.append((pc.field("longitude") > west - MARGIN_DEG) & (pc.field("longitude") < east + MARGIN_DEG))
+            parts.append((pc.field("latitude") > south - MARGIN_DEG) & (pc.field("latitude") < north + MARGIN_DEG))
+        return reduce(and_, parts) if parts else None
+
+
+def _time(ns: int) -> pa.Scalar[Any]:
+    return pa.scalar(ns // US_STEP, pa.int64()).cast(US)
+
+
+def replay(root: Path, fusion: Fusion, since: Since = Since()) -> Iterator[Folded]:  # noqa: B008 immutable
     """Fold the archive into `fusion` in order of time, with the weights that were used; yields once per epoch.
 
     Args:
         root: of the archive.
-        fusion: a new one.
-        received_until: leave out what came later [ns]: the map as it was then.
+        fusion: a new one, or one that holds everything that was received before.
+        since: the rows wanted.
     """
-    tables = list(segments.read(root, Kind.OBSERVATION))
+    days = (None, None if since.until is None else since.until // layout.DAY_NS + 1)
+    tables = list(reading.read(root, Kind.OBSERVATION, COLUMNS, since.where(), days))
     if not tables:
         return
     table = pa.concat_tables(tables)
-    if received_until is not None:
-        table = table.filter(pa.array(table["received_at"].cast(pa.int64()).to_numpy() <= received_until))
     rows = segments.rows_of(table.sort_by("leave_time"))
-    distinct, index = np.unique(rows["vehicle"].astype(str), return_inverse=True)
-    o = observations(rows, np.array([number(p) for p in distinct.tolist()], np.int64)[index])
+    o = observations(rows, _numbers(rows["vehicle"].astype(str)))
     borders = np.flatnonzero(np.diff(o.time // EPOCH_NS)) + 1
     for part in np.split(np.arange(len(o.time)), borders):
         if len(part):

@@ -9,21 +9,24 @@ EPOCH grows with every start of the service and SEQ with every segment, so that 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from fleet_service.archive.files import write_table
+from fleet_service.archive import layout
+from fleet_service.archive.files import SEGMENT, sync_directory, write_synced
 from schemas import mugrid, tables
+from schemas.numeric import IntArray
 from schemas.wire import Kind
 
 SCHEMAS: Final = {Kind.OBSERVATION: tables.OBSERVATION_ARCHIVE, Kind.STATE: tables.STATE_ARCHIVE}
 _FOLDERS: Final = {Kind.OBSERVATION: "inbox", Kind.STATE: "inbox/states"}
+
+_TIMES: Final = ("enter_time", "leave_time", "time", "received_at")
+_STEPS: Final = {f.name: f.step for f in (*tables.OBSERVATION, *tables.STATE) if f.step}
 
 Rows = dict[str, NDArray[Any]]
 
@@ -48,23 +51,57 @@ class Writer:
 
     def __init__(self, root: Path, shard: str) -> None:
         self._root, self._shard, self._seq = root, shard, 0
-        for kind in SCHEMAS:
-            folder(root, kind).mkdir(parents=True, exist_ok=True)
-            for draft in folder(root, kind).glob("*.tmp"):  # of a run that died while writing: never acknowledged
+        folders = [folder(root, kind) for kind in SCHEMAS]
+        for inbox in folders:
+            inbox.mkdir(parents=True, exist_ok=True)
+            for draft in inbox.glob("*.tmp"):  # of a run that died while writing: never acknowledged
                 draft.unlink()
-        used = [int(path.stem.split("-")[-2]) for kind in SCHEMAS for path in paths(root, kind)]
+        for parent in {root.parent, root, *folders}:  # a folder that power loss forgets takes its segments along
+            sync_directory(parent)
+        self._unsynced: set[Path] = set()
+        # Compacted rows are known by the names of their segments, so that these may not be used again either.
+        named = [path for kind in SCHEMAS for path in (*paths(root, kind), *layout.compacted(root, kind))]
+        used = [int(layout.age(path.name)[0]) for path in named]
         self._epoch = max([int(time.time()), *(epoch + 1 for epoch in used)])
 
     def write(self, kind: Kind, rows: Rows) -> Path:
-        """Write one durable segment from columns (n,); `log_likelihood` is (n, 32) with the mask `told`.
+        """Write one segment from columns (n,); `log_likelihood` is (n, 32) with the mask `told`. Durable after `sync`.
 
         Raises:
             OSError: it could not be written; nothing is kept of it.
         """
         self._seq += 1
-        path = folder(self._root, kind) / f"{self._shard}-{self._epoch:010d}-{self._seq:08d}.parquet"
-        write_table(table_of(kind, rows), path)
+        path = folder(self._root, kind) / layout.segment_name(f"{self._shard}-{self._epoch:010d}", self._seq)
+        draft = path.with_name(path.name + ".tmp")
+        write_synced(table_of(kind, rows), draft, SEGMENT)
+        try:
+            draft.rename(path)
+        except OSError:
+            draft.unlink(missing_ok=True)
+            raise
+        self._unsynced.add(path.parent)
         return path
+
+    def sync(self) -> None:
+        """Make the names of the written segments durable. They are written: after a failure only this is repeated.
+
+        Raises:
+            OSError: a folder cannot be synced.
+        """
+        for inbox in sorted(self._unsynced):
+            sync_directory(inbox)
+            self._unsynced.discard(inbox)
+
+
+def stepped(rows: Rows) -> Rows:
+    """Rows with floats at multiples of their column's step and times at microseconds: what is fused is what is kept."""
+    out = {name: np.rint(c / _STEPS[name]) * _STEPS[name] if name in _STEPS else c for name, c in rows.items()}
+    return out | {name: out[name] // tables.US_STEP * tables.US_STEP for name in _TIMES if name in out}
+
+
+def nanoseconds(times: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
+    """Times of a kept table in ns, (n,)."""
+    return np.asarray(times.cast(tables.NS).cast(pa.int64()))
 
 
 def table_of(kind: Kind, rows: Rows) -> pa.Table:
@@ -77,26 +114,10 @@ def _column(f: pa.Field[Any], rows: Rows) -> pa.Array[Any]:
     if f.type == tables.LIKELIHOOD:
         valid = np.packbits(rows["told"], bitorder="little").tobytes()
         return pa.Array.from_buffers(f.type, len(values), [pa.py_buffer(valid), pa.py_buffer(values.tobytes())])
-    if f.type == pa.string():  # few distinct ones in a segment
-        distinct, index = np.unique(values, return_inverse=True)
-        return pa.array(distinct.tolist(), pa.string()).take(index)
+    if f.type == tables.US:
+        values = values // tables.US_STEP
     column: pa.Array[Any] = pa.array(values).cast(f.type)
     return column
-
-
-def read(root: Path, kind: Kind, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
-    """Every segment of a kind; a damaged file is set aside with the ending `.bad`, and reading goes on.
-
-    Raises:
-        OSError: the system cannot read (no memory, no handles, a failing disk).
-    """
-    for path in paths(root, kind):
-        try:
-            yield pq.read_table(path, columns=list(columns) if columns else None)
-        except (pa.ArrowInvalid, OSError) as error:
-            if isinstance(error, OSError) and error.errno is not None:
-                raise  # the system's trouble, not the file's
-            path.rename(path.with_name(path.name + ".bad"))
 
 
 def rows_of(table: pa.Table) -> Rows:
@@ -107,8 +128,8 @@ def rows_of(table: pa.Table) -> Rows:
         if f.type == tables.LIKELIHOOD:
             rows["told"] = np.asarray(column.is_valid())
             rows[f.name] = _likelihoods(column)
-        elif f.type == tables.NS:
-            rows[f.name] = column.cast(pa.int64()).to_numpy()
+        elif f.type == tables.US:
+            rows[f.name] = nanoseconds(column)
         else:
             rows[f.name] = column.to_numpy(zero_copy_only=False)
     return rows

@@ -1,6 +1,6 @@
 """Visits through the service's own path: rows as the archive has them → `observations` → `Fusion.fold` → alerts.
 
-Deliveries are as in life: a few rows come late (some beyond the lateness), and some twice; `Streams` of `admit` drops
+Deliveries are as in life: a few rows come late (some beyond the lateness), and some twice; `Streams` drops
 the second ones, as in the service.
 """
 
@@ -13,11 +13,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.random import Generator
 
-from fleet_service.admit import Streams
 from fleet_service.alerts import Alerts
 from fleet_service.archive.rebuild import observations
 from fleet_service.evaluation.town import CELLS, NS, START, Visits, cell_numbers
 from fleet_service.fusion import Fusion, Observations
+from fleet_service.streams import Streams
 from schemas import grid, mugrid
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.wire import Kind
@@ -38,7 +38,8 @@ def rows_of(v: Visits) -> dict[str, Any]:
     first = np.searchsorted(v.vehicle[order], v.vehicle[order])
     seq[order] = np.arange(n) - first + 1
     return {
-        "leave_time": START + (v.seconds * NS).astype(np.int64), "cell": cell, "sector": np.zeros(n, np.int8),
+        "leave_time": START + (v.seconds * NS).astype(np.int64), "cell": cell, "latitude": grid.centre(cell)[0],
+        "sector": np.zeros(n, np.int8),
         "yaw": np.zeros(n, np.float32), "position_std": np.full(n, 1.5, np.float32), "boot": v.vehicle + 1,
         "region": grid.region_of(cell), "seq": seq, "row": np.zeros(n, np.int32), "told": np.ones(n, bool),
         "log_likelihood": mugrid.encode_log_likelihood(v.told.log_likelihood),

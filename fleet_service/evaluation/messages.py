@@ -11,6 +11,7 @@ from fleet_service.evaluation.drive import rows_of
 from fleet_service.evaluation.town import NS, START, Visits
 from fleet_service.ingest import Message
 from schemas import grid, keys, wire
+from schemas.decoding import decode
 from schemas.numeric import IntArray
 from schemas.wire import Batch, Kind
 
@@ -66,7 +67,7 @@ def _message(
 
 def rebadged(message: Message, thief: int) -> tuple[Message, Message]:
     """Another's message on the thief's own key; and its visits in a batch of the thief's own."""
-    batch = wire.decode(message.payload, message.encoding, message.kind)
+    batch = decode(message.payload, message.encoding, message.kind)
     name = name_of(thief)
     key = keys.observation_key(batch.region, name)
     own = replace(batch, vehicle=name, boot=thief + 1)

@@ -63,14 +63,19 @@ def measure(drive: Drive, folder: Path) -> dict[str, float]:
 def _figures(scores: Scores, measured: np.ndarray[Any, Any]) -> dict[str, float]:
     value = scores.taken(measured)
     return {
-        "fusion.whole_way.coverage90": float(scores.covered.mean()),
-        "fusion.whole_way.rmse": float(np.sqrt(np.mean(value.error**2))),
-        "fusion.whole_way.coverage90.measured": float(value.covered.mean()),
-        "fusion.whole_way.bias.measured": float(value.error.mean()),
-        "fusion.whole_way.rmse.excited3": float(np.sqrt(np.mean(value.error[value.vehicles >= 3] ** 2))),
+        "fusion.whole_way.coverage90": mean(scores.covered),
+        "fusion.whole_way.rmse": mean(value.error**2) ** 0.5,
+        "fusion.whole_way.coverage90.measured": mean(value.covered),
+        "fusion.whole_way.bias.measured": mean(value.error),
+        "fusion.whole_way.rmse.excited3": mean(value.error[value.vehicles >= 3] ** 2) ** 0.5,
         "fusion.whole_way.cells": float(len(scores.error)),
         "fusion.whole_way.cells.measured": float(measured.sum()),
     }
+
+
+def mean(values: np.ndarray[Any, Any]) -> float:
+    """The mean, NaN of nothing: a figure that was not measured holds no bar."""
+    return float(values.mean()) if len(values) else float("nan")
 
 
 def read(path: Path) -> dict[str, Any]:

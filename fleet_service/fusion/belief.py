@@ -2,130 +2,195 @@
 
 Legend
     p    belief: probability of each bin                                        (32,)
+    q    a belief at rest: its bins in 16 bits, the largest 65 535               (32,)
     L    likelihood of one visit, from its bytes                                (32,)
     B    bias kernel: B[i, j] = P(the vehicle takes μ_i for μ_j)                (32, 32), rows sum to 1
     L̃    B·L over its mean: the vote of a vehicle whose bias is unknown          (32,)
-    ε    share of votes that say nothing about the road                         [-]
-    w    weight: how much of a vote is new (1: all)                             [-]
+    s    strength of a vote: what part of it is new, trusted and surely here    [-]
     h    P(the road changed since), 1 - exp(-Δt / CHANGE_S)                     [-]
+
+Arithmetic is in single precision, half as long as double: a belief is a guess of two digits.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fleet_service.fusion import constants as c
 from schemas import mugrid
-from schemas.numeric import ByteArray, FloatArray, compiled
+from schemas.numeric import ByteArray, Float32Array, FloatArray, compiled
+
+PackedArray = NDArray[np.uint16]
+Bins = NDArray[np.floating[Any]]
 
 BOUND, VALUE = 0, 1  # kinds of vote
 _BINS: Final = mugrid.BINS
 _DIFFUSION: Final = 0.5 * (c.DRIFT_PER_ROOT_HOUR / c.BIN_WIDTH) ** 2 / 3600.0  # bins² per second, half the variance
 _STEP: Final = 0.25  # largest share that leaves a bin to each side in one diffusion step: stable and without ripple
 _STEPS: Final = 64  # one day; by then the change hazard has levelled everything
-_LIKELIHOOD: Final = np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT)
+_LIKELIHOOD: Final = np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT).astype(np.float32)
 _CENTRES: Final = mugrid.CENTRES
 _EDGE: Final = (c.SLIPPERY - mugrid.LOWER) / c.BIN_WIDTH
 SLIPPERY_SHARE: Final[FloatArray] = np.clip(_EDGE - np.arange(_BINS), 0.0, 1.0)  # of each bin that lies below SLIPPERY
+PRIOR: Final[Float32Array] = mugrid.PRIOR.astype(np.float32)
+FULL: Final = np.uint16(65535)
+REACH: Final = 6  # bins to each side that the kernel is cut at: 3.6 of its widest standard deviation
+_LEAST_TAP: Final = 1e-9  # single precision has numbers below 1e-38 that cost a hundred times as much to multiply
+PADDED: Final = _BINS + 2 * REACH
 
 
 def bias_kernel() -> FloatArray:
-    """B, a normal of standard deviation hypot(BIAS_RELATIVE·μ, BIAS_ABSOLUTE), cut at the grid's ends."""
+    """B, a normal of standard deviation hypot(BIAS_RELATIVE·μ, BIAS_ABSOLUTE), cut at REACH and the grid's ends."""
     std = np.hypot(c.BIAS_RELATIVE * _CENTRES, c.BIAS_ABSOLUTE)[:, None]
     kernel = np.exp(-0.5 * np.square((_CENTRES[None, :] - _CENTRES[:, None]) / std))
+    kernel[np.abs(np.subtract.outer(np.arange(_BINS), np.arange(_BINS))) > REACH] = 0.0
     return np.asarray(kernel / kernel.sum(axis=1, keepdims=True))
 
 
-_SPREAD: Final = np.ascontiguousarray(bias_kernel().T)  # [j, i]: the inner loop runs over i
-
-
-@compiled
-def _mix(p: FloatArray, change: float) -> None:
+def _taps() -> Float32Array:
+    """B by diagonals: (2·REACH + 1, 32), so that bins stand beside each other."""
+    kernel, taps = bias_kernel(), np.zeros((2 * REACH + 1, _BINS), np.float32)
     for i in range(_BINS):
-        p[i] += change * (1.0 / _BINS - p[i])
+        for j in range(max(i - REACH, 0), min(i + REACH + 1, _BINS)):
+            taps[j - i + REACH, i] = kernel[i, j]
+    taps[taps < _LEAST_TAP] = 0.0
+    return taps
+
+
+_TAPS: Final = _taps()
 
 
 @compiled
-def forget(p: FloatArray, seconds: float) -> None:
-    """Let `seconds` pass: diffusion with reflecting ends, then p ← (1 - h)·p + h·uniform. In place.
+def total(p: Bins) -> float:
+    """Sum of 32 numbers, in four strands: a single one waits for itself."""
+    a, b, d, e = p[0], p[1], p[2], p[3]
+    for i in range(4, _BINS, 4):
+        a += p[i]
+        b += p[i + 1]
+        d += p[i + 2]
+        e += p[i + 3]
+    return (a + b) + (d + e)  # type: ignore[no-any-return]
 
-    Both keep the uniform belief and keep a rising one rising, so that time alone never lowers an upper end below the
-    prior's.
+
+@compiled
+def unpack(belief: PackedArray, row: int, p: Bins) -> None:
+    """p of a belief at rest."""
+    whole = 0
+    for i in range(_BINS):
+        whole += belief[row, i]
+    scale = np.float32(1.0) / np.float32(whole)
+    for i in range(_BINS):
+        p[i] = np.float32(belief[row, i]) * scale
+
+
+@compiled
+def pack(p: Bins, belief: PackedArray, row: int) -> None:
+    """Put a belief at rest; it need not be normalised. Rounding keeps a rising one rising and a uniform one uniform."""
+    a, b = p[0], p[1]
+    for i in range(2, _BINS, 2):
+        a = max(a, p[i])
+        b = max(b, p[i + 1])
+    scale = np.float32(FULL) / np.float32(max(a, b))
+    for i in range(_BINS):
+        belief[row, i] = np.uint16(np.float32(p[i]) * scale + np.float32(0.5))
+
+
+@compiled
+def mix(p: Bins, change: float, prior: Float32Array) -> None:
+    """p ← (1 - h)·p + h·prior, in place."""
+    h = np.float32(change)
+    for i in range(_BINS):
+        p[i] += h * (prior[i] - p[i])
+
+
+@compiled
+def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded: Bins) -> None:
+    """Let time pass: diffusion over `drift_s` with reflecting ends, then the hazard of a change over `change_s`.
+
+    In place. Both keep the uniform belief and keep a rising one rising, so that time alone never lowers an upper end
+    below the prior's. `padded` (34 at least) is for keeps.
     """
-    if seconds <= 0.0:
-        return
-    total = _DIFFUSION * seconds
-    steps = min(math.ceil(total / _STEP), _STEPS)
-    share = min(total / steps, _STEP)
-    for _ in range(steps):
-        left = p[0]
-        for i in range(_BINS - 1):
-            here = p[i]
-            p[i] += share * (left - 2.0 * here + p[i + 1])
-            left = here
-        p[_BINS - 1] += share * (left - p[_BINS - 1])
-    _mix(p, -math.expm1(-seconds / c.CHANGE_S))
+    if drift_s > 0.0:
+        whole = _DIFFUSION * drift_s
+        steps = min(math.ceil(whole / _STEP), _STEPS)
+        share = np.float32(min(whole / steps, _STEP))
+        for _ in range(steps):
+            padded[0], padded[_BINS + 1] = p[0], p[_BINS - 1]
+            for i in range(_BINS):
+                padded[i + 1] = p[i]
+            for i in range(_BINS):
+                p[i] += share * ((padded[i] - padded[i + 1]) + (padded[i + 2] - padded[i + 1]))
+    if change_s > 0.0:
+        mix(p, -math.expm1(-change_s / c.CHANGE_S), prior)
 
 
 @compiled
-def doubt(p: FloatArray, seconds: float, power: float) -> None:
-    """Make up what `forget` over `seconds` lacks to CHANGE_LEAST, for a value of which `power` is new. In place."""
-    lacking = c.CHANGE_LEAST * power + math.expm1(-max(seconds, 0.0) / c.CHANGE_S)
+def doubt(p: Bins, change_s: float, power: float, prior: Float32Array) -> None:
+    """Make up what `forget` over `change_s` lacks to CHANGE_LEAST, for a value of which `power` is new. In place."""
+    lacking = c.CHANGE_LEAST * power + math.expm1(-max(change_s, 0.0) / c.CHANGE_S)
     if lacking > 0.0:
-        _mix(p, lacking)
+        mix(p, lacking, prior)
 
 
 @compiled
 def kind_of(evidence: ByteArray) -> int:
     """VALUE where the likelihood falls towards the upper end by more than senders differ; else BOUND."""
-    least = 255
+    least = np.uint8(255)
     for i in range(_BINS):
         least = min(least, evidence[i])
-    return VALUE if evidence[_BINS - 1] - least >= c.VALUE_DROP_STEPS else BOUND
+    return VALUE if evidence[_BINS - 1] >= int(least) + c.VALUE_DROP_STEPS else BOUND
 
 
 @compiled
-def spread(evidence: ByteArray, kind: int, out: FloatArray) -> None:
-    """L̃ of a visit into `out`, mean 1. The fall of a BOUND above its maximum is noise and is levelled."""
-    out[:] = 0.0
-    steps = 255
-    for j in range(_BINS):
-        steps = int(evidence[j]) if kind == VALUE else min(steps, int(evidence[j]))
-        likelihood = _LIKELIHOOD[steps]
-        for i in range(_BINS):
-            out[i] += _SPREAD[j, i] * likelihood
-    total = 0.0
+def spread(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> None:
+    """L̃ of a visit into `out` (32), mean 1. The fall of a BOUND above its maximum is noise and is levelled.
+
+    `padded` (PADDED) must hold zeros in its first and last REACH places.
+    """
+    if kind == VALUE:
+        for j in range(_BINS):
+            padded[REACH + j] = _LIKELIHOOD[evidence[j]]
+    else:
+        steps = np.uint8(255)
+        for j in range(_BINS):
+            steps = min(steps, evidence[j])
+            padded[REACH + j] = _LIKELIHOOD[steps]
     for i in range(_BINS):
-        total += out[i]
+        here = np.float32(0.0)
+        for k in range(2 * REACH + 1):
+            here += _TAPS[k, i] * padded[i + k]
+        out[i] = here
+    scale = np.float32(_BINS) / np.float32(total(out))
     for i in range(_BINS):
-        out[i] *= _BINS / total
+        out[i] *= scale
 
 
 @compiled
-def vote(p: FloatArray, spread_likelihood: FloatArray, contamination: float, power: float) -> None:
-    """p ← p·((1 - ε)·L̃ + ε)^w over its sum. In place."""
-    total = 0.0
+def vote(p: Bins, spread_likelihood: Bins, strength: float) -> None:
+    """p ← p·(s·L̃ + 1 - s), in place and not normalised."""
+    s, rest = np.float32(strength), np.float32(1.0 - strength)
     for i in range(_BINS):
-        factor = (1.0 - contamination) * spread_likelihood[i] + contamination
-        p[i] *= factor if power == 1.0 else factor**power
-        total += p[i]
-    for i in range(_BINS):
-        p[i] /= total
+        p[i] *= s * spread_likelihood[i] + rest
 
 
 @compiled
-def describe(likelihood: FloatArray) -> tuple[float, float, float]:
-    """Mean, standard deviation and P(slippery) of a likelihood against the uniform prior."""
-    total, first, slippery = 0.0, 0.0, 0.0
+def mean_of(likelihood: Bins) -> float:
+    """Mean of a likelihood of mean 1 against the uniform prior."""
+    first = 0.0
     for i in range(_BINS):
-        total += likelihood[i]
         first += likelihood[i] * _CENTRES[i]
-        slippery += likelihood[i] * SLIPPERY_SHARE[i]
-    mean = first / total
-    second = 0.0
+    return first / _BINS
+
+
+@compiled
+def describe(likelihood: Bins, mean: float) -> tuple[float, float]:
+    """Standard deviation about `mean`, and P(slippery), of a likelihood of mean 1 against the uniform prior."""
+    second, slippery = 0.0, 0.0
     for i in range(_BINS):
         second += likelihood[i] * (_CENTRES[i] - mean) ** 2
-    return mean, math.sqrt(second / total), slippery / total
+        slippery += likelihood[i] * SLIPPERY_SHARE[i]
+    return math.sqrt(second / _BINS), slippery / _BINS

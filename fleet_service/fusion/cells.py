@@ -1,78 +1,92 @@
-"""The cells, structure of arrays: one row ("slot") per cell and sector that anybody visited."""
+"""The cells: one row ("slot") per cell and sector that anybody visited. Columns to read, records in memory.
+
+The belief of a slot is one run of 64 bytes and all else another, so that a visit to a cell that was not lately in use
+costs two reads of memory and not one for every column.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeVar
+from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from fleet_service.fusion.belief import FULL, PackedArray
 from schemas import mugrid
 from schemas.numeric import Float32Array, IntArray, compiled
 
-NOBODY = -1
-WITNESSES = 3  # remembered per slot: as many as an alert ever needs
+NONE: Final = -1
+NOBODY: Final = -1
+SECOND: Final = 10**9  # ns
+Records = NDArray[np.void]
+Int32Array = NDArray[np.int32]
+UIntArray = NDArray[np.uint32]
+
+CELL: Final = np.dtype(
+    [("key", "i8"), ("time", "i8"), ("first", "i8"), ("returned", "u8"), ("aged", "f4"), ("visits", "u4"),
+     ("vehicles", "u4"), ("values", "f4"), ("crowd", "f4", (2,)), ("window", "i4"), ("voice", "i4")]
+)  # fmt: skip
 
 
 class Cells(NamedTuple):
     """What is known of each slot.
 
     Attributes:
-        belief: (n, 32) probability of each bin at `time`; single precision halves the memory of a country.
-        time: (n,) last observation that was folded [ns].
+        belief: (n, 32) bins in 16 bits, see `belief.unpack`, at `time` less `aged`.
+        key: (n,) cell · 4 + sector.
+        time: (n,) last observation that was folded [ns]; 0 before the first.
         first: (n,) first one [ns].
+        returned: (n,) a bit for each remainder of the vehicles whose visits were forgotten, so that who comes back is
+            not counted as another.
+        aged: (n,) seconds before `time` that the belief has not forgotten yet.
         visits: (n,) observations.
         vehicles: (n,) distinct vehicles.
         values: (n,) votes with a value, fractions of repeated ones summed.
         crowd: (n, 2) bounds and values of vehicles that are not trusted, as far as they are not renewed.
-        witness: (n, WITNESSES) the last distinct vehicles that called it slippery, or NOBODY.
-        witnessed: (n, WITNESSES) when they did [ns].
+        window: (n,) row of the slot's window, or NONE.
+        voice: (n,) row of its voices, or NONE where nobody gave a value.
     """
 
-    belief: Float32Array
+    belief: PackedArray
+    key: IntArray
     time: IntArray
     first: IntArray
-    visits: IntArray
-    vehicles: IntArray
+    returned: NDArray[np.uint64]
+    aged: Float32Array
+    visits: UIntArray
+    vehicles: UIntArray
     values: Float32Array
     crowd: Float32Array
-    witness: IntArray
-    witnessed: IntArray
+    window: Int32Array
+    voice: Int32Array
 
 
-def empty(slots: int) -> Cells:
-    """Slots that hold the prior."""
-    return Cells(
-        np.full((slots, mugrid.BINS), 1.0 / mugrid.BINS, np.float32),
-        np.zeros(slots, np.int64),
-        np.zeros(slots, np.int64),
-        np.zeros(slots, np.int64),
-        np.zeros(slots, np.int64),
-        np.zeros(slots, np.float32),
-        np.zeros((slots, 2), np.float32),
-        np.full((slots, WITNESSES), NOBODY, np.int64),
-        np.zeros((slots, WITNESSES), np.int64),
-    )
+def cells_of(belief: PackedArray, records: Records) -> Cells:
+    """Columns of records."""
+    return Cells(belief, *(records[name] for name in CELL.names or ()))
 
 
-Columns = TypeVar("Columns", bound=tuple[object, ...])
-
-
-def extended(old: Columns, new: Columns) -> Columns:
-    """`new`, with the rows of `old` in front."""
-    for source, target in zip(old, new, strict=True):
-        target[: len(source)] = source  # type: ignore[index, arg-type]
-    return new
+def no_beliefs(rows: int) -> PackedArray:
+    """Room for beliefs at rest."""
+    return np.zeros((rows, mugrid.BINS), np.uint16)
 
 
 @compiled
-def copy_slot(source: Cells, target: Cells, slot: int) -> None:
-    """One slot from one store to another."""
-    target.belief[slot] = source.belief[slot]
-    target.time[slot] = source.time[slot]
-    target.first[slot] = source.first[slot]
-    target.visits[slot] = source.visits[slot]
-    target.vehicles[slot] = source.vehicles[slot]
-    target.values[slot] = source.values[slot]
-    target.crowd[slot] = source.crowd[slot]
-    target.witness[slot] = source.witness[slot]
-    target.witnessed[slot] = source.witnessed[slot]
+def begin(belief: PackedArray, cells: Records, slot: int, key: int) -> None:
+    """A slot that holds the prior."""
+    belief[slot] = FULL
+    cells[slot].key = key
+    cells[slot].window = NONE
+    cells[slot].voice = NONE
+
+
+@compiled
+def copy_slot(
+    belief: PackedArray, cells: Records, at: int, to_belief: PackedArray, to_cells: Records, to: int
+) -> None:  # fmt: skip
+    """What is known of a slot, from one row to another; not its window and voice."""
+    for i in range(mugrid.BINS):
+        to_belief[to, i] = belief[at, i]
+    window, voice = to_cells[to].window, to_cells[to].voice
+    to_cells[to] = cells[at]
+    to_cells[to].window, to_cells[to].voice = window, voice

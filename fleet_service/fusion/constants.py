@@ -27,6 +27,10 @@ CHANGE_S: Final = 10800.0
 # chance of it: three passes turn a firm belief. Lower bounds do not: however many there are, they wear nothing away.
 CHANGE_LEAST: Final = 0.003
 
+# Time is let pass over a belief in portions of this length: shorter ones would be lost in the rounding of its 16 bits,
+# and none moves an interval by a tenth of a bin.
+FORGET_S: Final = 10.0
+
 # A vehicle's vote in a cell counts again in the measure in which the map forgets the first one, by drift as by change;
 # so that no vehicle can hold a cell by driving over it all day.
 VOTE_RENEWAL_S: Final = 3600.0
@@ -41,6 +45,12 @@ NOVELTY_STD: Final = 0.05
 VOTES: Final = 2.0
 # ... and only at a visit of its own: nobody drives round a block in less. So a flood of reports is one report.
 REVISIT_S: Final = 20.0
+# ... and so many visits of one vehicle to one cell are kept for the window; more are archived and not fused. Six visits
+# of their own fit into it (REVISIT_S), and their votes would be worth nothing.
+WAITING_MOST: Final = 32
+# So long a vehicle's visits to a cell are remembered, to the hour: by then its vote counts whole again (1 - e⁻⁶), and
+# memory is the vehicles of a quarter of a day and not of a year.
+FORGOTTEN_S: Final = 6 * 3600.0
 # For a lower bound, "something else" is this much more grip used.
 NOVELTY_UTILISED: Final = 0.10
 
@@ -48,6 +58,13 @@ NOVELTY_UTILISED: Final = 0.10
 # log-likelihood), so a fall towards the upper end of less than twice that is taken as flat: a bound, not a value.
 VALUE_DROP_NATS: Final = 1.0
 VALUE_DROP_STEPS: Final = int(VALUE_DROP_NATS * mugrid.STEPS_PER_NAT)
+
+# A fix's error spreads a visit over the cells before and behind: each gets the vote in the measure in which the vehicle
+# was there. Shares below this stay with the visit's own cell: receivers of 1.5 m leave 6 % to each side, which is part
+# of CONTAMINATION, and thrice the votes would say nothing more.
+SPREAD_LEAST: Final = 0.08
+SPREAD_CELLS: Final = 2  # to each side; who is further off has no position
+HERE_SHARE: Final = 0.5  # more probably here than elsewhere: counts as a visit, and is held against others'
 
 # A posterior (μ, interval) is a value only where this share of μ was used (contract), else a lower bound.
 VALUE_UTILISATION: Final = 0.6
@@ -62,7 +79,7 @@ SLIPPERY: Final = 0.4
 # Honest vehicles then agree in 95 % of their meetings (fixes in the wrong cell, roads that change), whatever the road.
 PEERS_AGREE: Final = 2.5
 PEERS_DISAGREE: Final = 4.0
-PEER_NS: Final = 900 * 10**9  # values further apart in time may both be right
+PEER_S: Final = 900  # values further apart in time may both be right
 PEER_STD: Final = 0.25  # wider ones agree with everything
 # Meetings with one vehicle after which the old count half: who was honest and begins to lie is seen in minutes, and a
 # repaired sensor as soon; the mean over many others keeps it quiet.

@@ -12,17 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.belief import forget
-from fleet_service.fusion.cells import Cells, empty, extended
-from fleet_service.fusion.table import EMPTY, grown, places_of, room, slots_of
-from fleet_service.fusion.trust import newcomer, no_peers, no_speakers, trusted
-from fleet_service.fusion.window import NONE, Entries, Links, Pairs, absorb, no_entries, no_links, no_pairs, settle
+from fleet_service.fusion.belief import PackedArray, forget, unpack
+from fleet_service.fusion.cells import NOBODY, NONE, SECOND, Cells, Records
+from fleet_service.fusion.stores import Stores, distinct
+from fleet_service.fusion.trust import newcomer, trusted
+from fleet_service.fusion.votes import PADDED, SCRATCH, P
+from fleet_service.fusion.weather import Reports, Weather, aged, no_reports, weather_of
+from fleet_service.fusion.window import absorb, settle
 from schemas import grid
 from schemas.numeric import BoolArray, ByteArray, Float32Array, FloatArray, IntArray, compiled
 
 SmallArray = NDArray[np.int8]
-_FIRST_SLOTS = 1024
-_FIRST_VEHICLES = 64
+_ANY = 1 << 62
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,8 @@ class Observations:
         vehicle, boot, region, place: identity; `vehicle` is a number that stands for the vehicle, `place` counts rows
             in the stream of (vehicle, boot, region).
         evidence: (n, 32) log-likelihood in steps, see `likelihoods.evidence`.
+        beside: (n, k) other cells in which the vehicle may have been instead, -1 where there is none.
+        beside_share: (n, k) probability that it was there; what is left belongs to `cell`.
     """
 
     time: IntArray
@@ -46,6 +49,8 @@ class Observations:
     region: IntArray
     place: IntArray
     evidence: ByteArray
+    beside: IntArray
+    beside_share: Float32Array
 
     def take(self, rows: IntArray | BoolArray) -> Observations:
         """Some of the rows."""
@@ -54,7 +59,8 @@ class Observations:
 
 @dataclass(frozen=True)
 class Folded:
-    """What became of observations: late or fused (n,), weight that was used (n,), slots that changed (k,)."""
+    """What became of observations: whether each was late or one too many, and so not fused (n,); weight that was used
+    (n,); slots that changed (k,)."""
 
     late: BoolArray
     weight: Float32Array
@@ -66,32 +72,66 @@ class Fusion:
 
     Args:
         lateness_s: L [s]; an observation older than the checkpoint is reported late and not fused.
+
+    Attributes:
+        stores: cells, windows, pairs and vehicles.
+        trusts: epoch from which they act, weights by vehicle, and that of an unknown vehicle; the oldest first.
+        reports: the weather that may still be asked for.
     """
 
     def __init__(self, lateness_s: float) -> None:
         self._lateness_ns = int(lateness_s * 1e9)
         self._kept_epochs = self._lateness_ns // c.EPOCH_NS + 2  # whose trust an observation in time may still need
         self._epoch: int | None = None
-        self._keys, self._slots = np.full(2 * _FIRST_SLOTS, EMPTY), np.zeros(2 * _FIRST_SLOTS, np.int64)
-        self.cell, self.sector = np.zeros(_FIRST_SLOTS, np.int64), np.zeros(_FIRST_SLOTS, np.int8)
-        self.size = 0
-        self.live, self._kept = empty(_FIRST_SLOTS), empty(_FIRST_SLOTS)
-        self._links: Links = no_links(_FIRST_SLOTS)
-        self._entries: Entries = no_entries(_FIRST_SLOTS)
-        self._pairs, self._pair_count = no_pairs(2 * _FIRST_SLOTS), 0
-        self._vehicles: dict[int, int] = {}
-        self._speakers, self._peers = no_speakers(_FIRST_SLOTS), no_peers(_FIRST_VEHICLES)
-        self._trust: list[tuple[int, Float32Array, float]] = [(-1, np.zeros(0, np.float32), newcomer(False))]
+        self.stores = Stores()
+        self.trusts: list[tuple[int, Float32Array, float]] = [(-1, np.zeros(0, np.float32), newcomer(False))]
+        self.reports: Reports = no_reports()
+        self._weather: Weather = weather_of(self.reports)
+
+    def resume(self, epoch: int | None, trusts: list[tuple[int, Float32Array, float]], reports: Reports) -> None:
+        """Go on from an epoch, the weights that were given since, and the weather; the stores are set before."""
+        self._epoch, self.trusts, self.reports = epoch, trusts, reports
+        self._weather = weather_of(reports)
+
+    @property
+    def epoch(self) -> int:
+        """Epoch of the latest time; -1 before the first."""
+        return -1 if self._epoch is None else self._epoch
+
+    @property
+    def live(self) -> Cells:
+        """The cells as they are now; rows beyond `size` are not in use."""
+        return self.stores.live
+
+    @property
+    def size(self) -> int:
+        """Slots in use."""
+        return self.stores.size
+
+    @property
+    def cell(self) -> IntArray:
+        """Cell of every slot, (size,)."""
+        return self.live.key[: self.size] // grid.SECTORS
+
+    @property
+    def sector(self) -> SmallArray:
+        """Sector of every slot, (size,)."""
+        return (self.live.key[: self.size] % grid.SECTORS).astype(np.int8)
 
     @property
     def waiting(self) -> int:
         """Observations in the window, counted per cell."""
-        return len(self._entries.free) - int(self._entries.unused[0])
+        return self.stores.waiting
 
     @property
     def checkpoint(self) -> int | None:
         """Time of the checkpoint [ns]; None before the first observation."""
         return None if self._epoch is None else self._epoch * c.EPOCH_NS - self._lateness_ns
+
+    @property
+    def next_epoch(self) -> int:
+        """First time [ns] of which no observation was folded yet; 0 before the first."""
+        return 0 if self._epoch is None else (self._epoch + 1) * c.EPOCH_NS
 
     def fold(self, o: Observations, weight: Float32Array | None = None, late: BoolArray | None = None) -> Folded:
         """Take in observations in any order.
@@ -104,40 +144,60 @@ class Fusion:
             late = np.zeros(len(o.time), bool) if self.checkpoint is None else o.time < self.checkpoint
         used = np.zeros(len(o.time), np.float32)
         touched = [np.zeros(0, np.int64)]
-        vehicle = self._indices(o.vehicle)
+        vehicle = self.stores.vehicles_of(o.vehicle)
         epoch = o.time // c.EPOCH_NS
-        for e in np.unique(epoch[~late]).tolist():
+        for e in distinct(epoch[~late]).tolist():
             self._advance(e)
             rows = np.flatnonzero((epoch == e) & ~late)
             used[rows] = self._weights(e, vehicle[rows]) if weight is None else weight[rows]
-            touched.append(self._absorb(o.take(rows), vehicle[rows], used[rows]))
-        return Folded(late, used, np.unique(np.concatenate(touched)))
+            slots, left_out = self._absorb(o, rows, vehicle, used, c.WAITING_MOST if weight is None else _ANY)
+            touched.append(slots)
+            late = late | left_out
+            used[left_out] = 0.0
+        return Folded(late, used, distinct(np.concatenate(touched)))
+
+    def weather(self, reports: Reports) -> None:
+        """Take in weather; each report must act from `next_epoch` on at the earliest, or the map depends on when it
+        came."""
+        columns = (np.concatenate([getattr(r, f.name) for r in (self.reports, reports)]) for f in fields(Reports))
+        self.reports = Reports(*columns)
+        if self.checkpoint is not None:  # all that a belief may still ask for is younger than its last visit
+            self.reports = _recent(self.reports, self._oldest())
+        self._weather = weather_of(self.reports)
 
     def beliefs(self, slots: IntArray, now: int) -> FloatArray:
         """Belief of each slot, (k, 32), with what time did to it until `now` [ns]."""
-        return _beliefs(self.live, slots, now)
+        return _beliefs(self.stores.state.belief, self.stores.state.cells, self._weather, slots, now)
+
+    def believed(self, slots: IntArray) -> FloatArray:
+        """Belief of each slot, (k, 32), at its last observation."""
+        packed = self.stores.state.belief[slots].astype(np.float64)
+        return np.asarray(packed / packed.sum(axis=1, keepdims=True))
 
     def slots_of(self, cell: IntArray, sector: IntArray | SmallArray) -> IntArray:
         """Slot of each cell and sector, -1 where nobody was."""
-        place = places_of(self._keys, cell * grid.SECTORS + sector)
-        return np.where(self._keys[place] == EMPTY, NONE, self._slots[place])
+        return self.stores.slots_of(cell * grid.SECTORS + sector)
 
     def trust(self, vehicle: int) -> float:
         """Weight of a vehicle's next vote."""
-        index = self._vehicles.get(vehicle)
-        newest = self._trust[-1][0]
-        return float(self._weights(newest, np.array([len(self._vehicles) if index is None else index]))[0])
+        index = self.stores.known(np.array([vehicle]))
+        newest = self.trusts[-1][0]
+        return float(self._weights(newest, np.where(index < 0, self.stores.vehicles, index))[0])
 
-    def _indices(self, vehicle: IntArray) -> IntArray:
-        ids, inverse = np.unique(vehicle, return_inverse=True)
-        known = self._vehicles
-        indices = np.array([known.setdefault(i, len(known)) for i in ids.tolist()], np.int64)
-        if len(known) > len(self._peers.other):
-            self._peers = extended(self._peers, no_peers(2 * len(known)))
-        return np.asarray(indices[inverse])
+    def witnesses(self, slots: IntArray, kind: int, since: IntArray | int) -> tuple[IntArray, IntArray]:
+        """Vehicles that called slots (k,) GRIP or ICE after `since` [ns] and are still trusted: how many, and the last.
+
+        At most WITNESSES are remembered; the last time [ns] is 0 where there is none.
+        """
+        voice, voices = self.live.voice[slots], self.stores.state.voices
+        who = np.where(voice[:, None] == NONE, NOBODY, voices["witness"][voice, kind])
+        when = voices["witnessed"][voice, kind].astype(np.int64) * SECOND
+        trust = self._weights(self.trusts[-1][0], np.maximum(who, 0)) >= c.WITNESS_TRUST
+        counted = (who != NOBODY) & trust & (when > np.reshape(since, (-1, 1)))
+        return counted.sum(axis=1), np.where(counted, when, 0).max(axis=1)
 
     def _weights(self, epoch: int, vehicle: IntArray) -> Float32Array:
-        record = next(record for record in reversed(self._trust) if record[0] <= epoch or record[0] < 0)
+        record = next(record for record in reversed(self.trusts) if record[0] <= epoch or record[0] < 0)
         known, unknown = record[1], np.float32(record[2])
         inside = vehicle < len(known)
         return np.where(inside, np.append(known, unknown)[np.where(inside, vehicle, len(known))], unknown)
@@ -148,85 +208,70 @@ class Fusion:
             self._epoch = epoch
         while self._epoch < epoch:
             self._epoch = self._epoch + 1 if self.waiting else epoch
-            self._settle(self._epoch * c.EPOCH_NS - self._lateness_ns)
-            before = self._trust[-1][1]
-            joined = np.full(len(self._vehicles) - len(before), newcomer(False), np.float32)
-            weights, established = trusted(self._peers, np.append(before, joined))
+            before = self._epoch * c.EPOCH_NS - self._lateness_ns
+            stores = self.stores
+            settle(stores.state, self._weather, stores.peers, stores.names, stores.open_windows(), before)
+            stores.forget_pairs(before // SECOND)
+            weights = self.trusts[-1][1]
+            joined = np.full(stores.vehicles - len(weights), newcomer(False), np.float32)
+            weights, established = trusted(stores.peers, np.append(weights, joined))
             record = (self._epoch, weights, newcomer(established))
-            self._trust = [self._trust[0], *self._trust[1:][-self._kept_epochs :], record]
+            self.trusts = [self.trusts[0], *self.trusts[1:][-self._kept_epochs :], record]
 
-    def _settle(self, before: int) -> None:
-        if not self.waiting:
-            return
-        self._reserve_pairs(self.waiting)
-        slots = np.flatnonzero(self._links.head[: self.size] != NONE)
-        slots = slots[
-            np.lexsort((self.sector[slots], self.cell[slots]))
-        ]  # an order that does not depend on who came first
-        self._pair_count += settle(
-            self._kept, self._links, self._entries, self._pairs, self._speakers, self._peers, slots, before
-        )
-
-    def _absorb(self, o: Observations, vehicle: IntArray, weight: Float32Array) -> IntArray:
-        both = np.flatnonzero(o.second >= 0)
-        rows = np.concatenate([np.arange(len(o.time)), both])
-        keys = np.concatenate([o.cell, o.cell[both]]) * grid.SECTORS + np.concatenate([o.sector, o.second[both]])
-        order = np.argsort(o.time[rows], kind="stable")  # in the order of time nothing has to be folded again
-        rows, keys = rows[order], keys[order]
-        slots = self._slots_for(keys)
-        if self._entries.unused[0] < len(rows):
-            places = max(2 * len(self._entries.free), self.waiting + len(rows))
-            self._entries = _more_entries(self._entries, places)
-        identity = np.stack([o.vehicle, o.boot, o.region, o.place], axis=1)
-        absorb(
-            self.live, self._kept, self._links, self._entries, self._pairs,
-            slots, o.time[rows], identity[rows], vehicle[rows], weight[rows], o.evidence[rows],
+    def _absorb(
+        self, o: Observations, rows: IntArray, vehicle: IntArray, weight: Float32Array, most: int
+    ) -> tuple[IntArray, BoolArray]:  # fmt: skip
+        rows = rows[np.argsort(o.time[rows], kind="stable")]  # in the order of time nothing has to be folded again
+        at, keys, share = _votes(o, rows)
+        slots = self.stores.slots_for(keys)
+        self.stores.reserve(len(slots))
+        left_out = absorb(
+            self.stores.state, self._weather, slots, at, share, o.time, o.vehicle, o.boot, o.place, vehicle, weight,
+            o.evidence, most,
         )  # fmt: skip
-        return slots
+        return slots, left_out
 
-    def _slots_for(self, keys: IntArray) -> IntArray:
-        if 2 * (self.size + len(keys)) > len(self._keys):
-            self._keys, old, new = grown(self._keys, room(2 * (self.size + len(keys))))
-            moved = np.zeros(len(self._keys), np.int64)
-            moved[new] = self._slots[old]
-            self._slots = moved
-        slots = slots_of(self._keys, self._slots, keys, self.size)
-        size = max(self.size, int(slots.max()) + 1)
-        if size > len(self.cell):
-            self._more_slots(2 * size)
-        self.cell[slots], self.sector[slots] = keys // grid.SECTORS, (keys % grid.SECTORS).astype(np.int8)
-        self.size = size
-        return slots
-
-    def _more_slots(self, slots: int) -> None:
-        self.cell, self.sector = (np.append(a, np.zeros(slots - len(a), a.dtype)) for a in (self.cell, self.sector))
-        self.live = extended(self.live, empty(slots))
-        self._kept = extended(self._kept, empty(slots))
-        self._links = extended(self._links, no_links(slots))
-        self._speakers = extended(self._speakers, no_speakers(slots))
-
-    def _reserve_pairs(self, more: int) -> None:
-        if 2 * (self._pair_count + more) > len(self._pairs.keys):
-            keys, old, new = grown(self._pairs.keys, room(2 * (self._pair_count + more)))
-            larger = no_pairs(len(keys))._replace(keys=keys)
-            for name in Pairs._fields[1:]:
-                getattr(larger, name)[new] = getattr(self._pairs, name)[old]
-            self._pairs = larger
+    def _oldest(self) -> int:
+        times = self.live.time[: self.size]
+        return int(times.min(initial=np.iinfo(np.int64).max, where=times > 0))
 
 
-def _more_entries(old: Entries, places: int) -> Entries:
-    unused, had = int(old.unused[0]), len(old.free)
-    new = extended(old, no_entries(places))
-    new.free[:unused] = old.free[:unused]
-    new.free[unused : unused + places - had] = np.arange(had, places)
-    new.unused[0] = unused + places - had
-    return new
+def _votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, Float32Array]:
+    """Votes of some observations: row, key and share; those beside and in a second sector too. In order of `rows`."""
+    own = 1.0 - o.beside_share[rows].sum(axis=1)
+    key = o.cell[rows] * grid.SECTORS
+    at, keys, share = [rows], [key + o.sector[rows]], [own]
+    second = np.flatnonzero(o.second[rows] >= 0)
+    if len(second):
+        at.append(rows[second])
+        keys.append(key[second] + o.second[rows[second]])
+        share.append(own[second])
+    beside, which = np.nonzero(o.beside[rows] >= 0)
+    if len(beside):
+        at.append(rows[beside])
+        keys.append(o.beside[rows[beside], which] * grid.SECTORS + o.sector[rows[beside]])
+        share.append(o.beside_share[rows[beside], which])
+    whole = np.concatenate(at)
+    order = np.argsort(o.time[whole], kind="stable") if len(at) > 1 else slice(None)
+    return whole[order], np.concatenate(keys)[order], np.concatenate(share)[order].astype(np.float32)
+
+
+def _recent(reports: Reports, oldest: int) -> Reports:
+    """Without those that ended before `oldest` [ns]."""
+    return reports.take(reports.time >= oldest - 4 * 3600 * SECOND)
 
 
 @compiled
-def _beliefs(cells: Cells, slots: IntArray, now: int) -> FloatArray:
-    out = np.empty((len(slots), cells.belief.shape[1]))
+def _beliefs(belief: PackedArray, cells: Records, weather: Weather, slots: IntArray, now: int) -> FloatArray:
+    scratch = np.empty((3, SCRATCH))
+    p = scratch[P]
+    out = np.empty((len(slots), belief.shape[1]))
     for k in range(len(slots)):
-        out[k] = cells.belief[slots[k]]
-        forget(out[k], (now - cells.time[slots[k]]) * 1e-9)
+        slot = slots[k]
+        unpack(belief, slot, p)
+        seconds = max((now - cells[slot].time) * 1e-9, 0.0) + cells[slot].aged
+        drift, change, prior = aged(weather, cells[slot].key, now - int(seconds * 1e9), now)
+        forget(p, drift, change, weather.prior[prior], scratch[PADDED])
+        for i in range(belief.shape[1]):
+            out[k, i] = p[i]
     return out

@@ -15,85 +15,56 @@ Legend
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from fleet_service.fusion import constants as c
-from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray, compiled
-
-NOBODY = -1
-
-
-class Speakers(NamedTuple):
-    """The last SPEAKERS vehicles that gave a value in each slot, (slots, SPEAKERS): who (index and number), when [ns],
-    and what."""
-
-    vehicle: IntArray
-    number: IntArray
-    time: IntArray
-    mean: Float32Array
-    std: Float32Array
+from fleet_service.fusion.cells import NOBODY, SECOND, Records
+from fleet_service.fusion.pools import PEER
+from schemas.numeric import BoolArray, Float32Array, FloatArray, compiled
 
 
-class Peers(NamedTuple):
-    """Whom each vehicle met, (vehicles, PEERS), NOBODY where free; the pair's rank, agreement and meetings."""
-
-    other: IntArray
-    rank: IntArray
-    agreed: Float32Array
-    met: Float32Array
-
-
-def no_speakers(slots: int) -> Speakers:
-    """Nobody spoke."""
-    shape = (slots, c.SPEAKERS)
-    return Speakers(
-        np.full(shape, NOBODY, np.int64), np.zeros(shape, np.int64), np.zeros(shape, np.int64),
-        np.zeros(shape, np.float32), np.zeros(shape, np.float32),
-    )  # fmt: skip
-
-
-def no_peers(vehicles: int) -> Peers:
+def no_peers(vehicles: int) -> Records:
     """Nobody met."""
-    shape = (vehicles, c.PEERS)
-    return Peers(
-        np.full(shape, NOBODY, np.int64), np.zeros(shape, np.int64), np.zeros(shape, np.float32),
-        np.zeros(shape, np.float32),
-    )  # fmt: skip
+    peers = np.zeros(vehicles, PEER)
+    peers["other"] = NOBODY
+    return peers
 
 
 @compiled
-def meet(
-    speakers: Speakers, peers: Peers, slot: int, vehicle: int, number: int, time: int, mean: float, std: float
-) -> None:  # fmt: skip
-    """Let a value meet those that others gave here lately, and take the place of its vehicle's own, or the oldest."""
+def meet(voices: Records, voice: int, peers: Records, names: Records, entries: Records, entry: int) -> None:
+    """Let a value meet those that others gave here lately, and take the place of its vehicle's own, or the oldest.
+
+    `names` (V,) are the vehicles' numbers, by index. Who was more probably elsewhere meets nobody.
+    """
+    if entries[entry].share < c.HERE_SHARE:
+        return
+    vehicle, now = int(entries[entry].vehicle), entries[entry].time // SECOND
+    mean, std = float(entries[entry].mean), float(entries[entry].std)
+    speaker, spoke = voices[voice].speaker, voices[voice].spoke
     place = 0
     for k in range(c.SPEAKERS):
-        other = speakers.vehicle[slot, k]
-        if other == vehicle:
+        if speaker[k] == vehicle:
             place = k
             break
-        if speakers.time[slot, k] < speakers.time[slot, place]:
+        if spoke[k] < spoke[place]:
             place = k
     for k in range(c.SPEAKERS):
-        other = speakers.vehicle[slot, k]
-        if other in (NOBODY, vehicle) or time - speakers.time[slot, k] > c.PEER_NS:
+        other = int(speaker[k])
+        if other == NOBODY or other == vehicle or now - spoke[k] > c.PEER_S:  # noqa: SIM109 not known to the compiler
             continue
-        spread = math.hypot(std, float(speakers.std[slot, k]))
+        spread = math.hypot(std, float(voices[voice].std[k]))
         if spread > c.PEER_STD:
             continue
-        deviations = abs(mean - speakers.mean[slot, k]) / spread
+        deviations = abs(mean - voices[voice].mean[k]) / spread
         agreement = (c.PEERS_DISAGREE - deviations) / (c.PEERS_DISAGREE - c.PEERS_AGREE)
         agreement = min(max(agreement, 0.0), 1.0)
-        others = speakers.number[slot, k]
-        _note(peers, vehicle, other, _rank(number, others), agreement)
-        _note(peers, other, vehicle, _rank(others, number), agreement)
-    speakers.vehicle[slot, place] = vehicle
-    speakers.number[slot, place] = number
-    speakers.time[slot, place] = time
-    speakers.mean[slot, place] = mean
-    speakers.std[slot, place] = std
+        _note(peers, vehicle, other, _rank(names[vehicle].key, names[other].key), agreement)
+        _note(peers, other, vehicle, _rank(names[other].key, names[vehicle].key), agreement)
+    speaker[place] = vehicle
+    spoke[place] = now
+    voices[voice].mean[place] = mean
+    voices[voice].std[place] = std
 
 
 @compiled
@@ -109,33 +80,33 @@ def _rank(vehicle: int, other: int) -> int:
 
 
 @compiled
-def _note(peers: Peers, vehicle: int, other: int, rank: int, agreement: float) -> None:
+def _note(peers: Records, vehicle: int, other: int, rank: int, agreement: float) -> None:
     place = rank % c.PEERS
-    known = peers.other[vehicle, place]
+    known = peers[vehicle].other[place]
     if known != other:
-        if known != NOBODY and peers.rank[vehicle, place] < rank:
+        if known != NOBODY and peers[vehicle].rank[place] < rank:
             return
-        peers.rank[vehicle, place] = rank
-        peers.other[vehicle, place] = other
-        peers.agreed[vehicle, place] = 0.0
-        peers.met[vehicle, place] = 0.0
-    peers.agreed[vehicle, place] += agreement
-    peers.met[vehicle, place] += 1.0
-    if peers.met[vehicle, place] > c.PEER_MEMORY:
-        peers.agreed[vehicle, place] *= 0.5
-        peers.met[vehicle, place] *= 0.5
+        peers[vehicle].rank[place] = rank
+        peers[vehicle].other[place] = other
+        peers[vehicle].agreed[place] = 0.0
+        peers[vehicle].met[place] = 0.0
+    peers[vehicle].agreed[place] += agreement
+    peers[vehicle].met[place] += 1.0
+    if peers[vehicle].met[place] > c.PEER_MEMORY:
+        peers[vehicle].agreed[place] *= 0.5
+        peers[vehicle].met[place] *= 0.5
 
 
-def trusted(peers: Peers, before: Float32Array) -> tuple[Float32Array, bool]:
+def trusted(peers: Records, before: Float32Array) -> tuple[Float32Array, bool]:
     """Trust of each vehicle, (V,), from whom it met and their trust `before`, (V,); whether the service is established.
 
     In an established one, who has met few that are trusted is a newcomer.
     """
     vehicles = len(before)
-    other, met = peers.other[:vehicles], peers.met[:vehicles]
-    theirs = np.maximum(before, c.TRUST_HEARD_LEAST)[np.maximum(other, 0)]
+    other, met = peers["other"][:vehicles], peers["met"][:vehicles].astype(np.float64)
+    theirs = np.maximum(before.astype(np.float64), c.TRUST_HEARD_LEAST)[np.maximum(other, 0)]
     weight = np.where(other != NOBODY, theirs, 0.0) * np.minimum(met, 1.0)
-    agreement = peers.agreed[:vehicles] / np.maximum(met, 1.0)
+    agreement = peers["agreed"][:vehicles] / np.maximum(met, 1.0)
     heard = weight.sum(axis=1)
     mean = (c.TRUST_PRIOR * c.TRUST_PRIOR_PEERS + (weight * agreement).sum(axis=1)) / (c.TRUST_PRIOR_PEERS + heard)
     trust = _scaled(mean)

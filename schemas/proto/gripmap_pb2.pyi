@@ -180,6 +180,12 @@ class Alert(_message.Message):
     reason: str
     def __init__(self, cell: _Optional[int] = ..., sector: _Optional[int] = ..., raised: _Optional[bool] = ..., time: _Optional[int] = ..., mu: _Optional[float] = ..., mu_lower: _Optional[float] = ..., mu_upper: _Optional[float] = ..., p_slippery: _Optional[float] = ..., vehicles: _Optional[int] = ..., latitude: _Optional[float] = ..., longitude: _Optional[float] = ..., reason: _Optional[str] = ...) -> None: ...
 
+class StandingAlerts(_message.Message):
+    __slots__ = ("alerts",)
+    ALERTS_FIELD_NUMBER: _ClassVar[int]
+    alerts: _containers.RepeatedCompositeFieldContainer[Alert]
+    def __init__(self, alerts: _Optional[_Iterable[_Union[Alert, _Mapping]]] = ...) -> None: ...
+
 class Weather(_message.Message):
     __slots__ = ("time", "air_temperature", "road_temperature", "precipitation", "prior")
     TIME_FIELD_NUMBER: _ClassVar[int]

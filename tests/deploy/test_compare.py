@@ -86,12 +86,14 @@ def test_a_road_that_was_slippery_before_is_not_the_new_patch() -> None:
 def test_picture_and_page_are_written_and_no_value_can_end_the_script(tmp_path: Path) -> None:
     found = compare.compare(tile([7, 8], 0.1, 0.4), visits(("a", 11, 7, 0.2, 0.1), ("a", 12, 8, 0.5, 0.1)), 10 * S)
     basis = found.cells.schema.get_field_index("basis")
-    hostile = replace(found, cells=found.cells.set_column(basis, "basis", [["</script><b>", "measured"]]))
+    hostile = replace(found, cells=found.cells.set_column(basis, "basis", [["</script><!--<script>", "measured"]]))
     picture.draw(found, tmp_path / "map.png")
     page.write(hostile, "| table |", tmp_path / "map.html")
     assert (tmp_path / "map.png").stat().st_size > 10_000
     text = (tmp_path / "map.html").read_text()
     assert text.count("</script>") == 1
-    data = json.loads(text.split("const data = ")[1].split(";\nconst points")[0].replace("<\\/", "</"))
+    data = json.loads(text.split("const data = ")[1].split(";\nconst points")[0])
+    assert [cell["basis"] for cell in data["cells"]] == ["</script><!--<script>", "measured"]
+    assert "<!--" not in text
     assert [cell["truth"] for cell in data["cells"]] == [0.2, 0.5]
     assert "http" not in text

@@ -180,7 +180,7 @@ BAD_ARGUMENTS = {
     "broken start": (["--start", "yesterday"], "^error: start: 'yesterday' is no time; write it like 2026"),
     "no configuration": (["--config", "nowhere.json"], "^error: config: cannot read nowhere.json"),
     "name for no key": (["--publish", "--name", "My Car/**"], "^error: name: 'My Car/\\*\\*' is no vehicle name; give"),
-    "folder as output": (["--out", "/"], "^error: out: cannot write /"),
+    "folder that is none": (["--out", "/dev/null/out"], "^error: out: cannot write /dev/null/out"),
 }
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from edge_agent.spool import JITTER, LONGEST_RESEND_S, Draft, Held, Spool, Stream
+from edge_agent.spool import HURRY_S, JITTER, LONGEST_RESEND_S, Draft, Held, Spool, Stream
 from schemas.errors import InputError
 from schemas.wire import Kind
 
@@ -126,6 +127,33 @@ def test_the_wait_between_offers_is_bounded(path: Path) -> None:
         now += LONGEST_RESEND_S * (1 + JITTER)
         assert seqs(spool.due(now, limit=1)) == [1]
     spool.close()
+
+
+def test_after_an_outage_all_is_offered_anew_within_a_second_oldest_first_and_nothing_twice(path: Path) -> None:
+    spool = Spool(path, boot=BOOT, first_resend_s=4.0)
+    spool.store([draft() for _ in range(5)] + [draft("car-b")], now=0.0)
+    assert len(spool.due(now=4.0 * (1 + JITTER), limit=9)) == 6
+    spool.hurry("car-a", now=5.3)
+    offered = [seq for now in (5.5, 5.7, 5.9, 6.1, 5.3 + HURRY_S) for seq in seqs(spool.due(now, limit=9))]
+    assert offered == [1, 2, 3, 4, 5]
+    assert spool.due(now=5.5 + 4.0 * (1 - JITTER) - 0.01, limit=9) == []
+    assert sorted(seqs(spool.due(now=6.3 + 4.0 * (1 + JITTER), limit=9))) == [1, 1, 2, 3, 4, 5]  # and once the other's
+    spool.close()
+
+
+def test_folders_made_for_a_spool_are_synced_into_the_ones_above(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[Path] = []
+    fsync = os.fsync
+
+    def seen(handle: int) -> None:
+        synced.append(Path(f"/proc/self/fd/{handle}").resolve())
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", seen)
+    Spool(tmp_path / "a" / "b" / "spool.sqlite").close()
+    assert synced == [tmp_path, tmp_path / "a"]
 
 
 def test_a_full_spool_gives_up_the_oldest_states_then_the_oldest_observations_and_counts_them(path: Path) -> None:

@@ -45,7 +45,7 @@ def observations(
     vehicle = np.asarray(vehicles, np.int64)
     return Observations(
         time, whole + cell, np.zeros(n, np.int8), np.full(n, second, np.int8), vehicle, vehicle * 7 + 1, whole + REGION,
-        np.arange(n), mugrid.encode_log_likelihood(log_likelihood),
+        np.arange(n), mugrid.encode_log_likelihood(log_likelihood), np.full((n, 4), -1), np.zeros((n, 4), np.float32),
     )  # fmt: skip
 
 

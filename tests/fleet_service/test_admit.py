@@ -1,4 +1,4 @@
-"""What is let in: streams against a set as oracle, rules one by one, and bytes that mean harm."""
+"""What is let in: rules one by one, and bytes that mean harm."""
 
 from __future__ import annotations
 
@@ -13,41 +13,17 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from fleet_service.acks import Acks, ranges
-from fleet_service.admit import MAX_AHEAD, Clock, Stream, Streams
+from fleet_service.admit import Clock
 from fleet_service.archive.pseudonyms import Pseudonyms
 from fleet_service.ingest import Inbox, Intake, Message
+from fleet_service.limits import Limits
+from fleet_service.streams import Streams
 from schemas import grid, wire
 from schemas.wire import Kind
 from tests.fleet_service.examples import CELL, LATITUDE, REGION, SECOND, batch, key
 
 NOW = time.time_ns()
 CLOCK = Clock(NOW, 30 * SECOND, 30 * 86_400 * SECOND)
-
-
-@given(st.lists(st.tuples(st.integers(1, 60), st.integers(1, 60)), max_size=80))
-def test_a_stream_knows_exactly_what_was_admitted_or_never_comes(steps: list[tuple[int, int]]) -> None:
-    stream, admitted, floor = Stream(), set(), 0
-    for seq, held in steps:
-        floor = max(floor, min(held, seq) - 1)
-        stream.raise_to(min(held, seq))
-        assert stream.admitted(seq) == (seq <= floor or seq in admitted)
-        stream.admit(seq)
-        admitted.add(seq)
-    for seq in range(1, 62):
-        assert stream.admitted(seq) == (seq <= floor or seq in admitted)
-
-
-def test_a_stream_without_gaps_is_one_number() -> None:
-    stream = Stream()
-    for seq in range(1, 5001):
-        assert stream.admit(seq)
-    assert (stream.low, stream.seen) == (5000, 0)
-
-
-def test_a_seq_far_beyond_what_is_held_is_not_noted() -> None:
-    stream = Stream()
-    assert not stream.admit(MAX_AHEAD + 1)
-    assert stream.seen == 0
 
 
 @given(st.sets(st.integers(1, 40)))
@@ -162,7 +138,7 @@ def test_a_batch_is_admitted_once_however_often_and_wherever_it_comes(desk: Desk
 
 def test_a_full_queue_drops_and_counts() -> None:
     counts: Counter[str] = Counter()
-    inbox = Inbox(2, counts)
+    inbox = Inbox(2, counts, Limits(1e6, 1e6, None, counts))
     for _ in range(5):
         inbox.put(message(good()))
     assert len(inbox.drain(0.0, 10)) == 2

@@ -6,7 +6,8 @@ import numpy as np
 
 from fleet_service.alerts import Alerts
 from fleet_service.fusion import Fusion
-from tests.fleet_service.examples import CELL, SECOND, START, at_least, observations, value
+from fleet_service.fusion.pools import ICE
+from tests.fleet_service.examples import CELL, SECOND, START, at_least, belief, observations, slippery, value
 
 HOUR = 3600 * SECOND
 
@@ -58,16 +59,42 @@ def test_old_ice_is_no_witness_for_new_ice() -> None:
     assert not alerts.folded(folded.slots)
 
 
-def test_what_many_called_dry_takes_three_witnesses() -> None:
+def called(mu: float, vehicles: range, then: float, others: range) -> tuple[Fusion, list[bool]]:
+    """A cell that `vehicles` called `mu` and afterwards each of `others` `then`; whether it was under an alert."""
     fusion = Fusion(120.0)
     alerts = Alerts(fusion)
-    fusion.fold(observations(np.arange(20) * 30.0, np.arange(20), value(np.full(20, 0.85))))
-    raised = []
-    for vehicle in range(8):
-        folded = fusion.fold(observations([900.0 + 10.0 * vehicle], [vehicle], value([0.2])))
-        raised.append(any(alert.raised for alert in alerts.folded(folded.slots)))
-    assert True in raised
-    assert raised.index(True) >= 2
+    under = []
+    for k, vehicle in enumerate([*vehicles, *others]):
+        later = k >= len(vehicles)  # by then the first ones are known
+        folded = fusion.fold(observations([20.0 * k + 400.0 * later], [vehicle], value([then if later else mu])))
+        alerts.folded(folded.slots)
+        under.append(bool(alerts.raised))
+    return fusion, under[len(vehicles) :]
+
+
+def test_what_many_called_dry_takes_four_witnesses_however_sure_the_belief_is() -> None:
+    fusion, under = called(0.85, range(20), 0.2, range(5, 11))
+    assert slippery(belief(fusion)) > 0.9
+    assert under == [False, False, False, True, True, True]
+
+
+def test_what_many_called_ice_takes_four_vehicles_to_clear() -> None:
+    fusion, under = called(0.2, range(20), 0.85, range(5, 11))
+    assert slippery(belief(fusion)) < 0.05
+    assert under == [True, True, True, False, False, False]
+
+
+def test_who_lost_its_trust_is_no_witness_any_more_for_what_it_said_before() -> None:
+    fusion, _ = called(0.2, range(4), 0.2, range(0))
+    slot = np.zeros(1, np.int64)
+    assert fusion.witnesses(slot, ICE, 0)[0] == [4]
+    rng = np.random.default_rng(3)
+    for cell in range(40):  # elsewhere the first two say dry things of ice
+        who = rng.permutation(12)
+        mu = np.where(who < 2, 0.9, 0.2 + 0.02 * rng.normal(size=12))
+        fusion.fold(observations(200.0 + 20.0 * cell + np.arange(12), who, value(mu), cell=cell))
+    assert fusion.trust(0) < 0.5 < fusion.trust(2)
+    assert fusion.witnesses(slot, ICE, 0)[0] == [2]
 
 
 def test_an_alert_ends_only_when_grip_is_sure() -> None:

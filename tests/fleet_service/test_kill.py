@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 import zenoh
 
-from fleet_service.archive import segments
+from fleet_service.archive import reading
 from schemas.config import ZenohSettings
 from schemas.wire import Kind
 from tests.fleet_service.examples import SECOND, batch
@@ -79,5 +79,5 @@ def identities(fleet: Fleet) -> list[tuple[int, int, int]]:
 
 def archived(folder: Path) -> list[tuple[int, int, int]]:
     """Boot, seq and row of everything in the segments."""
-    table = pa.concat_tables(segments.read(folder / "archive", Kind.OBSERVATION, ["boot", "seq", "row"]))
+    table = pa.concat_tables(reading.read(folder / "archive", Kind.OBSERVATION, ["boot", "seq", "row"]))
     return list(zip(*(table[name].to_pylist() for name in ("boot", "seq", "row")), strict=True))

@@ -163,7 +163,7 @@ def test_what_is_not_ours_is_counted_and_the_service_goes_on(
 
 
 def test_ice_raises_an_alert_after_few_passes_and_grip_clears_it(fleet: Fleet) -> None:
-    fleet.settle(*(batch(f"sim-{k:03}", 1, now() - 60 * SECOND, [0.85]) for k in range(10)))
+    fleet.settle(*(batch(f"sim-{k:03}", 1, now() - 60 * SECOND, [0.85]) for k in range(6)))
     for passes in range(8):
         fleet.settle(batch(f"sim-{passes:03}", 2, now(), [0.2]))
         if not fleet.alerts.empty():
@@ -176,6 +176,25 @@ def test_ice_raises_an_alert_after_few_passes_and_grip_clears_it(fleet: Fleet) -
         fleet.settle(batch(f"sim-{100 + k}", 1, now(), [0.85]))
     cleared = fleet.alerts.get(timeout=10.0)
     assert (cleared.cell, cleared.raised, cleared.reason) == (CELL, False, "later visits found grip")
+
+
+def standing(session: zenoh.Session) -> list[wire.Alert]:
+    """What a client hears that comes late."""
+    replies = [reply.ok for reply in session.get(f"{keys.ROOT}/alert/**") if reply.ok]
+    assert all(str(reply.encoding) == wire.STANDING_ENCODING for reply in replies)
+    return [alert for reply in replies for alert in wire.decode_standing(reply.payload.to_bytes())]
+
+
+def test_who_comes_late_asks_for_the_alerts_that_stand(fleet: Fleet) -> None:
+    assert not standing(fleet.session)
+    fleet.settle(*(batch(f"sim-{k:03}", 1, now(), [0.2]) for k in range(3)))
+    raised = fleet.alerts.get(timeout=10.0)
+    assert standing(fleet.session) == [raised]
+    assert not [reply for reply in fleet.session.get(keys.alert_key(TILE + 1)) if reply.ok]
+    for k in range(10):
+        fleet.settle(batch(f"sim-{100 + k}", 1, now(), [0.85]))
+    fleet.alerts.get(timeout=10.0)
+    assert not standing(fleet.session)
 
 
 def test_one_liar_raises_no_alert_however_often_it_reports(fleet: Fleet, service: Running) -> None:

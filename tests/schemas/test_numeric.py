@@ -22,7 +22,10 @@ def inner(x: float) -> float:
 """
 
 
-def run(folder: Path, factor: str) -> str:
+FULL_DISK = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0)); "
+
+
+def run(folder: Path, factor: str, before: str = "") -> str:
     """What outer(1.0) gives in a new process, with `inner` multiplying by `factor`."""
     package = folder / "kernels"
     (package / "inner.py").write_text(INNER.format(factor=factor))
@@ -31,7 +34,7 @@ def run(folder: Path, factor: str) -> str:
         (folder / "schemas").symlink_to(source, target_is_directory=True)
     environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
     environment |= {"XDG_CACHE_HOME": str(folder / "cache"), "PYTHONPATH": str(folder)}
-    words = [sys.executable, "-c", "from kernels.outer import outer; print(outer(1.0))"]
+    words = [sys.executable, "-c", f"{before}from kernels.outer import outer; print(outer(1.0))"]
     return subprocess.run(words, env=environment, cwd=folder, capture_output=True, text=True, check=True).stdout.strip()
 
 
@@ -42,3 +45,11 @@ def test_a_change_in_a_called_kernel_is_seen_by_its_callers(tmp_path: Path) -> N
     assert run(tmp_path, "2.0") == "3.0"
     assert run(tmp_path, "5.0") == "6.0"
     assert len(list((tmp_path / "cache" / "gripmap").glob("kernels-*"))) == 2
+
+
+def test_a_full_disk_under_the_cache_costs_only_the_cache(tmp_path: Path) -> None:
+    (tmp_path / "kernels").mkdir()
+    (tmp_path / "kernels" / "__init__.py").touch()
+    (tmp_path / "kernels" / "outer.py").write_text(CALLER)
+    assert run(tmp_path, "2.0", FULL_DISK) == "3.0"
+    assert not list((tmp_path / "cache").rglob("*.nbc"))

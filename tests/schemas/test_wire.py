@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas import grid, tables, wire
+from schemas.decoding import decode
 from schemas.errors import WireError
 from schemas.proto import gripmap_pb2 as pb
 from schemas.wire import Batch, Kind
@@ -34,7 +35,7 @@ def same(a: Batch, b: Batch) -> None:
 @pytest.mark.parametrize("kind", Kind)
 def test_a_batch_comes_back_as_it_was_sent(kind: Kind) -> None:
     sent = batch(kind, 50)
-    same(wire.decode(wire.encode(sent), wire.ENCODING[kind], kind), sent)
+    same(decode(wire.encode(sent), wire.ENCODING[kind], kind), sent)
 
 
 @pytest.mark.parametrize("kind", Kind)
@@ -42,7 +43,7 @@ def test_the_json_mapping_says_the_same_as_the_bytes(kind: Kind) -> None:
     sent = batch(kind)
     message = (pb.ObservationBatch if kind is Kind.OBSERVATION else pb.StateBatch).FromString(wire.encode(sent))
     text = json_format.MessageToJson(message, preserving_proto_field_name=True)
-    same(wire.decode(text.encode(), wire.JSON, kind), sent)
+    same(decode(text.encode(), wire.JSON, kind), sent)
 
 
 @pytest.mark.parametrize(
@@ -75,7 +76,7 @@ def test_bytes_of_version_1_are_still_written_and_read(name: str) -> None:
     kept = (DATA / f"{name}.v1.bin").read_bytes()
     if name.endswith("_batch"):
         kind = Kind.OBSERVATION if name.startswith("obs") else Kind.STATE
-        same(wire.decode(kept, wire.ENCODING[kind], kind), batch(kind))
+        same(decode(kept, wire.ENCODING[kind], kind), batch(kind))
     elif name == "ack":
         assert wire.decode_ack(kept) == acknowledgement()
     else:
@@ -88,7 +89,7 @@ def test_a_person_can_publish_with_one_line() -> None:
         '{"vehicle":"anna","boot":1,"seq":1,"enter_time":[1790000000000000000],"latitude":[57.7],"longitude":[11.97],'
     )
     line += '"yaw":[1.6],"mu":[0.3],"mu_lower":[0.2],"mu_upper":[0.4],"mu_utilised":[0.28]}'
-    got = wire.decode(line.encode(), wire.JSON, Kind.OBSERVATION)
+    got = decode(line.encode(), wire.JSON, Kind.OBSERVATION)
     assert got.columns["cell"][0] == grid.cell_of(57.7, 11.97)
     assert got.columns["sector"][0] == 1
     assert got.columns["leave_time"][0] == 1790000000000000000
@@ -102,7 +103,7 @@ def test_columns_of_unequal_length_are_refused_by_name() -> None:
     message = pb.ObservationBatch.FromString(wire.encode(batch(Kind.OBSERVATION)))
     del message.speed[-1]
     with pytest.raises(WireError, match="^speed: has 2 records"):
-        wire.decode(message.SerializeToString(), "", Kind.OBSERVATION)
+        decode(message.SerializeToString(), "", Kind.OBSERVATION)
 
 
 def test_too_many_records_are_refused_on_both_sides() -> None:
@@ -110,7 +111,7 @@ def test_too_many_records_are_refused_on_both_sides() -> None:
         wire.encode(batch(Kind.STATE, 51))
     message = pb.StateBatch(time=[1] * 51, latitude=[1.0] * 51, longitude=[1.0] * 51)
     with pytest.raises(WireError, match="^time: 51 records"):
-        wire.decode(message.SerializeToString(), "", Kind.STATE)
+        decode(message.SerializeToString(), "", Kind.STATE)
 
 
 @pytest.mark.parametrize(
@@ -130,13 +131,13 @@ def test_too_many_records_are_refused_on_both_sides() -> None:
 )
 def test_garbage_is_refused_with_a_reason(payload: bytes, encoding: str) -> None:
     with pytest.raises(WireError, match=r".+: .+; .+"):
-        wire.decode(payload, encoding, Kind.OBSERVATION)
+        decode(payload, encoding, Kind.OBSERVATION)
 
 
 @given(st.binary(max_size=300), st.sampled_from(["", wire.JSON]), st.sampled_from(list(Kind)))
 def test_no_bytes_raise_anything_but_a_wire_error(payload: bytes, encoding: str, kind: Kind) -> None:
     with contextlib.suppress(WireError):
-        assert 1 <= wire.decode(payload, encoding, kind).rows <= wire.MAX_ROWS
+        assert 1 <= decode(payload, encoding, kind).rows <= wire.MAX_ROWS
 
 
 @given(st.data())
@@ -146,4 +147,4 @@ def test_damaged_batches_raise_nothing_but_a_wire_error(data: st.DataObject) -> 
     for _ in range(data.draw(st.integers(1, 4))):
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
     with contextlib.suppress(WireError):
-        assert 1 <= wire.decode(bytes(payload), "", kind).rows <= wire.MAX_ROWS
+        assert 1 <= decode(bytes(payload), "", kind).rows <= wire.MAX_ROWS

@@ -13,31 +13,44 @@ from typing import NamedTuple
 from edge_agent.adaptation.fuzzy import adapted
 from edge_agent.dynamics.parameters import P
 from edge_agent.estimators import flags
+from edge_agent.estimators.friction_mixture.arrays import clear_rows, put, put_square
 from edge_agent.estimators.friction_mixture.block import F, block_features
 from edge_agent.estimators.friction_mixture.constants import C, X
+from edge_agent.estimators.friction_mixture.curve import Curve
 from edge_agent.estimators.friction_mixture.memory import INPUTS, RING, H, Memory
-from edge_agent.estimators.friction_mixture.mixture import moments, predict_node, recall_lost, reinject, update_node
-from edge_agent.estimators.friction_mixture.nodes import change_road, quantile, reweigh
+from edge_agent.estimators.friction_mixture.mixture import moments, recall_lost, reinject
+from edge_agent.estimators.friction_mixture.node import Nominal, Room, factorize, predict_node, update_node
+from edge_agent.estimators.friction_mixture.nodes import Sides, change_road, projected, quantile, reweigh
 from edge_agent.estimators.friction_mixture.residuals import gained
-from edge_agent.estimators.friction_mixture.sample import restart_motion, start, take_sample
+from edge_agent.estimators.friction_mixture.sample import (
+    fall_asleep,
+    forget_vehicle,
+    restart_motion,
+    start,
+    take_sample,
+)
 from schemas.numeric import FloatArray, compiled
 from schemas.signals import S
 
 SLIDING_THETA = 3.0  # normalised slip beyond the peak of every passenger tyre's curve
-FREE_DEMAND = 0.15  # force over load below which wheels that roll alike are taken for rolling freely
+FREE_FORCE = 0.05  # along, over load, below which wheels that roll alike are taken for rolling freely
+ALIKE = 0.03  # relative difference of their speeds
 LOST_RATIO = 8.0  # of actual over nominal innovation variance in the window: no noise or curve does that
 LOST_SPREAD_M_S = 5.0
+SLOWEST_TOLD_M_S = 1.5  # below this speed of vehicle and wheels slip has no meaning, and nothing is concluded
 EXCITED_S = 1.0  # memory of the grip used
+TOLD = (int(H.LEFT), int(H.RIGHT), int(H.MU))  # where the friction of left, right and both is held
 
 
 class Design(NamedTuple):
     """What does not change while driving: tables that the kernels read."""
 
     constants: FloatArray  # (len(C),)
-    mu: FloatArray  # (K,)
+    mu: FloatArray  # (K,) nodes of one friction
     prior: FloatArray  # (K,)
-    xi: FloatArray  # (points, n)
-    w_cov: FloatArray  # (points,)
+    sides: Sides  # all nodes
+    curve: Curve
+    nominal: Nominal
     inputs: FloatArray  # (5,) fuzzy sets
     outputs: FloatArray  # (5,)
     scales: FloatArray  # (2,) on nominal variances
@@ -50,21 +63,18 @@ class Scratch(NamedTuple):
     features: FloatArray
     loads: FloatArray
     spin: FloatArray
-    at_force: FloatArray
-    slopes: FloatArray
-    points: FloatArray
-    outcomes: FloatArray
     innovation: FloatArray
     theoretical: FloatArray
-    noise: FloatArray
     process: FloatArray
+    keep: FloatArray
     gain: FloatArray
     log_likelihood: FloatArray
     plain: FloatArray
     predicted: FloatArray
     sums: FloatArray
     scales: FloatArray
-    work: FloatArray
+    root: FloatArray  # (K + PAIRS, n, n)
+    room: Room
 
 
 @compiled
@@ -80,25 +90,59 @@ def finish_block(memory: Memory, design: Design, scratch: Scratch, row: FloatArr
         memory.start_omega[n], memory.last_omega[n], memory.last_delta[n], duration, speed, scratch.loads,
         scratch.spin, scratch.features,
     )  # fmt: skip
+    _wake_or_sleep(memory, design, scratch, n)
     _road(memory, design, scratch, n, speed * duration)
     _measure(memory, design, scratch, row, n, duration)
     _predict(memory, design, scratch, n, duration, speed)
-    health |= _recover(memory, design, scratch, n)
+    health |= _recover(memory, design, scratch, row, n)
     _conclude(memory, design, scratch, row, n, health)
 
 
 @compiled
+def taking_part(memory: Memory, design: Design, n: int) -> int:
+    """How many nodes of vehicle n are awake."""
+    nodes = design.sides.prior if memory.held[n, H.UNLIKE] > 0.0 else design.mu
+    return len(nodes)
+
+
+@compiled
+def _wake_or_sleep(memory: Memory, design: Design, scratch: Scratch, n: int) -> None:
+    """Nodes of unlike sides take part from the first sign of such a road until they have become improbable."""
+    chain, weight, visit = design.mu.shape[0], memory.weight[n], memory.visit[n]
+    sign = scratch.features[F.UNLIKE] > design.constants[C.ASYMMETRY]
+    if memory.held[n, H.UNLIKE] > 0.0:
+        total = 0.0
+        for j in range(chain, weight.shape[0]):
+            total += weight[j]
+        if total < 0.5 * design.constants[C.UNLIKE] and not sign:
+            fall_asleep(memory, design.prior, n)
+    elif sign:
+        memory.held[n, H.UNLIKE] = 1.0
+        for j in range(weight.shape[0]):
+            if j < chain:
+                weight[j] *= 1.0 - design.constants[C.UNLIKE]
+                visit[j] *= 1.0 - design.constants[C.UNLIKE]
+            else:
+                weight[j] = visit[j] = design.sides.prior[j]
+                put(memory.mean[n, j], memory.all_mean[n])
+                put_square(memory.covariance[n, j], memory.all_covariance[n])
+
+
+@compiled
 def _road(memory: Memory, design: Design, scratch: Scratch, n: int, metres: float) -> None:
+    chain, count = design.mu.shape[0], taking_part(memory, design, n)
+    prior = design.sides.prior if count > chain else design.prior
     hazard = 1.0 - math.exp(-metres * design.constants[C.HAZARD])
-    drift = min(metres * design.constants[C.DIFFUSION] * design.mu.shape[0], 0.5)
-    change_road(memory.weight[n], design.prior, hazard, drift, scratch.predicted)
-    for j in range(design.mu.shape[0]):
-        zeta = min(hazard * design.prior[j] / scratch.predicted[j], 1.0)
-        reinject(memory.mean[n, j], memory.root[n, j], zeta, memory.all_mean[n], memory.all_root[n], scratch.work)
-        memory.weight[n, j] = scratch.predicted[j]
-    change_road(memory.visit[n], design.prior, hazard, drift, scratch.predicted)
-    for j in range(design.mu.shape[0]):
-        memory.visit[n, j] = scratch.predicted[j]
+    leaving = 1.0 - math.exp(-metres * design.constants[C.UNLIKE_HAZARD])
+    drift = min(metres * design.constants[C.DIFFUSION] * chain, 0.5)
+    predicted, weight, visit = scratch.predicted[:count], memory.weight[n, :count], memory.visit[n, :count]
+    change_road(visit, prior, chain, hazard, leaving, drift, predicted)
+    put(visit, predicted)
+    change_road(weight, prior, chain, hazard, leaving, drift, predicted)
+    for j in range(count):
+        zeta = min(hazard * prior[j] / predicted[j], 1.0)
+        reinject(memory.mean[n, j], memory.covariance[n, j], zeta, memory.all_mean[n], memory.all_covariance[n])
+    put(weight, predicted)
 
 
 @compiled
@@ -109,16 +153,16 @@ def _measure(memory: Memory, design: Design, scratch: Scratch, row: FloatArray, 
     """
     held, constants = memory.held[n], design.constants
     inflation = max(constants[C.CORRELATION] / duration, 1.0)
-    count = design.mu.shape[0]
+    count = taking_part(memory, design, n)
     for g in range(4):
         scratch.sums[g] = 0.0
     best = top = -math.inf
     nis = rows = 0.0
     for j in range(count):
+        factorize(memory.covariance[n, j], scratch.root[j])
         loglik, plain, square, used = update_node(
-            row, constants, design.mu[j], memory.mean[n, j], memory.root[n, j], scratch.features, inflation,
-            design.xi, design.w_cov, scratch.at_force, scratch.slopes, scratch.points, scratch.outcomes,
-            scratch.innovation[j], scratch.theoretical[j], scratch.noise, scratch.work,
+            row, constants, design.curve, design.nominal, design.sides.pair[j], memory.mean[n, j], scratch.root[j],
+            scratch.features, inflation, scratch.innovation[j], scratch.theoretical[j], scratch.room,
         )  # fmt: skip
         scratch.log_likelihood[j], scratch.plain[j] = loglik, plain + math.log(memory.weight[n, j])
         best, top = max(best, loglik), max(top, scratch.plain[j])
@@ -137,14 +181,15 @@ def _measure(memory: Memory, design: Design, scratch: Scratch, row: FloatArray, 
     need = (constants[C.DEMAND_HALF] / max(scratch.features[F.DEMAND], 1e-3)) ** constants[C.DEMAND_POWER]
     blind = memory.counts[n, S.AX] == 0 or math.isnan(scratch.features[F.SIDE] + scratch.features[F.SIDE + 1])
     share = novelty(memory.usual[n], scratch.features, constants, duration) / (1.0 + need)
+    moving = meaning(scratch.features, memory.all_mean[n, X.VX])
     for j in range(count):
         loss = scratch.log_likelihood[j] - best
         beyond = min(loss + constants[C.PLAUSIBLE], 0.0)
         loss = max(loss, -constants[C.PLAUSIBLE])
-        scratch.log_likelihood[j] = 0.0 if blind else max(share * loss + beyond, -constants[C.LARGEST_LOSS])
-    recall_lost(memory.mean[n], memory.root[n], memory.weight[n], constants)
-    reweigh(memory.weight[n], scratch.log_likelihood)
-    reweigh(memory.visit[n], scratch.log_likelihood)
+        scratch.log_likelihood[j] = 0.0 if blind else max(moving * (share * loss + beyond), -constants[C.LARGEST_LOSS])
+    recall_lost(memory.mean[n], scratch.root, memory.weight[n, :count], constants)
+    reweigh(memory.weight[n, :count], scratch.log_likelihood)
+    reweigh(memory.visit[n, :count], scratch.log_likelihood)
     keep = math.exp(-duration / constants[C.WINDOW])
     for group in range(2):
         if scratch.sums[2 + group] > 0.0:
@@ -158,20 +203,39 @@ def _measure(memory: Memory, design: Design, scratch: Scratch, row: FloatArray, 
 
 
 @compiled
-def _recover(memory: Memory, design: Design, scratch: Scratch, n: int) -> int:
+def meaning(features: FloatArray, vx: float) -> float:
+    """Share of the evidence that slip is worth at low speed: none when creeping, all from twice that speed on."""
+    fastest = abs(vx)
+    for wheel in range(4):
+        if not math.isnan(features[F.ROLL + wheel]):
+            fastest = max(fastest, abs(features[F.ROLL + wheel]))
+    return min(max(fastest / SLOWEST_TOLD_M_S - 1.0, 0.0), 1.0)
+
+
+@compiled
+def _recover(memory: Memory, design: Design, scratch: Scratch, row: FloatArray, n: int) -> int:
     """Begin the motion and the friction anew where freely rolling wheels have long contradicted them.
 
     A wheel without force rolls: if all nodes call it sliding, none finds back by itself, for the curve is flat there.
     """
     expected = memory.theoretical[n, 0]
-    if scratch.features[F.DEMAND] > FREE_DEMAND or memory.actual[n, 0] * memory.factor[n, 0] < LOST_RATIO * expected:
+    if memory.actual[n, 0] * memory.factor[n, 0] < LOST_RATIO * expected:
         return 0
-    speed, most = math.nan, -math.inf
+    least, most = math.inf, -math.inf
     for wheel in range(4):
-        if scratch.features[F.ROLL + wheel] > most:
-            speed = most = scratch.features[F.ROLL + wheel]
-    restart_motion(memory, n, speed, LOST_SPREAD_M_S)
-    memory.actual[n, 0] = expected
+        if abs(scratch.features[F.FORCE + wheel]) > FREE_FORCE:
+            return 0
+        if not math.isnan(scratch.features[F.ROLL + wheel]):
+            least, most = min(least, scratch.features[F.ROLL + wheel]), max(most, scratch.features[F.ROLL + wheel])
+    turning = abs(scratch.features[F.YAW_RATE]) * row[P.TRACK_REAR]
+    if most - least > ALIKE * max(most, SLOWEST_TOLD_M_S) + turning:
+        return 0
+    forget_vehicle(memory, design.nominal, n)  # what was learned while lost is as wrong as the motion was
+    restart_motion(memory, n, most if most >= 0.0 else math.nan, LOST_SPREAD_M_S)
+    for group in range(2):
+        memory.actual[n, group] = memory.theoretical[n, group]
+        memory.factor[n, group] = 1.0
+    fall_asleep(memory, design.prior, n)
     for j in range(design.prior.shape[0]):
         memory.weight[n, j] = memory.visit[n, j] = design.prior[j]
     return flags.RESET
@@ -193,37 +257,51 @@ def novelty(usual: FloatArray, features: FloatArray, constants: FloatArray, dura
 
 @compiled
 def _predict(memory: Memory, design: Design, scratch: Scratch, n: int, duration: float, speed: float) -> None:
-    held, constants, process = memory.held[n], design.constants, scratch.process
+    held, constants, nominal = memory.held[n], design.constants, design.nominal
     ax = abs(held[H.AX])
     drift_x = constants[C.DRIFT_X] ** 2 + (constants[C.LEAK_WANDER] * ax) ** 2 + held[H.MISSING_AX]
     drift_y = constants[C.DRIFT_Y] ** 2 + (constants[C.GYRO_WANDER] * speed) ** 2 + held[H.MISSING_AY]
-    process[X.VX], process[X.VY] = math.sqrt(drift_x * duration), math.sqrt(drift_y * duration)
-    spread_k = constants[C.STIFFNESS_STD] * math.sqrt(1.0 - math.exp(-2.0 * duration / constants[C.STIFFNESS_TIME]))
-    spread_l = math.sqrt(1.0 - math.exp(-2.0 * duration / constants[C.LEAK_TIME]))
-    process[X.STEER] = spread_k * constants[C.STEER_STD] / constants[C.STIFFNESS_STD]
-    process[X.LN_KX] = process[X.LN_KY] = spread_k
-    process[X.LEAK_Y] = constants[C.LEAK_Y_STD] * spread_l
-    process[X.LEAK_X] = constants[C.LEAK_X_STD] * spread_l
-    process[X.BIAS_X] = process[X.BIAS_Y] = constants[C.BIAS_STD] * math.sqrt(
-        1.0 - math.exp(-2.0 * duration / constants[C.BIAS_TIME])
-    )
+    scratch.process[X.VX], scratch.process[X.VY] = drift_x * duration, drift_y * duration
+    for i in range(X.LN_KX, nominal.mean.shape[0]):
+        scratch.keep[i] = math.exp(-duration / nominal.time[i])
+        scratch.process[i] = nominal.std[i] ** 2 * (1.0 - scratch.keep[i] ** 2)
     for k in range(8):
         scratch.gain[k] = memory.gain[n, k // 2, k % 2]
     cos, sin = math.cos(held[H.ANGLE]), math.sin(held[H.ANGLE])
-    for j in range(design.mu.shape[0]):
+    count = taking_part(memory, design, n)
+    for j in range(count):
         predict_node(
-            memory.mean[n, j], memory.root[n, j], constants, cos, sin, scratch.gain, process, duration, scratch.work
-        )
-    moments(memory.mean[n], memory.root[n], memory.weight[n], memory.all_mean[n], memory.all_root[n], scratch.work)
+            memory.mean[n, j], scratch.root[j], nominal, cos, sin, scratch.gain, scratch.keep, scratch.process,
+            memory.covariance[n, j],
+        )  # fmt: skip
+    moments(
+        memory.mean[n], memory.covariance[n], memory.weight[n, :count], memory.all_mean[n], memory.all_covariance[n]
+    )
+
+
+@compiled
+def tell_friction(memory: Memory, design: Design, scratch: Scratch, n: int) -> None:
+    """Quantiles of the mean friction and of both sides."""
+    held, chain = memory.held[n], design.mu.shape[0]
+    unlike = taking_part(memory, design, n) > chain
+    for side in range(3):
+        place = TOLD[side]
+        weight = memory.weight[n, :chain]
+        if unlike:
+            weight = scratch.predicted[:chain]
+            projected(memory.weight[n], design.sides.share[side], weight)
+        for k, level in enumerate((0.5, 0.05, 0.95)):
+            if unlike or side == 0:
+                held[place + k] = quantile(design.mu, design.prior, weight, level)
+            else:
+                held[place + k] = held[H.LEFT + k]
 
 
 @compiled
 def _conclude(memory: Memory, design: Design, scratch: Scratch, row: FloatArray, n: int, health: int) -> None:
-    """Quantiles, grip used in the last second, health; and the next block begins."""
+    """Friction, grip used in the last second, health; and the next block begins."""
     held = memory.held[n]
-    held[H.MU] = quantile(design.mu, design.prior, memory.weight[n], 0.5)
-    held[H.MU_LOWER] = quantile(design.mu, design.prior, memory.weight[n], 0.05)
-    held[H.MU_UPPER] = quantile(design.mu, design.prior, memory.weight[n], 0.95)
+    tell_friction(memory, design, scratch, n)
     place = int(held[H.RING_NEXT])
     memory.ring_time[n, place], memory.ring_used[n, place] = held[H.TIME], scratch.features[F.DEMAND]
     held[H.RING_NEXT] = (place + 1) % RING
@@ -248,8 +326,8 @@ def begin_block(memory: Memory, n: int) -> None:
     held[H.BLOCK_TIME] = held[H.TIME]
     for k in range(H.ANGLE, H.SAMPLES + 1):
         held[k] = 0.0
-    memory.gain[n] = 0.0
-    memory.gain_sum[n] = 0.0
+    clear_rows(memory.gain[n])
+    clear_rows(memory.gain_sum[n])
     held[H.MISSING_AX] = held[H.MISSING_AY] = 0.0
     held[H.START_YAW_RATE] = held[H.YAW_RATE]
     for c in range(INPUTS):
@@ -265,7 +343,7 @@ def step(
 ) -> int:
     """Take one sample (18,) of vehicle n; returns health flags of this sample alone."""
     if not memory.started[n]:
-        return start(memory, design.constants, design.mu, design.prior, row, n, time, sample) | flags.RESET
+        return start(memory, design.nominal, design.mu, design.prior, row, n, time, sample) | flags.RESET
     health, whole = take_sample(memory, design.constants, design.prior, row, n, time, sample)
     if whole:
         finish_block(memory, design, scratch, row, n)

@@ -14,17 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_agent.estimators.friction_mixture.advance import Design, Scratch, step, velocity
+from edge_agent.estimators.friction_mixture.arrays import clear, put
 from edge_agent.estimators.friction_mixture.block import F
-from edge_agent.estimators.friction_mixture.constants import NODES, STATES, X
+from edge_agent.estimators.friction_mixture.constants import NODES, PAIRS, STATES, C, X
 from edge_agent.estimators.friction_mixture.memory import H, Memory, new_memory
+from edge_agent.estimators.friction_mixture.node import new_room
 from edge_agent.estimators.friction_mixture.nodes import evidence as evidence_of
-from edge_agent.estimators.friction_mixture.nodes import quantile
+from edge_agent.estimators.friction_mixture.nodes import projected, quantile
 from edge_agent.estimators.friction_mixture.residuals import ROWS
 from edge_agent.estimators.friction_mixture.sample import UNKNOWN_VX_STD
-from schemas.errors import InputError
+from edge_agent.estimators.shares import checked, in_shares
 from schemas.mugrid import BINS, CENTRES
-from schemas.numeric import BoolArray, FloatArray, compiled
-from schemas.signals import CHANNELS
+from schemas.numeric import BoolArray, FloatArray, compiled, released
 
 OUTPUTS = (
     "vx", "vy", "yaw_rate", "sideslip", "vx_std", "vy_std", "yaw_rate_std", "sideslip_std",
@@ -60,8 +61,8 @@ class Estimates:
     evidence: FloatArray | None  # (T, N, 32) at closes, else NaN: log-likelihood of the visit on the friction grid
 
 
-@compiled
-def advance_all(
+@released
+def advance_some(
     memory: Memory,
     design: Design,
     scratch: Scratch,
@@ -73,20 +74,55 @@ def advance_all(
     out: FloatArray,
     health: FlagArray,
     evidence: FloatArray,
+    wheels: FloatArray,
+    first: int,
+    last: int,
 ) -> None:
-    """Fill out (15, T, N), health (T, N) and evidence (T, N, 32) where closes (T, N); other evidence stays."""
-    for n in range(t.shape[1]):
+    """Fill out (15, T, N), health (T, N), wheels (T, N, 4, 3), and evidence (T, N, 32) where closes (T, N).
+
+    Of the vehicles [first, last) alone.
+    """
+    for n in range(first, last):
         for k in range(t.shape[0]):
             if closes.shape[0] > 0 and closes[k, n]:
-                if memory.started[n]:
-                    evidence_of(design.mu, design.prior, memory.visit[n], centres, evidence[k, n])
-                else:
-                    evidence[k, n] = 0.0
-                memory.visit[n] = design.prior
+                close_visit(memory, design, scratch, n, centres, evidence[k, n])
             memory.held[n, H.LOG_LIKELIHOOD] = 0.0
             flags = step(memory, design, scratch, rows[n], n, t[k, n], signals[k, n])
             report(memory, design, n, out[:, k, n])
+            tell_wheels(memory, design, n, wheels[k, n])
             health[k, n] = flags | int(memory.held[n, H.HEALTH])
+
+
+@compiled
+def close_visit(
+    memory: Memory, design: Design, scratch: Scratch, n: int, centres: FloatArray, evidence: FloatArray
+) -> None:
+    """Write what the visit that ends told (32,), and begin the next from the prior."""
+    if not memory.started[n]:
+        clear(evidence)
+        return
+    chain = design.mu.shape[0]
+    if memory.held[n, H.UNLIKE] > 0.0:
+        told, expected = scratch.predicted[:chain], scratch.plain[:chain]
+        projected(memory.visit[n], design.sides.share[2], told)
+        projected(design.sides.prior, design.sides.share[2], expected)
+        evidence_of(design.mu, expected, told, centres, evidence)
+        put(memory.visit[n], design.sides.prior)
+    else:
+        evidence_of(design.mu, design.prior, memory.visit[n, :chain], centres, evidence)
+        put(memory.visit[n, :chain], design.prior)
+
+
+@compiled
+def tell_wheels(memory: Memory, design: Design, n: int, out: FloatArray) -> None:
+    """Median, lower and upper friction of the four wheels, (4, 3)."""
+    held = memory.held[n]
+    for wheel in range(4):
+        place = H.LEFT if wheel % 2 == 0 else H.RIGHT
+        for k, level in enumerate((0.5, 0.05, 0.95)):
+            out[wheel, k] = (
+                held[place + k] if memory.started[n] else quantile(design.mu, design.prior, design.prior, level)
+            )
 
 
 @compiled
@@ -97,11 +133,8 @@ def report(memory: Memory, design: Design, n: int, out: FloatArray) -> None:
         return
     held = memory.held[n]
     vx, vy = velocity(memory, n)
-    root = memory.all_root[n]
-    std_x = std_y = 0.0
-    for j in range(root.shape[0]):
-        std_x += root[X.VX, j] ** 2
-        std_y += root[X.VY, j] ** 2
+    std_x = memory.all_covariance[n, X.VX, X.VX] + (design.constants[C.RADIUS_STD] * vx) ** 2
+    std_y = memory.all_covariance[n, X.VY, X.VY]
     speed = max(abs(vx), SLOWEST_M_S)
     out[0], out[1], out[2], out[3] = vx, vy, held[H.YAW_RATE], math.atan2(vy, speed)
     out[4], out[5] = math.sqrt(std_x), math.sqrt(std_y)
@@ -116,7 +149,7 @@ def report(memory: Memory, design: Design, n: int, out: FloatArray) -> None:
 @compiled
 def unknown(out: FloatArray, design: Design) -> None:
     """Outputs (15,) before the first usable sample: the prior, and no motion with a wide spread."""
-    out[:] = 0.0
+    clear(out)
     out[4] = UNKNOWN_VX_STD
     out[5] = out[6] = out[7] = 1.0
     out[8] = quantile(design.mu, design.prior, design.prior, 0.5)
@@ -131,61 +164,60 @@ class EstimatorBank:
     def __init__(self, rows: FloatArray, design: Design) -> None:
         self._rows, self._design = rows, design
         self._memory = new_memory(len(rows))
-        self._scratch = new_scratch()
+        self._scratch: list[Scratch] = []
 
-    def advance(self, t: FloatArray, signals: FloatArray, closes: BoolArray | None = None) -> Estimates:
+    def advance(
+        self, t: FloatArray, signals: FloatArray, closes: BoolArray | None = None, *, threads: int = 1
+    ) -> Estimates:
         """Take the next samples of all vehicles.
 
         Args:
             t: (T, N) measurement time [s]; a sample whose time does not increase is left out, and health says so.
             signals: (T, N, 18) in the order of schemas.signals.CHANNELS; NaN is a missing reading.
             closes: (T, N), True at the first sample that belongs to a new visit; None for no visits.
+            threads: how many share the vehicles among them; changes no bit of the result.
 
         Returns:
             Estimates at the same samples; none of them is NaN, except evidence away from closes.
 
         Raises:
-            InputError: shapes do not agree with the bank.
+            InputError: shapes do not agree with the bank, or threads is below 1.
         """
         count = len(self._rows)
-        t, signals = np.ascontiguousarray(t, np.float64), np.ascontiguousarray(signals, np.float64)
-        if t.ndim != 2 or t.shape[1] != count:
-            raise InputError("t", f"shape {t.shape} for a bank of {count}", "give (T, N)")
-        if signals.shape != (*t.shape, len(CHANNELS)):
-            raise InputError("signals", f"shape {signals.shape}", f"give {(*t.shape, len(CHANNELS))}")
-        if closes is not None and closes.shape != t.shape:
-            raise InputError("closes", f"shape {closes.shape}", f"give {t.shape}")
+        t, signals = checked(t, signals, closes, count)
         ends = np.zeros((0, count), np.bool_) if closes is None else np.ascontiguousarray(closes, np.bool_)
         out = np.empty((len(OUTPUTS), *t.shape))
         health = np.empty(t.shape, np.int32)
+        wheels = np.empty((*t.shape, 4, 3))
         evidence = np.full((*ends.shape, BINS), np.nan)
-        advance_all(
-            self._memory, self._design, self._scratch, self._rows, CENTRES, t, signals, ends, out, health, evidence
-        )
+        self._scratch += [new_scratch() for _ in range(threads - len(self._scratch))]
+        whole = (self._rows, CENTRES, t, signals, ends, out, health, evidence, wheels)
+
+        def work(share: int, first: int, last: int) -> None:
+            advance_some(self._memory, self._design, self._scratch[share], *whole, first, last)
+
+        in_shares(work, count, threads)
         named = dict(zip(OUTPUTS, out, strict=True))
-        return Estimates(**named, health=health, mu_wheel=None, evidence=None if closes is None else evidence)
+        return Estimates(**named, health=health, mu_wheel=wheels, evidence=None if closes is None else evidence)
 
 
 def new_scratch() -> Scratch:
     """Room for the intermediate results of one block of one vehicle."""
-    points = 2 * STATES
+    count = NODES + PAIRS
     return Scratch(
         features=np.zeros(int(F.LENGTH)),
         loads=np.zeros(4),
         spin=np.zeros(4),
-        at_force=np.zeros(ROWS),
-        slopes=np.ones(4),
-        points=np.zeros((points, STATES)),
-        outcomes=np.zeros((points, ROWS)),
-        innovation=np.zeros((NODES, ROWS)),
-        theoretical=np.zeros((NODES, ROWS)),
-        noise=np.zeros(ROWS),
+        innovation=np.zeros((count, ROWS)),
+        theoretical=np.zeros((count, ROWS)),
         process=np.zeros(STATES),
+        keep=np.zeros(STATES),
         gain=np.zeros(8),
-        log_likelihood=np.zeros(NODES),
-        plain=np.zeros(NODES),
-        predicted=np.zeros(NODES),
+        log_likelihood=np.zeros(count),
+        plain=np.zeros(count),
+        predicted=np.zeros(count),
         sums=np.zeros(4),
         scales=np.zeros(2),
-        work=np.zeros((2 * STATES + ROWS, max(NODES * (STATES + 1), points + ROWS, 2 * STATES + 1))),
+        root=np.zeros((count, STATES, STATES)),
+        room=new_room(),
     )

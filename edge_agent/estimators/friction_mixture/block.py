@@ -8,9 +8,12 @@ Legend (index `F` of a feature row)
     LOAD              wheel load over axle load [1]
     SIDE, SIDE_LEAK   F_y/F_z of an axle in the wheel's frame, and its derivative by the leak [1]
     NOISE             nominal standard deviation of a residual [1]: four wheels, two axles
+    TELL_X, TELL_Y    what the force of an axle tells of stiffness, from 0 to 1
+    UNLIKE            slip left against right of an axle beyond force and noise, in force over load [1]
 
-Longitudinal force comes from torque, F_x = (T - J*omega')/R; where it is missing, from a_x shared out by guess with a
-spread to match. Lateral axle forces come from m*a_y and Iz*r' (paper 004, equation 2; errata 000 on signs and arms).
+Longitudinal force comes from torque, F_x = (T - J*omega')/R; where torque or speed is missing, from a_x shared out by
+guess with a spread to match. Lateral axle forces come from m*a_y and Iz*r' (paper 004, equation 2; errata 000 on signs
+and arms).
 """
 
 from __future__ import annotations
@@ -46,7 +49,10 @@ class F(IntEnum):
     SIDE = 32
     SIDE_LEAK = 34
     NOISE = 36
-    LENGTH = 42
+    TELL_X = 42
+    TELL_Y = 44
+    UNLIKE = 46
+    LENGTH = 47
 
 
 @compiled
@@ -88,11 +94,12 @@ def _forces(
     ax = mean_or(sums, counts, S.AX, math.nan)
     for wheel in range(4):
         torque = mean_or(sums, counts, S.TORQUE + wheel, math.nan)
-        if not math.isnan(torque):
+        if not (math.isnan(torque) or math.isnan(features[F.ROLL + wheel])):
             force = force_from_torque(torque, spin[wheel], row[P.WHEEL_INERTIA], row[P.RADIUS])
             spread = constants[C.FORCE_SHARE] * abs(force)
         else:
-            health |= flags.NO_TORQUE
+            if math.isnan(torque):
+                health |= flags.NO_TORQUE
             known = 0.0 if math.isnan(ax) else row[P.MASS] * ax
             force = _driving_share(row, wheel, known) * known
             spread = constants[C.NO_TORQUE_SHARE] * abs(known)
@@ -157,7 +164,8 @@ def _noise(
     for axle in range(2):
         side = features[F.SIDE + axle]
         turning = constants[C.GYRO_STD] * (row[P.TO_FRONT] if axle == 0 else row[P.TO_REAR]) / speed
-        angle = row[P.SLOPE_Y] * math.hypot(constants[C.ANGLE_STD], turning)
+        pointing = constants[C.ANGLE_SHARE] * features[F.STEER_SIN + 2 * axle]
+        angle = row[P.SLOPE_Y] * math.sqrt(constants[C.ANGLE_STD] ** 2 + turning**2 + pointing**2)
         share = constants[C.AXLE_SHARE] * side
         bend = constants[C.BEND_SHARE] * side * side
         change = side - before[axle]
@@ -214,7 +222,38 @@ def block_features(
         features[F.SIDE] = features[F.SIDE + 1] = math.nan
     _noise(row, constants, counts, speed, scales, side, duration, features)
     features[F.DEMAND] = demand(features)
+    _tell(constants, features)
+    features[F.UNLIKE] = unlike(row, constants, features, counts, speed)
     return health
+
+
+@compiled
+def _tell(constants: FloatArray, features: FloatArray) -> None:
+    """TELL_X and TELL_Y: below some force it is noise of the slip that would tell stiffness."""
+    for axle in range(2):
+        along = max(abs(features[F.FORCE + 2 * axle]), abs(features[F.FORCE + 2 * axle + 1]))
+        side = features[F.SIDE + axle]
+        features[F.TELL_X + axle] = along * along / (along * along + constants[C.TELLING_X] ** 2)
+        features[F.TELL_Y + axle] = (
+            0.0 if math.isnan(side) else side * side / (side * side + constants[C.TELLING_Y] ** 2)
+        )
+
+
+@compiled
+def unlike(row: FloatArray, constants: FloatArray, features: FloatArray, counts: IntArray, speed: float) -> float:
+    """Largest difference between the sides of an axle of slip (as linear force over load) not asked for by force."""
+    most, speed = 0.0, max(speed, 1.0)
+    for axle in range(2):
+        left, right = 2 * axle, 2 * axle + 1
+        track = row[P.TRACK_FRONT] if axle == 0 else row[P.TRACK_REAR]
+        turning = track * features[F.YAW_RATE] * features[F.STEER_COS + left]
+        slip = (features[F.ROLL + right] - features[F.ROLL + left] - turning) / speed
+        samples = max(min(counts[S.OMEGA + left], counts[S.OMEGA + right]), 1)
+        noise = constants[C.OMEGA_NOISE] * row[P.RADIUS] / speed * math.sqrt(2.0 / samples)
+        apart = abs(row[P.SLOPE_X] * slip - features[F.FORCE + right] + features[F.FORCE + left])
+        if not math.isnan(apart):
+            most = max(most, apart - 4.0 * row[P.SLOPE_X] * noise)
+    return most
 
 
 @compiled

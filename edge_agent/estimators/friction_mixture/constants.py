@@ -15,7 +15,10 @@ import numpy as np
 from schemas.numeric import FloatArray
 
 NODES = 20  # friction hypotheses, equidistant in the square root of mu: fine where mu is small
-STATES = 9
+PAIRS = 30  # hypotheses of unlike sides: a low and a high friction, either way round
+CURVED = 4  # states in which the rows of measurement bend
+ACTIVE = 8  # states that the rows see within a block
+STATES = 11
 
 
 class X(IntEnum):
@@ -25,11 +28,13 @@ class X(IntEnum):
     VY = 1  # [m/s], at the centre of gravity
     LN_KX = 2  # log of true over nominal longitudinal stiffness
     LN_KY = 3  # the same for cornering stiffness
-    LEAK_Y = 4  # share of measured lateral acceleration that is gravity felt by the rolled body
-    LEAK_X = 5  # the same of longitudinal acceleration and pitch
-    BIAS_X = 6  # of a_x: offset and slope [m/s^2]
-    BIAS_Y = 7  # of a_y: offset, and yaw-rate offset times speed [m/s^2]
-    STEER = 8  # offset of the front steering against the rear axle [rad]
+    STEER = 4  # offset of the front steering against the rear axle [rad]
+    LEAK_Y = 5  # share of measured lateral acceleration that is gravity felt by the rolled body
+    BEND = 6  # shape of the tyre: spreads by which it is sharper than the usual one
+    GAIN = 7  # error of the longitudinal force over load, relative: torque gain and mass
+    LEAK_X = 8  # as LEAK_Y, of longitudinal acceleration and pitch
+    BIAS_X = 9  # of a_x: offset and slope [m/s^2]
+    BIAS_Y = 10  # of a_y: offset, and yaw-rate offset times speed [m/s^2]
 
 
 class C(IntEnum):
@@ -83,6 +88,15 @@ class C(IntEnum):
     STEADY_TIME = 45
     STEADY_HALF = 46
     STEADY_SHARE = 47
+    CURVATURE = 48
+    BEND_STD = 49
+    BEND_TIME = 50
+    GAIN_STD = 51
+    UNLIKE = 52
+    UNLIKE_HAZARD = 53
+    ASYMMETRY = 54
+    RADIUS_STD = 55
+    ANGLE_SHARE = 56
 
 
 class Constant(NamedTuple):
@@ -113,7 +127,7 @@ CONSTANTS = (
     ),
     Constant(C.LARGEST_LOSS, 3.0, "nat", "most that a block may take from a node: a spike is forgiven within two"),
     Constant(C.HUBER, 2.0, "1", "innovation in standard deviations beyond which a row is trusted less"),
-    Constant(C.FARTHEST, 2.0, "1", "prior standard deviations within which stiffness, leaks and offsets are kept"),
+    Constant(C.FARTHEST, 3.0, "1", "prior standard deviations within which stiffness, leaks and offsets are kept"),
     Constant(
         C.LOST_X,
         0.7,
@@ -124,7 +138,7 @@ CONSTANTS = (
     Constant(C.FLAT, 0.3, "1", "slope of the tyre curve below which a wheel counts as sliding"),
     Constant(
         C.SLIDING_PRICE,
-        1.0,
+        0.3,
         "1",
         "weight of the density that sliding spreads over slip: not every braking car slides on all wheels",
     ),
@@ -134,7 +148,9 @@ CONSTANTS = (
         "1",
         "weight of ln det S of the axles: none favours the flexible node, all of it the saturated one",
     ),
-    Constant(C.SHAPE, 1.4, "1", "Magic Formula c between the lateral 1.3 and the longitudinal 1.65 of passenger tyres"),
+    Constant(
+        C.SHAPE, 1.45, "1", "Magic Formula c between the lateral 1.3 and the longitudinal 1.65 of passenger tyres"
+    ),
     Constant(C.STIFFNESS_STD, 0.12, "1", "log stiffness factors (vehicle)"),
     Constant(C.STIFFNESS_TIME, 300.0, "s", "return of the stiffness factors to their prior"),
     Constant(
@@ -187,6 +203,15 @@ CONSTANTS = (
         "1",
         "evidence left where nothing changes: the error of curve and offsets is then the same again",
     ),
+    Constant(C.CURVATURE, -0.1, "1", "Magic Formula e, as c"),
+    Constant(C.BEND_STD, 1.0, "1", "tyres between round and sharp: most of them"),
+    Constant(C.BEND_TIME, 100.0, "s", "return of the shape to its prior: it changes with the road as well"),
+    Constant(C.GAIN_STD, 0.045, "1", "torque gain 3 %, mass 3 %, load and radius (vehicle)"),
+    Constant(C.UNLIKE, 0.05, "1", "share of roads whose two sides differ"),
+    Constant(C.UNLIKE_HAZARD, 1 / 60, "1/m", "end of such a road"),
+    Constant(C.ASYMMETRY, 0.12, "1", "left against right, in force over load, that wakes the nodes of unlike sides"),
+    Constant(C.RADIUS_STD, 0.002, "1", "wheel radius (vehicle)"),
+    Constant(C.ANGLE_SHARE, 0.01, "1", "steering ratio, compliance and how the wheels of an axle point, of the angle"),
 )
 
 
@@ -198,3 +223,22 @@ def constant_row(**changes: float) -> FloatArray:
     for name, value in changes.items():
         row[C[name.upper()]] = value
     return row
+
+
+def nominal_states(constants: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Prior (mean, std) of the states and the time [s] of their return to it, (STATES,) each; velocity has none."""
+    mean, std, time = np.zeros(STATES), np.ones(STATES), np.full(STATES, np.inf)
+    for state, spread, back in (
+        (X.LN_KX, C.STIFFNESS_STD, C.STIFFNESS_TIME),
+        (X.LN_KY, C.STIFFNESS_STD, C.STIFFNESS_TIME),
+        (X.LEAK_Y, C.LEAK_Y_STD, C.LEAK_TIME),
+        (X.STEER, C.STEER_STD, C.STIFFNESS_TIME),
+        (X.BEND, C.BEND_STD, C.BEND_TIME),
+        (X.GAIN, C.GAIN_STD, C.STIFFNESS_TIME),
+        (X.LEAK_X, C.LEAK_X_STD, C.LEAK_TIME),
+        (X.BIAS_X, C.BIAS_STD, C.BIAS_TIME),
+        (X.BIAS_Y, C.BIAS_STD, C.BIAS_TIME),
+    ):
+        std[state], time[state] = constants[spread], constants[back]
+    mean[X.LEAK_Y], mean[X.LEAK_X] = constants[C.LEAK_Y_MEAN], constants[C.LEAK_X_MEAN]
+    return mean, std, time

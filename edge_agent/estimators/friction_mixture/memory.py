@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edge_agent.estimators.friction_mixture.constants import NODES, STATES
+from edge_agent.estimators.friction_mixture.constants import NODES, PAIRS, STATES
 from schemas.numeric import BoolArray, FloatArray, IntArray
 
 INPUTS = 15  # ax, ay, yaw rate, steering, wheel speed, torque: the channels before the position
@@ -40,6 +40,10 @@ class H(IntEnum):
     LOG_LIKELIHOOD = 20
     USED = 21
     REAR_STEERING = 22  # 1 once a rear steering angle has been seen
+    UNLIKE = 23  # 1 while the nodes of unlike sides take part
+    LEFT = 24  # median, lower, upper friction under the left wheels
+    RIGHT = 27
+    LENGTH = 30
 
 
 class G(IntEnum):
@@ -55,7 +59,7 @@ class Memory(NamedTuple):
     """State of N filters."""
 
     started: BoolArray  # (N,)
-    held: FloatArray  # (N, len(H))
+    held: FloatArray  # (N, int(H.LENGTH))
     gain: FloatArray  # (N, 4, 2) indexed by G
     gain_sum: FloatArray  # (N, 4, 2) over the samples of the block
     sums: FloatArray  # (N, 15) of the valid samples in the block
@@ -64,11 +68,11 @@ class Memory(NamedTuple):
     last_omega: FloatArray  # (N, 4) [rad/s]
     last_delta: FloatArray  # (N, 4) [rad]
     mean: FloatArray  # (N, K, n)
-    root: FloatArray  # (N, K, n, n) sqrt_cov
+    covariance: FloatArray  # (N, K, n, n)
     weight: FloatArray  # (N, K)
     visit: FloatArray  # (N, K) probabilities from the reference prior at the start of the visit
     all_mean: FloatArray  # (N, n) moments of the mixture
-    all_root: FloatArray  # (N, n, n)
+    all_covariance: FloatArray  # (N, n, n)
     actual: FloatArray  # (N, 2) windowed innovation variances
     theoretical: FloatArray  # (N, 2)
     factor: FloatArray  # (N, 2) adapted over nominal R
@@ -82,7 +86,7 @@ def new_memory(count: int) -> Memory:
     """Memory of `count` filters that have not seen a sample."""
     return Memory(
         started=np.zeros(count, np.bool_),
-        held=np.zeros((count, len(H))),
+        held=np.zeros((count, int(H.LENGTH))),
         gain=np.zeros((count, 4, 2)),
         gain_sum=np.zeros((count, 4, 2)),
         sums=np.zeros((count, INPUTS)),
@@ -90,12 +94,12 @@ def new_memory(count: int) -> Memory:
         start_omega=np.zeros((count, 4)),
         last_omega=np.zeros((count, 4)),
         last_delta=np.zeros((count, 4)),
-        mean=np.zeros((count, NODES, STATES)),
-        root=np.zeros((count, NODES, STATES, STATES)),
-        weight=np.zeros((count, NODES)),
-        visit=np.zeros((count, NODES)),
+        mean=np.zeros((count, NODES + PAIRS, STATES)),
+        covariance=np.zeros((count, NODES + PAIRS, STATES, STATES)),
+        weight=np.zeros((count, NODES + PAIRS)),
+        visit=np.zeros((count, NODES + PAIRS)),
         all_mean=np.zeros((count, STATES)),
-        all_root=np.zeros((count, STATES, STATES)),
+        all_covariance=np.zeros((count, STATES, STATES)),
         actual=np.zeros((count, 2)),
         theoretical=np.zeros((count, 2)),
         factor=np.ones((count, 2)),

@@ -11,12 +11,15 @@ Legend
 from __future__ import annotations
 
 import math
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray, compiled
 
+APART = 1.45  # how much more friction the higher side has, at least, to count as unlike
 SMALLEST = 1e-12  # a probability that the re-injection of road change will raise again
 
 
@@ -28,15 +31,24 @@ def node_table(count: int) -> tuple[FloatArray, FloatArray]:
 
 
 @compiled
-def change_road(w: FloatArray, prior: FloatArray, hazard: float, drift: float, out: FloatArray) -> None:
+def change_road(
+    w: FloatArray, prior: FloatArray, chain: int, hazard: float, leaving: float, drift: float, out: FloatArray
+) -> None:
     """out = w after a change to anywhere with probability hazard and to a neighbour with probability about drift.
 
+    Only the first `chain` nodes have neighbours; the others are left for anywhere with probability `leaving` as well.
     The exchange between neighbours is in detailed balance with the prior, which therefore stays what it is.
     """
     count = w.shape[0]
+    left = 0.0
     for j in range(count):
         out[j] = w[j]
-    for j in range(count - 1):
+        if j >= chain:
+            left += leaving * w[j]
+            out[j] -= leaving * w[j]
+    for j in range(count):
+        out[j] += left * prior[j]
+    for j in range(chain - 1):
         least = min(prior[j], prior[j + 1])
         flow = 0.5 * drift * least * (w[j] / prior[j] - w[j + 1] / prior[j + 1])
         out[j] -= flow
@@ -105,3 +117,49 @@ def evidence(mu: FloatArray, prior: FloatArray, w: FloatArray, centres: FloatArr
         top = max(top, out[i])
     for i in range(centres.shape[0]):
         out[i] -= top
+
+
+LOW = (0.05, 0.11, 0.17, 0.25, 0.36, 0.50, 0.66)  # edges of the cells of the lower side
+HIGH = (0.36, 0.55, 0.80, 1.20)  # and of the higher: often it is only known to be more
+
+
+class Sides(NamedTuple):
+    """Friction under the left and right wheels of all nodes: those of one friction first, then the pairs."""
+
+    pair: FloatArray  # (K + PAIRS, 2) left, right
+    prior: FloatArray  # (K + PAIRS,)
+    share: FloatArray  # (3, PAIRS, K) of a pair's left side, right side and mean in the cells of the K nodes
+
+
+def side_table(mu: FloatArray, prior: FloatArray, unlike: float) -> Sides:
+    """All nodes, where a share `unlike` of the roads has unlike sides; mu and prior (K,)."""
+    edges = np.linspace(math.sqrt(LOWER), math.sqrt(UPPER), len(mu) + 1) ** 2
+    pairs, mass, share = [], [], []
+    for low, high in ((a, b) for a in pairwise(LOW) for b in pairwise(HIGH) if sum(b) > APART * sum(a)):
+        for left, right in ((low, high), (high, low)):
+            mean = (0.5 * (left[0] + right[0]), 0.5 * (left[1] + right[1]))
+            pairs.append((0.5 * sum(left), 0.5 * sum(right)))
+            mass.append((low[1] - low[0]) * (high[1] - high[0]))
+            share.append([_overlap(edges, *cell) for cell in (left, right, mean)])
+    return Sides(
+        np.vstack([np.column_stack([mu, mu]), pairs]),
+        np.concatenate([(1.0 - unlike) * prior, unlike * np.array(mass) / sum(mass)]),
+        np.ascontiguousarray(np.array(share).transpose(1, 0, 2)),
+    )
+
+
+def _overlap(edges: FloatArray, lower: float, upper: float) -> FloatArray:
+    """Share of [lower, upper] in each cell between the edges."""
+    inside = np.minimum(edges[1:], upper) - np.maximum(edges[:-1], lower)
+    return np.asarray(np.maximum(inside, 0.0) / (upper - lower))
+
+
+@compiled
+def projected(w: FloatArray, share: FloatArray, out: FloatArray) -> None:
+    """out (K,) = probabilities of the cells of the K nodes, those of the pairs (PAIRS, K) shared out."""
+    chain = out.shape[0]
+    for j in range(chain):
+        out[j] = w[j]
+    for k in range(share.shape[0]):
+        for j in range(chain):
+            out[j] += w[chain + k] * share[k, j]

@@ -11,8 +11,10 @@ import math
 from edge_agent.dynamics.body import advance_velocity
 from edge_agent.dynamics.parameters import P
 from edge_agent.estimators import flags
+from edge_agent.estimators.friction_mixture.arrays import clear_rows, put, put_pair, put_square
 from edge_agent.estimators.friction_mixture.constants import C, X
 from edge_agent.estimators.friction_mixture.memory import INPUTS, G, H, Memory
+from edge_agent.estimators.friction_mixture.node import Nominal
 from edge_agent.estimators.friction_mixture.nodes import quantile
 from schemas.numeric import FloatArray, compiled
 from schemas.signals import S
@@ -35,7 +37,6 @@ LOST_AY = 0.7  # [m/s/s^.5] random walk without a_y or yaw rate
 GAP_ACCELERATION = 2.0  # [m/s^2] that may have acted during a silence
 FIRST_VX_STD, FIRST_VY_STD = 0.3, 0.3  # [m/s]
 UNKNOWN_VX_STD = 15.0  # [m/s] without any wheel speed
-START_LEAST_STD = 1e-3
 
 
 @compiled
@@ -75,7 +76,7 @@ def rolling_speed(row: FloatArray, sample: FloatArray) -> float:
 @compiled
 def start(
     memory: Memory,
-    constants: FloatArray,
+    nominal: Nominal,
     mu: FloatArray,
     prior: FloatArray,
     row: FloatArray,
@@ -101,23 +102,17 @@ def start(
     speed = rolling_speed(row, sample)
     known = not math.isnan(speed)
     memory.all_mean[n, X.VX] = speed if known else 0.0
-    memory.all_mean[n, X.LEAK_Y], memory.all_mean[n, X.LEAK_X] = constants[C.LEAK_Y_MEAN], constants[C.LEAK_X_MEAN]
-    root = memory.all_root[n]
-    root[X.VX, X.VX] = FIRST_VX_STD if known else UNKNOWN_VX_STD
-    root[X.VY, X.VY] = FIRST_VY_STD
-    root[X.LN_KX, X.LN_KX] = root[X.LN_KY, X.LN_KY] = constants[C.STIFFNESS_STD]
-    root[X.LEAK_Y, X.LEAK_Y], root[X.LEAK_X, X.LEAK_X] = constants[C.LEAK_Y_STD], constants[C.LEAK_X_STD]
-    root[X.STEER, X.STEER] = constants[C.STEER_STD]
-    root[X.BIAS_X, X.BIAS_X] = root[X.BIAS_Y, X.BIAS_Y] = constants[C.BIAS_STD]
+    forget_vehicle(memory, nominal, n)
+    memory.all_covariance[n, X.VX, X.VX] = (FIRST_VX_STD if known else UNKNOWN_VX_STD) ** 2
+    memory.all_covariance[n, X.VY, X.VY] = FIRST_VY_STD**2
     for j in range(prior.shape[0]):
         memory.weight[n, j] = memory.visit[n, j] = prior[j]
-        memory.mean[n, j] = memory.all_mean[n]
-        memory.root[n, j] = root
-    held[H.MU] = quantile(mu, prior, prior, 0.5)
-    held[H.MU_LOWER] = quantile(mu, prior, prior, 0.05)
-    held[H.MU_UPPER] = quantile(mu, prior, prior, 0.95)
-    memory.gain[n] = 0.0
-    memory.gain_sum[n] = 0.0
+        put(memory.mean[n, j], memory.all_mean[n])
+        put_square(memory.covariance[n, j], memory.all_covariance[n])
+    for k, level in enumerate((0.5, 0.05, 0.95)):
+        held[H.MU + k] = held[H.LEFT + k] = held[H.RIGHT + k] = quantile(mu, prior, prior, level)
+    clear_rows(memory.gain[n])
+    clear_rows(memory.gain_sum[n])
     memory.started[n] = True
     return flags.OK
 
@@ -195,14 +190,16 @@ def _kinematics(memory: Memory, n: int, dt: float, sample: FloatArray) -> None:
         ay, leak_y = rate * memory.all_mean[n, X.VX], 0.0
     held[H.AX], held[H.AY] = ax, ay
     gain = memory.gain[n]
-    gain[G.INPUT] = advance_velocity(gain[G.INPUT, 0], gain[G.INPUT, 1], ax, ay, rate, dt)
-    gain[G.LEAK_X] = advance_velocity(gain[G.LEAK_X, 0], gain[G.LEAK_X, 1], leak_x, 0.0, rate, dt)
-    gain[G.LEAK_Y] = advance_velocity(gain[G.LEAK_Y, 0], gain[G.LEAK_Y, 1], 0.0, leak_y, rate, dt)
-    gain[G.UNIT] = advance_velocity(gain[G.UNIT, 0], gain[G.UNIT, 1], 1.0, 0.0, rate, dt)
+    put_pair(gain[G.INPUT], advance_velocity(gain[G.INPUT, 0], gain[G.INPUT, 1], ax, ay, rate, dt))
+    put_pair(gain[G.LEAK_X], advance_velocity(gain[G.LEAK_X, 0], gain[G.LEAK_X, 1], leak_x, 0.0, rate, dt))
+    put_pair(gain[G.LEAK_Y], advance_velocity(gain[G.LEAK_Y, 0], gain[G.LEAK_Y, 1], 0.0, leak_y, rate, dt))
+    put_pair(gain[G.UNIT], advance_velocity(gain[G.UNIT, 0], gain[G.UNIT, 1], 1.0, 0.0, rate, dt))
     held[H.ANGLE] += rate * dt
     held[H.SUM_COS] += math.cos(held[H.ANGLE])
     held[H.SUM_SIN] += math.sin(held[H.ANGLE])
-    memory.gain_sum[n] += gain
+    for k in range(gain.shape[0]):
+        memory.gain_sum[n, k, 0] += gain[k, 0]
+        memory.gain_sum[n, k, 1] += gain[k, 1]
     held[H.SAMPLES] += 1.0
 
 
@@ -222,19 +219,45 @@ def _add(memory: Memory, n: int, sample: FloatArray) -> None:
 
 
 @compiled
+def forget_vehicle(memory: Memory, nominal: Nominal, n: int) -> None:
+    """The overall moments of what is a property of vehicle or sensor become those of its prior."""
+    covariance = memory.all_covariance[n]
+    for i in range(X.LN_KX, nominal.mean.shape[0]):
+        memory.all_mean[n, i] = nominal.mean[i]
+        for j in range(i + 1):
+            covariance[i, j] = covariance[j, i] = 0.0
+        covariance[i, i] = nominal.std[i] ** 2
+
+
+@compiled
+def fall_asleep(memory: Memory, prior: FloatArray, n: int) -> None:
+    """The nodes of unlike sides take no part any more; prior (K,) of the others."""
+    if memory.held[n, H.UNLIKE] == 0.0:
+        return
+    memory.held[n, H.UNLIKE] = 0.0
+    chain = prior.shape[0]
+    for weight in (memory.weight[n], memory.visit[n]):
+        total = 0.0
+        for j in range(chain):
+            total += weight[j]
+        for j in range(weight.shape[0]):
+            weight[j] = weight[j] / total if j < chain else 0.0
+
+
+@compiled
 def restart_motion(memory: Memory, n: int, speed: float, spread: float) -> None:
     """All nodes of vehicle n go on at `speed` [m/s], or, where that is NaN, at the speed they have within `spread`."""
     if not math.isnan(speed):
         memory.all_mean[n, X.VX], spread = speed, FIRST_VX_STD
     memory.all_mean[n, X.VY] = 0.0
-    root = memory.all_root[n]
-    for i in range(root.shape[0]):
+    covariance = memory.all_covariance[n]
+    for i in range(covariance.shape[0]):
         for axis in range(2):
-            root[i, axis] = 0.0
-    root[X.VX, X.VX], root[X.VY, X.VY] = spread, FIRST_VY_STD
+            covariance[i, axis] = covariance[axis, i] = 0.0
+    covariance[X.VX, X.VX], covariance[X.VY, X.VY] = spread**2, FIRST_VY_STD**2
     for j in range(memory.mean.shape[1]):
-        memory.mean[n, j] = memory.all_mean[n]
-        memory.root[n, j] = root
+        put(memory.mean[n, j], memory.all_mean[n])
+        put_square(memory.covariance[n, j], covariance)
 
 
 @compiled
@@ -245,6 +268,7 @@ def _bridge(
     held = memory.held[n]
     gone = time - held[H.TIME]
     hazard = 1.0 - math.exp(-abs(memory.all_mean[n, X.VX]) * gone * constants[C.HAZARD])
+    fall_asleep(memory, prior, n)
     for j in range(prior.shape[0]):
         memory.weight[n, j] += hazard * (prior[j] - memory.weight[n, j])
         memory.visit[n, j] += hazard * (prior[j] - memory.visit[n, j])
@@ -255,8 +279,8 @@ def _bridge(
     held[H.TIME] = held[H.BLOCK_TIME] = time
     for k in range(H.ANGLE, H.SAMPLES + 1):
         held[k] = 0.0
-    memory.gain[n] = 0.0
-    memory.gain_sum[n] = 0.0
+    clear_rows(memory.gain[n])
+    clear_rows(memory.gain_sum[n])
     held[H.START_YAW_RATE] = held[H.YAW_RATE]
     for channel in range(INPUTS):
         memory.sums[n, channel] = 0.0

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -19,10 +19,10 @@ from edge_agent.dynamics.slip import SLOWEST_M_S, wheel_velocity
 from edge_agent.estimators import flags
 from edge_agent.estimators.friction_mixture.bank import OUTPUTS, Estimates, FlagArray
 from edge_agent.estimators.gaussian.intake import Track, new_track
-from schemas.errors import InputError
+from edge_agent.estimators.shares import checked, in_shares
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import BoolArray, FloatArray, compiled
-from schemas.signals import CHANNELS, S
+from schemas.signals import S
 
 # what is known of the friction of a road nobody has measured: moments of the uniform prior
 PRIOR_MU = 0.5 * (LOWER + UPPER)
@@ -35,13 +35,28 @@ FASTEST_M_S = 150.0  # an estimate beyond has diverged
 FASTEST_TURN = 20.0  # [rad/s]
 
 M = TypeVar("M")
-Kernel = Callable[[M, Track, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FlagArray], None]
+
+
+class Stretch(NamedTuple):
+    """The next samples of N vehicles, and where their estimates go."""
+
+    rows: FloatArray  # (N, len(P)) parameters
+    t: FloatArray  # (T, N) [s]
+    signals: FloatArray  # (T, N, 18)
+    out: FloatArray  # (15, T, N) in the order of OUTPUTS
+    wheels: FloatArray  # (T, N, 4, 3), or (0, N, 4, 3) where friction is one
+    health: FlagArray  # (T, N)
+
+
+Kernel = Callable[[M, Track, Stretch, int, int], None]
 
 
 class Bank(Protocol):
     """What steps N vehicles at once; see `EstimatorBank.advance`."""
 
-    def advance(self, t: FloatArray, signals: FloatArray, closes: BoolArray | None = None) -> Estimates:
+    def advance(
+        self, t: FloatArray, signals: FloatArray, closes: BoolArray | None = None, *, threads: int = 1
+    ) -> Estimates:
         """Take the next samples of all vehicles."""
         ...
 
@@ -49,26 +64,25 @@ class Bank(Protocol):
 class GaussianBank(Generic[M]):
     """N filters of one paper; made by `create`.
 
-    kernel(memory, track, rows, t, signals, out (15, T, N), wheels (T, N, 4, 3) or (0, N, 4, 3), health (T, N)).
+    kernel(memory, track, stretch, first, last) fills what belongs to the vehicles [first, last).
     """
 
     def __init__(self, rows: FloatArray, memory: M, kernel: Kernel[M], *, wheels: bool = False) -> None:
         self._rows, self._memory, self._kernel, self._wheels = rows, memory, kernel, wheels
         self._track = new_track(len(rows))
 
-    def advance(self, t: FloatArray, signals: FloatArray, closes: BoolArray | None = None) -> Estimates:
+    def advance(
+        self, t: FloatArray, signals: FloatArray, closes: BoolArray | None = None, *, threads: int = 1
+    ) -> Estimates:
         """Take the next samples; arguments and errors as `EstimatorBank.advance`, but no evidence is told."""
         count = len(self._rows)
-        t, signals = np.ascontiguousarray(t, np.float64), np.ascontiguousarray(signals, np.float64)
-        if t.ndim != 2 or t.shape[1] != count:
-            raise InputError("t", f"shape {t.shape} for a bank of {count}", "give (T, N)")
-        if signals.shape != (*t.shape, len(CHANNELS)):
-            raise InputError("signals", f"shape {signals.shape}", f"give {(*t.shape, len(CHANNELS))}")
-        if closes is not None and closes.shape != t.shape:
-            raise InputError("closes", f"shape {closes.shape}", f"give {t.shape}")
+        t, signals = checked(t, signals, closes, count)
         out, health = np.empty((len(OUTPUTS), *t.shape)), np.zeros(t.shape, np.int32)
         wheels = np.empty((t.shape[0] if self._wheels else 0, count, 4, 3))
-        self._kernel(self._memory, self._track, self._rows, t, signals, out, wheels, health)
+        stretch = Stretch(self._rows, t, signals, out, wheels, health)
+        in_shares(
+            lambda _, first, last: self._kernel(self._memory, self._track, stretch, first, last), count, threads
+        )  # fmt: skip
         named = dict(zip(OUTPUTS, out, strict=True))
         return Estimates(**named, health=health, mu_wheel=wheels if self._wheels else None, evidence=None)
 

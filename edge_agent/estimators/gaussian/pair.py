@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edge_agent.dynamics.chassis import DUGOFF
 from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import P
 from edge_agent.dynamics.slip import wheel_velocity
@@ -113,8 +112,7 @@ def turn(pair: Pair, track: Track, row: FloatArray, n: int, gone: float, frictio
         beta = pair.beta[n] if sub == 0 else 1.0 - pair.beta[n]
         share(pair.root[n], beta, root)
         axis_points(pair.mean[n], root, pair.xi, points)
-        for p in range(points.shape[0]):
-            carry(row, points[p], friction, track.before[n], track.use[n], gone, True, DUGOFF)
+        carry(row, points, friction, track.before[n], track.use[n], gone, True)
         for i in range(STATES):
             process[i, i] = pair.process[i] * math.sqrt(gone / STEP_S / beta)
         predict(points, pair.weight, pair.weight, process, mean, root, work)

@@ -33,58 +33,57 @@ def substeps(speed: float, gone: float) -> int:
 @compiled
 def carry(
     row: FloatArray,
-    x: FloatArray,
+    points: FloatArray,
     friction: FloatArray,
     before: FloatArray,
     use: FloatArray,
     gone: float,
     torque: bool,
-    shape: float,
 ) -> None:
-    """Move the state x (6,) on by `gone` [s], in place; inputs (15,) run straight from `before` to `use`.
+    """Move the states points (P, 6) on by `gone` [s], in place; inputs (15,) run straight from `before` to `use`.
 
     torque: longitudinal forces come from the wheels' torque, z is the yaw acceleration and friction (4,) is given; the
     velocity follows a_x and a_y of the state alone, which measurements correct for drag and slopes. Else forces come
     from slip and z is the friction of all wheels.
     """
-    count = substeps(abs(x[0]), gone)
+    slowest = abs(points[0, 0])
+    for p in range(points.shape[0]):
+        slowest = min(slowest, abs(points[p, 0]))
+    count = substeps(slowest, gone)
     step = gone / count
-    mu, known, force_x, force_y = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
-    motion, delta, omega = np.empty(5), np.empty(4), np.empty(4)
-    slope_x = slope_y = turn = 0.0
+    mu, known, omega, steering = np.empty(4), np.empty(4), np.empty(4), np.empty((4, 2))
     for wheel in range(4):
-        mu[wheel] = min(max(friction[wheel] if torque else x[5], LOWER), UPPER)
         known[wheel] = wheel_force(row, before, use, wheel, gone) if torque else math.nan
-    for stage in range(3 * count):
-        k, act = stage // 3, stage % 3
-        if act == 0:
-            vx, vy, rate = x[0], x[1], x[4]
-        elif act == 1:
-            vx, vy, rate = x[0] + step * slope_x, x[1] + step * slope_y, x[4] + step * turn
-            if torque:
-                vx, vy = advance_velocity(x[0], x[1], x[2], x[3], x[4], step)
-        _between(before, use, (k if act == 0 else k + 1) / count, delta, omega)
-        motion[0], motion[1], motion[2], motion[3], motion[4] = vx, vy, rate, x[2], x[3]
-        ax, ay, now = response(row, motion, delta, omega, known, mu, shape, force_x, force_y)
-        if act == 0:
-            slope_x, slope_y = x[2] + x[4] * x[1], x[3] - x[4] * x[0]
-            turn = x[5] if torque else now
-        elif act == 1:
+        mu[wheel] = min(max(friction[wheel], LOWER), UPPER)
+    _inputs(before, use, 0.0, omega, steering)
+    for k in range(count):
+        omega_from, steering_from = omega.copy(), steering.copy()
+        _inputs(before, use, (k + 1) / count, omega, steering)
+        for p in range(points.shape[0]):
             if not torque:
-                vx = x[0] + 0.5 * step * (slope_x + ax + rate * vy)
-                vy = x[1] + 0.5 * step * (slope_y + ay - rate * motion[0])
-            rate = x[4] + 0.5 * step * (turn + now)
-            x[0], x[1], x[4] = vx, vy, rate
-        else:
-            x[2], x[3] = ax, ay
+                mu[:] = min(max(points[p, 5], LOWER), UPPER)
+            v, u, ax, ay, r = points[p, 0], points[p, 1], points[p, 2], points[p, 3], points[p, 4]
+            _, _, turn = response(row, v, u, r, ax, ay, steering_from, omega_from, known, mu)
+            turn = points[p, 5] if torque else turn
+            slope_x, slope_y = ax + r * u, ay - r * v
+            ahead, aside, rate = v + step * slope_x, u + step * slope_y, r + step * turn
+            vx, vy = advance_velocity(v, u, ax, ay, r, step) if torque else (ahead, aside)
+            felt_x, felt_y, again = response(row, vx, vy, rate, ax, ay, steering, omega, known, mu)
+            if not torque:
+                vx = v + 0.5 * step * (slope_x + felt_x + rate * aside)
+                vy = u + 0.5 * step * (slope_y + felt_y - rate * ahead)
+            rate = r + 0.5 * step * (turn + again)
+            points[p, 0], points[p, 1], points[p, 4] = vx, vy, rate
+            points[p, 2], points[p, 3], again = response(row, vx, vy, rate, ax, ay, steering, omega, known, mu)
             if torque:
-                x[5] = now
+                points[p, 5] = again
 
 
 @compiled
-def _between(before: FloatArray, use: FloatArray, share: float, delta: FloatArray, omega: FloatArray) -> None:
-    """Steering and wheel speeds at a share of the way from one sample to the next."""
+def _inputs(before: FloatArray, use: FloatArray, share: float, omega: FloatArray, steering: FloatArray) -> None:
+    """Wheel speeds (4,) and turned steering (4, 2) at a share of the way from one sample to the next."""
     for wheel in range(4):
         d, w = S.DELTA + wheel, S.OMEGA + wheel
-        delta[wheel] = (1.0 - share) * before[d] + share * use[d]
+        delta = (1.0 - share) * before[d] + share * use[d]
         omega[wheel] = (1.0 - share) * before[w] + share * use[w]
+        steering[wheel, 0], steering[wheel, 1] = math.cos(delta), math.sin(delta)

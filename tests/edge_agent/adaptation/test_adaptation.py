@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from edge_agent.adaptation.fuzzy import LARGEST_FACTOR, LEAST_FACTOR, adapted, infer
-from edge_agent.adaptation.memberships import Memberships, load_memberships
+from edge_agent.adaptation.memberships import Memberships
 from schemas.errors import InputError
 
 SETS = Memberships()
@@ -45,12 +44,10 @@ def test_without_a_theoretical_variance_nothing_is_concluded() -> None:
     assert adapted(2.0, 1.0, 0.0, INPUTS, OUTPUTS) == 2.0
 
 
-def test_memberships_survive_vector_and_json(tmp_path: Path) -> None:
+def test_memberships_survive_vector_and_json() -> None:
     sets = Memberships(ln_scales=(0.2, -0.3))
     assert Memberships.from_vector(sets.to_vector()) == sets
-    path = tmp_path / "sets.json"
-    path.write_text(json.dumps({"memberships": sets.to_json(), "seed": 3}))
-    assert load_memberships(path) == sets
+    assert Memberships.from_json(json.loads(json.dumps(sets.to_json()))) == sets
 
 
 def test_every_vector_within_the_bounds_is_a_valid_set_of_memberships() -> None:
@@ -77,9 +74,7 @@ def test_impossible_memberships_are_refused_by_name(change: dict[str, Any], fiel
         Memberships(**change)
 
 
-@pytest.mark.parametrize("text", ["", "[]", '{"inputs": "wide"}', '{"memberships": {}}'])
-def test_a_file_that_is_no_memberships_is_refused(tmp_path: Path, text: str) -> None:
-    path = tmp_path / "sets.json"
-    path.write_text(text)
+@pytest.mark.parametrize("document", [None, [], {"inputs": "wide"}, {}])
+def test_a_document_that_is_no_memberships_is_refused(document: object) -> None:
     with pytest.raises(InputError, match="memberships"):
-        load_memberships(path)
+        Memberships.from_json(document)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edge_agent.dynamics.body import accelerations
-from edge_agent.dynamics.chassis import DUGOFF, response, tyre_forces
+from edge_agent.dynamics.chassis import DUGOFF, response, turned, tyre_forces
 from edge_agent.dynamics.drive_wheel import ELECTRIC_S, blended, drive_wheel, slip_share
 from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import P, parameter_row
@@ -24,7 +24,7 @@ UNKNOWN = np.full(4, np.nan)
 
 def forces(shape: float, mu: float, omega: FloatArray) -> tuple[FloatArray, FloatArray]:
     x, y = np.empty(4), np.empty(4)
-    tyre_forces(ROW, MOTION, DELTA, omega, np.full(4, mu), shape, x, y)
+    tyre_forces(ROW, MOTION, turned(DELTA), omega, np.full(4, mu), shape, x, y)
     return x, y
 
 
@@ -46,14 +46,15 @@ def test_a_wheel_without_speed_rolls_freely() -> None:
 
 
 def test_the_response_is_that_of_the_tyres_unless_a_force_is_known() -> None:
-    omega, x, y = np.full(4, 57.0), np.empty(4), np.empty(4)
-    free = response(ROW, MOTION, DELTA, omega, UNKNOWN, np.full(4, 0.8), DUGOFF, x, y)
+    omega = np.full(4, 57.0)
+    vx, vy, rate, ax, ay = MOTION
+    free = response(ROW, vx, vy, rate, ax, ay, turned(DELTA), omega, UNKNOWN, np.full(4, 0.8))
     tyre_x, tyre_y = forces(DUGOFF, 0.8, omega)
-    assert free == accelerations(ROW, tyre_x, tyre_y, DELTA)
+    assert free == pytest.approx(accelerations(ROW, tyre_x, tyre_y, DELTA), rel=1e-12, abs=1e-12)
     known = np.array([100.0, 200.0, np.nan, np.nan])
-    told = response(ROW, MOTION, DELTA, omega, known, np.full(4, 0.8), DUGOFF, x, y)
-    assert (x[0], x[1]) == (100.0, 200.0)
-    assert told[0] != free[0]
+    told = response(ROW, vx, vy, rate, ax, ay, turned(DELTA), omega, known, np.full(4, 0.8))
+    tyre_x[:2] = 100.0, 200.0
+    assert told == pytest.approx(accelerations(ROW, tyre_x, tyre_y, DELTA), rel=1e-12, abs=1e-12)
 
 
 def test_the_brush_curve_starts_with_slope_one_and_stays_at_one_from_three_on() -> None:

@@ -13,8 +13,10 @@ from schemas.vehicle import Vehicle
 
 
 @cache
-def drive(name: str, mu: float, seed: int = 1, seconds: float | None = None) -> tuple[FloatArray, FloatArray, Vehicle]:
-    """t (T,) [s], signals (T, 18) and the nominal vehicle of a simulated manoeuvre with ordinary sensors."""
+def drive(
+    name: str, mu: float | None, seed: int = 1, seconds: float | None = None
+) -> tuple[FloatArray, FloatArray, Vehicle]:
+    """t (T,) [s], signals (T, 18), nominal vehicle of a manoeuvre with ordinary sensors; its own friction if None."""
     log, vehicle = simulate_manoeuvre(name, mu=mu, seed=seed, duration_s=seconds, sensors="mems")
     return log["t"].to_numpy(), np.stack([log[c].to_numpy() for c in CHANNELS], axis=-1).astype(float), vehicle
 

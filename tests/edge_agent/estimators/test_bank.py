@@ -223,3 +223,38 @@ def test_misuse_is_refused_by_name(name: str, shape: tuple[int, ...], field: str
 def test_a_bank_of_no_vehicles_is_refused() -> None:
     with pytest.raises(InputError, match="vehicles"):
         create("ckf", [])
+
+
+def test_on_a_split_road_the_sides_are_told_apart() -> None:
+    t, signals, vehicle = drive("split-braking", None)
+    said = run("fckf", t, signals, vehicle)
+    assert said.mu_wheel is not None
+    braking = (t > 2.0) & (t < 4.0)
+    left, right = said.mu_wheel[braking, 0, 0], said.mu_wheel[braking, 0, 1]
+    assert ((left[:, 1] <= 0.8) & (left[:, 2] >= 0.8)).mean() > 0.85
+    assert np.abs(right[:, 0] - 0.3).mean() < 0.12
+    assert (right[:, 2] < left[:, 1]).all()
+    assert (said.mu_wheel[:, 0, 0] == said.mu_wheel[:, 0, 2]).all()
+
+
+def test_on_a_road_of_one_friction_the_wheels_have_it() -> None:
+    t, signals, vehicle = drive("slalom", 0.3)
+    said = run("fckf", t, signals, vehicle)
+    assert said.mu_wheel is not None
+    assert np.abs(said.mu_wheel[..., 0] - said.mu[..., None]).mean() < 0.02
+
+
+def test_creeping_after_a_hard_stop_tells_no_ice() -> None:
+    t, signals, vehicle = drive("braking", 0.85)
+    said = run("fckf", t, signals, vehicle)
+    assert said.vx[-1, 0] < 2.0
+    assert (said.mu_upper[t > 2.0] > 0.7).all()
+
+
+def test_wheels_that_spin_beyond_belief_tell_nothing_false() -> None:
+    t, signals, vehicle = drive("acceleration", 0.3)
+    broken = signals.copy()
+    broken[300:, S.OMEGA : S.OMEGA + 4] = 600.0
+    said = run("fckf", t, broken, vehicle)
+    assert (said.mu_lower[300:] <= 0.3).mean() > 0.85
+    assert (said.mu_upper[300:] >= 0.3).mean() > 0.85

@@ -20,7 +20,7 @@ def test_the_prior_of_the_nodes_is_uniform_in_mu_and_its_quantiles_say_so() -> N
 
 def test_road_change_leaves_the_prior_as_it_is() -> None:
     out = np.empty(NODES)
-    change_road(PRIOR, PRIOR, 0.1, 0.3, out)
+    change_road(PRIOR, PRIOR, NODES, 0.1, 0.0, 0.3, out)
     assert out == pytest.approx(PRIOR, abs=1e-12)
 
 
@@ -29,7 +29,7 @@ def test_road_change_keeps_the_whole_mass_and_brings_any_belief_back_to_the_prio
     w[3] = 1.0
     out = np.empty(NODES)
     for _ in range(400):
-        change_road(w, PRIOR, 0.02, 0.05, out)
+        change_road(w, PRIOR, NODES, 0.02, 0.0, 0.05, out)
         w[:] = out
         assert w.sum() == pytest.approx(1.0)
     assert w == pytest.approx(PRIOR, abs=1e-3)

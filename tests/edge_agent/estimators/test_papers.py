@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from edge_agent.adaptation.memberships import Memberships
+from edge_agent.banks import bank_of
 from edge_agent.estimators import Estimates, adaptive_federated_ckf, compensated_wckf, create, paper_aco_fckf
 from edge_agent.estimators.paper_aco_fckf import Setting
 from edge_agent.observer import Open, observe
@@ -29,7 +30,7 @@ PRIOR_WIDTH = 0.9 * 1.15
 
 
 def run(name: str, t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> Estimates:
-    return create(name, [vehicle]).advance(t[:, None], signals[:, None])
+    return bank_of(name, [vehicle]).advance(t[:, None], signals[:, None])
 
 
 @pytest.mark.parametrize("name", PAPERS)
@@ -46,7 +47,7 @@ def test_on_a_slalom_the_motion_is_found(name: str) -> None:
 @pytest.mark.parametrize("name", PAPERS)
 def test_a_vehicle_has_the_same_numbers_alone_and_among_many(name: str) -> None:
     t, signals, vehicle = drive("slalom", 0.8, seconds=1.5)
-    bank, crowd = create(name, [vehicle] * 3), np.repeat(signals[:, None], 3, axis=1)
+    bank, crowd = bank_of(name, [vehicle] * 3), np.repeat(signals[:, None], 3, axis=1)
     crowd[:, :2] += 0.01 * np.random.default_rng(0).normal(size=(1, 2, crowd.shape[2]))
     together = bank.advance(np.repeat(t[:, None], 3, axis=1), crowd)
     alone = run(name, t, signals, vehicle)
@@ -57,7 +58,7 @@ def test_a_vehicle_has_the_same_numbers_alone_and_among_many(name: str) -> None:
 @pytest.mark.parametrize("name", PAPERS)
 def test_however_the_samples_are_cut_the_numbers_are_the_same_and_causal(name: str) -> None:
     t, signals, vehicle = drive("slalom", 0.8, seconds=1.5)
-    whole, bank = run(name, t, signals, vehicle), create(name, [vehicle])
+    whole, bank = run(name, t, signals, vehicle), bank_of(name, [vehicle])
     parts = [bank.advance(t[a:b, None], signals[a:b, None]) for a, b in pairwise([0, 1, 2, 37, 90, len(t)])]
     for array in ARRAYS:
         assert np.array_equal(np.concatenate([getattr(p, array) for p in parts]), getattr(whole, array)), array
@@ -94,7 +95,7 @@ def test_without_evidence_the_observer_tells_friction_with_its_interval(name: st
     t, signals, vehicle = drive("slalom", 0.8, seconds=6.0)
     t, signals = t[:, None], signals[:, None]
     _, located = locate(Track.start(1), t, signals)
-    said = create(name, [vehicle]).advance(t, signals, located.closes)
+    said = bank_of(name, [vehicle]).advance(t, signals, located.closes)
     _, told, _ = observe(Open.start(1), (t * 1e9).astype(np.int64), located, said, AgentConfig())
     assert len(told.vehicle) > 0
     assert told.columns["log_likelihood"].shape == (len(told.vehicle), 0)
@@ -171,6 +172,6 @@ def test_the_fuzzy_sets_matter_to_the_papers_filter_and_are_refused_where_there_
 def test_misuse_is_refused_by_name(shape: tuple[int, ...], field: str) -> None:
     vehicle = drive("slalom", 0.3, seconds=1.5)[2]
     with pytest.raises(InputError, match=field):
-        create("paper-aco-fckf", [vehicle]).advance(np.zeros((3, 1)), np.zeros(shape))
+        bank_of("paper-aco-fckf", [vehicle]).advance(np.zeros((3, 1)), np.zeros(shape))
     with pytest.raises(InputError, match="closes"):
         create("sr-ukf", [vehicle]).advance(np.zeros((3, 1)), np.zeros((3, 1, 18)), np.zeros((2, 1), bool))

@@ -8,7 +8,7 @@ import pytest
 from edge_agent.filters.downdate import downdate, update_by_downdate
 from edge_agent.filters.federated import fuse, share
 from edge_agent.filters.sigma import cubature
-from edge_agent.filters.squareroot import predict, update
+from edge_agent.filters.squareroot import predict, sigma_points, update
 from edge_agent.filters.svd import axis_points
 from schemas.numeric import FloatArray
 
@@ -16,6 +16,19 @@ from schemas.numeric import FloatArray
 def covariance(n: int, seed: int) -> FloatArray:
     a = np.random.default_rng(seed).normal(size=(n, n))
     return np.asarray(a @ a.T + 0.1 * np.eye(n))
+
+
+System = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+"""f, q, h and the standard deviations of the measurement."""
+
+
+def textbook(mean: FloatArray, cov: FloatArray, system: System, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """One turn of the Kalman filter with whole covariances."""
+    f, q, h, noise = system
+    mean, cov = f @ mean, f @ cov @ f.T + q
+    s = h @ cov @ h.T + np.diag(noise**2)
+    gain = cov @ h.T @ np.linalg.inv(s)
+    return mean + gain @ (z - h @ mean), cov - gain @ s @ gain.T
 
 
 @pytest.mark.parametrize("beta", [0.1, 0.5, 0.83])
@@ -50,10 +63,7 @@ def test_a_federated_filter_that_counts_shared_rows_half_is_the_one_kalman_filte
     x, root, rule = mean.copy(), np.linalg.cholesky(cov), cubature(n)
     for _ in range(10):
         z = rng.normal(size=2)
-        mean, cov = f @ mean, f @ cov @ f.T + q
-        s = h @ cov @ h.T + np.diag(noise**2)
-        gain = cov @ h.T @ np.linalg.inv(s)
-        mean, cov = mean + gain @ (z - h @ mean), cov - gain @ s @ gain.T
+        mean, cov = textbook(mean, cov, (f, q, h, noise), z)
         x, root = _federated_turn(rule.xi, rule.w_cov, (x, root), (f, q, h, noise), z, 0.37)
     assert x == pytest.approx(mean, abs=1e-12)
     assert root @ root.T == pytest.approx(cov, abs=1e-12)
@@ -61,7 +71,7 @@ def test_a_federated_filter_that_counts_shared_rows_half_is_the_one_kalman_filte
 
 def _federated_turn(
     xi: FloatArray, weight: FloatArray, state: tuple[FloatArray, FloatArray],
-    system: tuple[FloatArray, FloatArray, FloatArray, FloatArray], z: FloatArray, beta: float,
+    system: System, z: FloatArray, beta: float,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     (mean, root), (f, q, h, noise) = state, system
     n, work = len(mean), np.empty((20, 40))
@@ -130,6 +140,23 @@ def test_an_update_by_downdates_is_the_orthogonal_update() -> None:
     assert not told[3]
     assert mean == pytest.approx(other, abs=1e-9)
     assert cov == pytest.approx(other_cov, abs=1e-9)
+
+
+def test_a_filter_that_updates_by_downdates_is_the_textbook_filter_on_a_linear_system() -> None:
+    rng, n = np.random.default_rng(21), 4
+    f, h, q = 0.9 * np.eye(n) + 0.05 * rng.normal(size=(n, n)), rng.normal(size=(3, n)), 0.01 * covariance(n, 22)
+    noise, rule = np.array([0.2, 0.3, 0.4]), cubature(n)
+    mean, cov = np.ones(n), covariance(n, 23)
+    x, root, points, work = mean.copy(), np.linalg.cholesky(cov), np.empty((2 * n, n)), np.empty((20, 40))
+    for _ in range(50):
+        z = rng.normal(size=3)
+        mean, cov = textbook(mean, cov, (f, q, h, noise), z)
+        sigma_points(x, root, rule.xi, points)
+        predict(np.ascontiguousarray(points @ f.T), rule.w_mean, rule.w_cov, np.linalg.cholesky(q), x, root, work)
+        told = update_by_downdate(x, root, root.copy(), np.ascontiguousarray(h @ root), z - h @ x, noise, work)
+        assert not told[3]
+        assert x == pytest.approx(mean, abs=1e-12)
+        assert root @ root.T == pytest.approx(cov, abs=1e-12)
 
 
 def test_where_the_downdate_refuses_the_orthogonal_update_does_the_work() -> None:

@@ -56,9 +56,9 @@ def test_triangularizing_keeps_the_product_and_makes_a_cholesky_factor(shape: tu
     assert (np.diag(factor) >= 0).all()
 
 
-def test_a_covariance_keeps_a_centimetre_at_an_offset_of_5400_kilometres() -> None:
-    rule = cubature(2)
-    points, mean, work = np.empty((4, 2)), np.empty(2), np.zeros((2, 6))
+@pytest.mark.parametrize("rule", [cubature(2), unscented(2, 1.0, 2.0, 0.5)], ids=lambda rule: rule.name)
+def test_a_covariance_keeps_a_centimetre_at_an_offset_of_5400_kilometres(rule: SigmaRule) -> None:
+    points, mean, work = np.empty((len(rule.xi), 2)), np.empty(2), np.zeros((2, 8))
     root = np.zeros((2, 2))
     squareroot.sigma_points(np.array([5.4e6, -5.4e6]), 0.01 * np.eye(2), rule.xi, points)
     squareroot.predict(points, rule.w_mean, rule.w_cov, np.zeros((2, 2)), mean, root, work)
@@ -142,6 +142,51 @@ def test_on_a_curved_measurement_the_square_root_is_the_textbook_covariance_filt
     )
     assert np.allclose(new, mean + k @ nu, rtol=0, atol=1e-9)
     assert np.allclose(root @ root.T, cov - k @ s @ k.T, rtol=0, atol=1e-9)
+
+
+def _textbook(
+    rule: SigmaRule, mean: FloatArray, cov: FloatArray, q: FloatArray, r: FloatArray, z: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """One turn of the cubature filter with whole covariances, for the pendulum of the test below."""
+    points = swing(mean + rule.xi @ np.linalg.cholesky(cov).T)
+    mean = points.mean(axis=0)
+    cov = (points - mean).T @ (points - mean) / len(points) + q
+    points = mean + rule.xi @ np.linalg.cholesky(cov).T
+    seen = look(points)
+    expected = seen.mean(axis=0)
+    s = (seen - expected).T @ (seen - expected) / len(points) + np.diag(r**2)
+    gain = (points - mean).T @ (seen - expected) / len(points) @ np.linalg.inv(s)
+    return mean + gain @ (z - expected), cov - gain @ s @ gain.T
+
+
+def swing(x: FloatArray) -> FloatArray:
+    """A damped pendulum of angle and rate over 50 ms."""
+    return np.stack([x[:, 0] + 0.05 * x[:, 1], 0.99 * x[:, 1] - 0.5 * np.sin(x[:, 0])], axis=1)
+
+
+def look(x: FloatArray) -> FloatArray:
+    """What is seen of it: its shadow, and its rate times its height."""
+    return np.stack([np.sin(x[:, 0]), x[:, 1] * np.cos(x[:, 0])], axis=1)
+
+
+def test_on_a_curved_system_the_square_root_filter_stays_the_textbook_covariance_filter() -> None:
+    rule, rng = cubature(2), np.random.default_rng(8)
+    q, r = 1e-3 * np.array([[1.0, 0.3], [0.3, 2.0]]), np.array([0.1, 0.2])
+    mean, cov = np.array([0.8, 0.0]), 0.1 * np.eye(2)
+    ours, root, work = mean.copy(), factor_of(cov), np.zeros((8, 16))
+    points = np.empty((4, 2))
+    for _ in range(100):
+        z = rng.normal(0.3, 0.3, size=2)
+        mean, cov = _textbook(rule, mean, cov, q, r, z)
+        squareroot.sigma_points(ours, root, rule.xi, points)
+        squareroot.predict(swing(points), rule.w_mean, rule.w_cov, factor_of(q), ours, root, work)
+        squareroot.sigma_points(ours, root, rule.xi, points)
+        seen, x, y = look(points), np.empty((2, 4)), np.empty((2, 4))
+        squareroot.deviations(points, ours, rule.w_cov, x, 0)
+        squareroot.deviations(seen, rule.w_mean @ seen, rule.w_cov, y, 0)
+        squareroot.update(ours, root, x, y, z - rule.w_mean @ seen, r, work)
+        assert np.allclose(ours, mean, rtol=0, atol=1e-9)
+        assert np.allclose(root @ root.T, cov, rtol=0, atol=1e-9)
 
 
 def test_a_missing_row_is_as_if_it_had_never_been_asked_for() -> None:

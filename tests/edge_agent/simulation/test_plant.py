@@ -120,6 +120,24 @@ def test_steering_left_turns_left_and_loads_the_right_wheels() -> None:
     assert u[U.STEER, 0] > u[U.STEER, 1]  # the inner wheel turns more
 
 
+@pytest.mark.parametrize("share", [-0.4, 0.3])
+def test_rear_wheels_that_steer_keep_the_circle_and_swing_the_tail(share: float) -> None:
+    """At walking pace the yaw rate is that of the wheels' directions, whoever steers."""
+    circles = []
+    for rear in (0.0, share):
+        p = replace(PRESETS["sedan"], rear_steer=rear).row()
+        x, u, w = np.zeros(STATES), np.zeros((len(U), 4)), np.zeros((len(W), 4))
+        start_at(x, p, (0.0, 0.0, 0.0), 2.0)
+        u[U.MU] = 0.9
+        command(p, u, 0.1, 0.0)
+        assert u[U.STEER, 2:] == pytest.approx(rear * u[U.STEER, :2])
+        for _ in range(1000):
+            advance(x, p, u, w, 1e-3, 1)
+        circles.append((x[X.YAW_RATE] / x[X.VX], x[X.VY] / x[X.VX]))
+    assert circles[1][0] == pytest.approx(circles[0][0], rel=0.02)
+    assert (circles[1][1] - circles[0][1]) * share > 0.0
+
+
 def test_driving_goes_forward_and_loads_the_rear() -> None:
     x, p, u = rolling(10.0, 0.9)
     command(p, u, 0.0, 4000.0)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from edge_agent.adaptation.memberships import Memberships
+from edge_agent.tuning import study
 from edge_agent.tuning.cli import DURATION_S
 from edge_agent.tuning.objectives import HELD_OUT, record, worth
 from edge_agent.tuning.tuned import FOLDER, WAYS, Document, load, parse, save, shipped
@@ -120,6 +121,14 @@ def test_shipped_memberships_gain_on_the_drives_of_the_search_and_cost_next_to_n
     default, colony = scores["default"], scores["colony"]
     assert colony.train.interval_score < 0.9 * default.train.interval_score
     assert colony.held_out.interval_score < 1.05 * default.held_out.interval_score
+
+
+def test_the_memberships_of_the_papers_filter_gain_on_held_out_drives_and_are_scored_as_it_is() -> None:
+    scores = load(FOLDER / "paper-aco-fckf.json").document.scores
+    default, colony = scores["default"].held_out.log_likelihood, scores["colony"].held_out.log_likelihood
+    assert colony > default + 1.0
+    found = study.overall(shipped("paper-aco-fckf"), study.record(study.HELD_OUT))
+    assert found == pytest.approx(colony, rel=0.02)
 
 
 def test_scores_in_the_shipped_file_are_those_of_the_filter_as_it_is() -> None:

@@ -106,4 +106,4 @@ def test_stores_grow_without_disturbing_what_they_hold() -> None:
     assert difference(grown, whole) <= 1e-6
     np.testing.assert_array_equal(np.sort(grown.cell[:n]), np.arange(n))
     assert (grown.slots_of(np.array([n + 5]), np.array([0])) == -1).all()
-    assert mugrid.quantiles(grown.live.belief[:n], 0.5) == pytest.approx(np.full(n, 0.6), abs=0.1)
+    assert mugrid.quantiles(grown.believed(np.arange(n)), 0.5) == pytest.approx(np.full(n, 0.6), abs=0.1)

@@ -146,3 +146,17 @@ def test_slopes_that_all_point_upwards_make_no_value_of_many_unexcited_visits() 
     lower, upper = interval(belief(fusion))
     assert lower < 0.3
     assert upper == pytest.approx(PRIOR_UPPER, abs=0.03)
+
+
+def test_a_flood_of_one_vehicle_is_bounded_in_the_window_and_told_as_not_fused() -> None:
+    fusion, n = Fusion(120.0), 500
+    rng = np.random.default_rng(2)
+    o = observations(60.0 * rng.random(n), np.full(n, 7), value(rng.uniform(0.1, 1.1, n)))
+    folded = [fusion.fold(o.take(part)) for part in np.array_split(np.arange(n), 10)]
+    assert fusion.waiting == c.WAITING_MOST == n - sum(int(f.late.sum()) for f in folded)
+    fusion.fold(observations([70.0], [8], value([0.5])))
+    assert fusion.waiting == c.WAITING_MOST + 1
+    again = Fusion(120.0)
+    again.fold(o, np.concatenate([f.weight for f in folded]), np.concatenate([f.late for f in folded]))
+    again.fold(observations([70.0], [8], value([0.5])))
+    np.testing.assert_array_equal(belief(again), belief(fusion))

@@ -1,0 +1,41 @@
+"""Copying and clearing small arrays by plain loops: a slice assignment costs seconds of compilation, each."""
+
+from __future__ import annotations
+
+from schemas.numeric import FloatArray, compiled
+
+
+@compiled
+def put(target: FloatArray, source: FloatArray) -> None:
+    """target (n,) = source (n,)."""
+    for i in range(target.shape[0]):
+        target[i] = source[i]
+
+
+@compiled
+def put_square(target: FloatArray, source: FloatArray) -> None:
+    """target (n, n) = source (n, n)."""
+    for i in range(target.shape[0]):
+        for j in range(target.shape[1]):
+            target[i, j] = source[i, j]
+
+
+@compiled
+def clear(target: FloatArray) -> None:
+    """target (n,) = 0."""
+    for i in range(target.shape[0]):
+        target[i] = 0.0
+
+
+@compiled
+def clear_rows(target: FloatArray) -> None:
+    """target (m, n) = 0."""
+    for i in range(target.shape[0]):
+        for j in range(target.shape[1]):
+            target[i, j] = 0.0
+
+
+@compiled
+def put_pair(target: FloatArray, pair: tuple[float, float]) -> None:
+    """target (2,) = pair."""
+    target[0], target[1] = pair[0], pair[1]

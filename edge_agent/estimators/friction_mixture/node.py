@@ -1,0 +1,325 @@
+"""One node of the mixture: the cubature filter of the vehicle, given the friction under its two sides.
+
+Legend
+    m, L        mean (n,) and square root of the covariance, L*L' = P          (n, n)
+    A           measurement deviations in the axes of L's columns              (6, ACTIVE)
+    f, a        row of A that is taken in, and its variance f'f + r^2
+    D           derivative of the rows by a state that they depend on linearly
+
+The rows bend with velocity and stiffness only: the third-degree cubature rule is taken in those four dimensions, and
+leak, steering, shape and gain enter by D, exactly (a Rao-Blackwellised rule). Rows are taken in one after the other
+(Potter 1963): L <- L*(I - g*f*f'), with g such that no covariance is ever subtracted.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from edge_agent.estimators.friction_mixture.block import F
+from edge_agent.estimators.friction_mixture.constants import ACTIVE, CURVED, STATES, C, X
+from edge_agent.estimators.friction_mixture.curve import Curve
+from edge_agent.estimators.friction_mixture.residuals import (
+    ROWS,
+    L,
+    bends,
+    forces,
+    gained,
+    residuals,
+    slips,
+    steepness,
+)
+from schemas.numeric import FloatArray, compiled
+
+LEAST_VARIANCE = 1e-18
+
+
+class Nominal(NamedTuple):
+    """Prior of the states that are properties of vehicle or sensor, (n,) each; velocity has none."""
+
+    mean: FloatArray
+    std: FloatArray
+    time: FloatArray  # [s] of their return to it
+
+
+class Room(NamedTuple):
+    """Arrays that an update writes before it reads them."""
+
+    slip: FloatArray  # (12,)
+    bent: FloatArray  # (6,)
+    force: FloatArray  # (6,)
+    at_force: FloatArray  # (6,)
+    base: FloatArray  # (6,)
+    ahead: FloatArray  # (6,)
+    behind: FloatArray  # (6,)
+    even: FloatArray  # (6,)
+    middle: FloatArray  # (CURVED, 6)
+    derivative: FloatArray  # (ACTIVE, 6)
+    deviation: FloatArray  # (6, ACTIVE)
+    noise: FloatArray  # (6,)
+    taken: FloatArray  # (ACTIVE,)
+    point: FloatArray  # (n,)
+
+
+def new_room() -> Room:
+    """Scratch of one update."""
+    return Room(
+        slip=np.zeros(int(L.LENGTH)),
+        bent=np.zeros(ROWS),
+        force=np.zeros(ROWS),
+        at_force=np.zeros(ROWS),
+        base=np.zeros(ROWS),
+        ahead=np.zeros(ROWS),
+        behind=np.zeros(ROWS),
+        even=np.zeros(ROWS),
+        middle=np.zeros((CURVED, ROWS)),
+        derivative=np.zeros((ACTIVE, ROWS)),
+        deviation=np.zeros((ROWS, ACTIVE)),
+        noise=np.zeros(ROWS),
+        taken=np.zeros(ACTIVE),
+        point=np.zeros(STATES),
+    )
+
+
+@compiled
+def factorize(covariance: FloatArray, root: FloatArray) -> None:
+    """root (n, n) = lower-triangular Cholesky factor of covariance (n, n), of which the lower half is read."""
+    n = covariance.shape[0]
+    for j in range(n):
+        total = covariance[j, j]
+        for k in range(j):
+            total -= root[j, k] * root[j, k]
+        diagonal = math.sqrt(max(total, LEAST_VARIANCE))
+        root[j, j] = diagonal
+        share = 1.0 / diagonal
+        for i in range(j + 1, n):
+            total = covariance[i, j]
+            for k in range(j):
+                total -= root[i, k] * root[j, k]
+            root[i, j] = total * share
+            root[j, i] = 0.0
+
+
+@compiled
+def linearize(
+    row: FloatArray,
+    constants: FloatArray,
+    curve: Curve,
+    nominal: Nominal,
+    pair: FloatArray,
+    mean: FloatArray,
+    features: FloatArray,
+    room: Room,
+) -> float:
+    """Fill room.derivative, leave room.force and room.at_force as at the mean, and return the price of sliding."""
+    gained_x, gained_y = gained(features, F.GAIN, mean, 0), gained(features, F.GAIN, mean, 1)
+    price = 0.0
+    for i in range(STATES):
+        room.point[i] = mean[i]
+    for state in range(ACTIVE, CURVED - 1, -1):  # at the mean, then with each moved, STEER last
+        step = 0.0 if state == ACTIVE else 0.5 * nominal.std[state]
+        room.point[state] += step
+        if state == ACTIVE or state == X.STEER:
+            slips(row, constants, mean, room.point, gained_x, gained_y, features, room.slip)
+        if state == ACTIVE:
+            bends(curve, pair, room.slip, features, room.bent)
+            price = sliding_price(curve, pair, features, room.slip, constants[C.FLAT])
+        forces(
+            curve, pair, room.point[X.LEAK_Y], room.point[X.BEND], room.point[X.GAIN], features, room.bent, room.force,
+            room.at_force,
+        )  # fmt: skip
+        told = room.base if state == ACTIVE else room.derivative[state]
+        residuals(curve, pair, room.slip, features, room.force, room.at_force, told)
+        room.point[state] -= step
+        if state < ACTIVE:
+            for r in range(ROWS):
+                told[r] = (told[r] - room.base[r]) / step
+    return price
+
+
+@compiled
+def sliding_price(curve: Curve, pair: FloatArray, features: FloatArray, slip: FloatArray, flat: float) -> float:
+    """What wheels on the flat of the curve cost: a sliding wheel may have any slip, so its density is spread thin."""
+    price = 0.0
+    for wheel in range(4):
+        if not math.isnan(features[F.ROLL + wheel]):
+            slope = steepness(curve, slip[L.ALONG + wheel], slip[L.ACROSS + wheel], pair[wheel % 2])
+            price -= min(math.log(slope / flat), 0.0)
+    return price
+
+
+@compiled
+def spread(
+    row: FloatArray,
+    constants: FloatArray,
+    curve: Curve,
+    pair: FloatArray,
+    mean: FloatArray,
+    root: FloatArray,
+    features: FloatArray,
+    room: Room,
+) -> None:
+    """Fill room.deviation (A), room.base with the predicted rows and room.even with the variance of their bend."""
+    gained_x, gained_y = gained(features, F.GAIN, mean, 0), gained(features, F.GAIN, mean, 1)
+    scale = math.sqrt(CURVED)
+    for r in range(ROWS):
+        room.base[r] = room.even[r] = 0.0
+    for column in range(CURVED):
+        for sign in range(2):
+            signed = scale if sign == 0 else -scale
+            told = room.ahead if sign == 0 else room.behind
+            for i in range(ACTIVE):
+                room.point[i] = mean[i] + signed * root[i, column]
+            room.point[X.STEER] = mean[X.STEER]
+            slips(row, constants, mean, room.point, gained_x, gained_y, features, room.slip)
+            residuals(curve, pair, room.slip, features, room.force, room.at_force, told)
+        for r in range(ROWS):
+            total = 0.5 * (room.ahead[r] - room.behind[r]) / scale
+            for state in range(CURVED, ACTIVE):
+                total += room.derivative[state, r] * root[state, column]
+            room.deviation[r, column] = total
+            room.middle[column, r] = 0.5 * (room.ahead[r] + room.behind[r])
+            room.base[r] += room.middle[column, r] / CURVED
+    for r in range(ROWS):
+        for column in range(CURVED):
+            room.even[r] += (room.middle[column, r] - room.base[r]) ** 2 / CURVED
+        for column in range(CURVED, ACTIVE):
+            total = 0.0
+            for state in range(CURVED, ACTIVE):
+                total += room.derivative[state, r] * root[state, column]
+            room.deviation[r, column] = total
+
+
+@compiled
+def update_node(
+    row: FloatArray,
+    constants: FloatArray,
+    curve: Curve,
+    nominal: Nominal,
+    pair: FloatArray,
+    mean: FloatArray,
+    root: FloatArray,
+    features: FloatArray,
+    inflation: float,
+    innovation: FloatArray,
+    theoretical: FloatArray,
+    room: Room,
+) -> tuple[float, float, float, int]:
+    """Cubature update of one node with R times `inflation`; mean (n,) and root (n, n) are changed.
+
+    Writes innovation (6,) and its theoretical variance without the inflation (6,).
+    Returns the log-likelihood with the inflated R, the one with the plain R (rows taken as independent), the normalised
+    innovation squared with the plain R, and the number of rows.
+    """
+    price = linearize(row, constants, curve, nominal, pair, mean, features, room)
+    spread(row, constants, curve, pair, mean, root, features, room)
+    plain = square = 0.0
+    for r in range(ROWS):
+        innovation[r] = -room.base[r]
+        own = features[F.NOISE + r] ** 2
+        variance = room.even[r]
+        for column in range(ACTIVE):
+            variance += room.deviation[r, column] ** 2
+        theoretical[r] = variance + own
+        excess = room.base[r] ** 2 / constants[C.HUBER] ** 2 - variance
+        room.noise[r] = max(own * inflation, excess) + room.even[r]
+        if not math.isnan(room.base[r]):
+            ratio = room.base[r] ** 2 / theoretical[r]
+            square += ratio
+            plain -= 0.5 * (ratio + math.log(2.0 * math.pi * theoretical[r]))
+    for r in range(ROWS):
+        room.base[r] = innovation[r]
+    loss, used = take_rows(constants, mean, root, room)
+    keep_within(mean, constants, nominal)
+    return -loss - constants[C.SLIDING_PRICE] / inflation * price, plain, square, used
+
+
+@compiled
+def take_rows(constants: FloatArray, mean: FloatArray, root: FloatArray, room: Room) -> tuple[float, int]:
+    """Take in the innovations room.base (6,) one by one; returns half the normalised square with its price, and rows.
+
+    What ln det S costs is weighed by AXLE_PRICE for the axles and nothing for the wheels.
+    """
+    n, loss, used = mean.shape[0], 0.0, 0
+    for r in range(ROWS):
+        if math.isnan(room.base[r]):
+            continue
+        used += 1
+        variance = room.noise[r]
+        for c in range(ACTIVE):
+            room.taken[c] = room.deviation[r, c]
+            variance += room.taken[c] ** 2
+        share = 1.0 / variance
+        gain = share / (1.0 + math.sqrt(room.noise[r] * share))
+        step = room.base[r] * share
+        loss += 0.5 * room.base[r] * step
+        if r >= 4:
+            loss += 0.5 * constants[C.AXLE_PRICE] * math.log(variance)
+        for i in range(n):
+            along = 0.0
+            for c in range(ACTIVE):
+                along += root[i, c] * room.taken[c]
+            mean[i] += along * step
+            along *= gain
+            for c in range(ACTIVE):
+                root[i, c] -= along * room.taken[c]
+        for k in range(r + 1, ROWS):
+            along = 0.0
+            for c in range(ACTIVE):
+                along += room.deviation[k, c] * room.taken[c]
+            room.base[k] -= along * step
+            along *= gain
+            for c in range(ACTIVE):
+                room.deviation[k, c] -= along * room.taken[c]
+    return loss, used
+
+
+@compiled
+def keep_within(mean: FloatArray, constants: FloatArray, nominal: Nominal) -> None:
+    """Keep what is a property of vehicle or sensor within what it can be; mean (n,)."""
+    far = constants[C.FARTHEST]
+    for i in range(X.LN_KX, mean.shape[0]):
+        middle, reach = nominal.mean[i], far * nominal.std[i]
+        mean[i] = min(max(mean[i], middle - reach), middle + reach)
+
+
+@compiled
+def predict_node(
+    mean: FloatArray,
+    root: FloatArray,
+    nominal: Nominal,
+    turn_cos: float,
+    turn_sin: float,
+    gain: FloatArray,
+    keep: FloatArray,
+    noise: FloatArray,
+    covariance: FloatArray,
+) -> None:
+    """Advance one node over a block: exact rotation, gained velocity gains (8,) of memory.G, process variances (n,).
+
+    The map is affine, and the cubature of an affine map is the map itself: covariance <- F*L*(F*L)' + diag(noise).
+    What is a property of vehicle or sensor returns to its prior by keep (n,). root is changed to F*L.
+    """
+    n = mean.shape[0]
+    for j in range(n):
+        column = root[:, j]
+        a, b = column[X.VX], column[X.VY]
+        gained_x, gained_y = gained(gain, 0, column, 0) - gain[0], gained(gain, 0, column, 1) - gain[1]
+        column[X.VX] = turn_cos * a + turn_sin * b + gained_x
+        column[X.VY] = turn_cos * b - turn_sin * a + gained_y
+        for i in range(X.LN_KX, n):
+            column[i] *= keep[i]
+    vx, vy = mean[X.VX], mean[X.VY]
+    gained_x, gained_y = gained(gain, 0, mean, 0), gained(gain, 0, mean, 1)
+    mean[X.VX] = turn_cos * vx + turn_sin * vy + gained_x
+    mean[X.VY] = turn_cos * vy - turn_sin * vx + gained_y
+    for i in range(X.LN_KX, n):
+        mean[i] = nominal.mean[i] + keep[i] * (mean[i] - nominal.mean[i])
+    for i in range(n):
+        for j in range(i + 1):
+            total = noise[i] if i == j else 0.0
+            for k in range(n):
+                total += root[i, k] * root[j, k]
+            covariance[i, j] = covariance[j, i] = total

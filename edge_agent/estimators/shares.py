@@ -1,0 +1,48 @@
+"""What every bank does around its kernel: check the samples, and give the vehicles to threads in equal shares.
+
+Kernels release the interpreter's lock and share no state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from schemas.errors import InputError
+from schemas.numeric import BoolArray, FloatArray
+from schemas.signals import CHANNELS
+
+
+def checked(t: FloatArray, signals: FloatArray, closes: BoolArray | None, count: int) -> tuple[FloatArray, FloatArray]:
+    """t (T, N) and signals (T, N, 18) as contiguous float64, for a bank of `count` vehicles.
+
+    Raises:
+        InputError: shapes do not agree with the bank or with each other.
+    """
+    t, signals = np.ascontiguousarray(t, np.float64), np.ascontiguousarray(signals, np.float64)
+    if t.ndim != 2 or t.shape[1] != count:
+        raise InputError("t", f"shape {t.shape} for a bank of {count}", "give (T, N)")
+    if signals.shape != (*t.shape, len(CHANNELS)):
+        raise InputError("signals", f"shape {signals.shape}", f"give {(*t.shape, len(CHANNELS))}")
+    if closes is not None and closes.shape != t.shape:
+        raise InputError("closes", f"shape {closes.shape}", f"give {t.shape}")
+    return t, signals
+
+
+def in_shares(work: Callable[[int, int, int], None], count: int, threads: int) -> None:
+    """Call work(share, first, last) for `threads` runs of vehicles, together all `count`, at the same time.
+
+    Raises:
+        InputError: threads is below 1.
+    """
+    if threads < 1:
+        raise InputError("threads", f"{threads} is below 1", "give at least one thread")
+    if threads == 1 or count <= 1:
+        return work(0, 0, count)
+    threads = min(threads, count)
+    cuts = [count * share // threads for share in range(threads + 1)]
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(work, range(threads), cuts[:-1], cuts[1:]))
+    return None

@@ -1,0 +1,24 @@
+"""The noise of paper 004's experiments: white, of one variance on a_x, a_y and the yaw rate, and on nothing else."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from schemas.numeric import FloatArray
+from schemas.signals import S
+
+SCHEDULE: Final = (0.04, 0.01, 0.05)  # variances of its table 2 [SI], in turn,
+SCHEDULE_S: Final = 2.0  # each for two seconds: a period of six
+
+
+def scheduled(t: FloatArray) -> FloatArray:
+    """Variance at the times t (T,) [s] by the SCHEDULE."""
+    return np.asarray(np.array(SCHEDULE)[(t / SCHEDULE_S).astype(int) % len(SCHEDULE)])
+
+
+def add_white(signals: FloatArray, variance: FloatArray, rng: np.random.Generator) -> None:
+    """Add noise of variance (T,) to the signals (T, 18) of one drive, in place."""
+    white = rng.normal(size=(len(variance), 3))
+    signals[:, S.AX : S.AX + 3] += np.sqrt(variance)[:, None] * white

@@ -1,0 +1,153 @@
+"""Where the questions run: DuckDB in this process, or Spark. Both see the archive's files as the same Ibis tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, TypeAlias
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from fleet_service.archive import layout, snapshots
+from fleet_service.archive.export import Part
+from schemas.errors import InputError
+from schemas.wire import Kind
+
+try:
+    import ibis
+except ImportError as error:
+    raise InputError("analyze", "Ibis is not installed", "pip install 'gripmap[analytics]'") from error
+
+Table: TypeAlias = Any  # an ibis.Table, whose package has no types
+ENGINES: Final = ("duckdb", "spark")
+_MAP_COLUMNS: Final = (
+    "cell, sector, mu, mu_lower, mu_upper, basis, vehicles"  # Ibis does not know geometries with a crs
+)
+NAMES: Final = {"observations": layout.TABLES[Kind.OBSERVATION], "map": snapshots.TABLE}
+
+
+@dataclass
+class Engine:
+    """A connection, and the files of one part of an archive.
+
+    Args:
+        name: one of ENGINES.
+        root: of the archive; only compacted files are read.
+        part: times and box wanted.
+        progress: whether the engine may draw its own progress bar.
+
+    Raises:
+        InputError: the engine is not installed.
+    """
+
+    name: str
+    root: Path
+    part: Part
+    progress: bool = False
+
+    def __post_init__(self) -> None:
+        self._spark: Any = None
+        if self.name == "spark":
+            self._spark = _spark(self.progress)
+            self.connection = ibis.pyspark.connect(self._spark)
+        else:
+            self.connection = ibis.duckdb.connect()
+            self.connection.raw_sql("SET TimeZone = 'UTC'")
+            self.connection.raw_sql("SET parquet_metadata_cache = true")  # footers once, for questions about few rows
+            self.connection.raw_sql(f"SET enable_progress_bar = {str(self.progress).lower()}")
+
+    def files(self, table: str) -> list[Path]:
+        """Files of a table that may hold rows of the part; a snapshot counts until the day after its own."""
+        before = 1 if table == "map" else 0
+        first, last = self.part.since // layout.DAY_NS - before, self.part.until // layout.DAY_NS
+        pattern = "*.parquet" if table == "map" else "*/*.parquet"
+        return [
+            path
+            for folder in layout.days(self.root, NAMES[table], first, last)
+            for path in sorted(folder.glob(pattern))
+        ]
+
+    def observations(self) -> Table:
+        """Rows of observations of the part; `time` is in seconds since 1970, `day` a date.
+
+        Raises:
+            InputError: there are none.
+        """
+        paths = self.files("observations")
+        if not paths:
+            problem = f"no compacted observations in {self.root} for these days"
+            raise InputError("archive", problem, "run fleet-service compact, or give other times")
+        t = self._read("observations", paths, "leave_time", "time")
+        t = t.mutate(day=t.date.cast("date"))
+        t = t.filter(t.time >= self.part.since // 10**9, t.time < -(-self.part.until // 10**9))
+        if self.part.bbox is not None:
+            west, south, east, north = self.part.bbox
+            t = t.filter(t.longitude >= west, t.longitude < east, t.latitude >= south, t.latitude < north)
+        return t
+
+    def maps(self) -> Table:
+        """Rows of the snapshots of the map; `snapshot` is their time in seconds since 1970.
+
+        Raises:
+            InputError: there are none.
+        """
+        paths = self.files("map")
+        if not paths:
+            raise InputError("archive", f"no snapshots of the map in {self.root}", "let the service take some")
+        return self._read("map", paths, "snapshot_time", "snapshot", _MAP_COLUMNS)
+
+    def rows(self) -> int:
+        """Rows of observations in the files, from their footers."""
+        return sum(int(pq.read_metadata(path).num_rows) for path in self.files("observations"))
+
+    def answer(self, expression: Table) -> pa.Table:
+        """Run an expression."""
+        found: pa.Table = expression.to_pyarrow()
+        return found
+
+    def _read(self, name: str, paths: Sequence[Path], moment: str, seconds: str, columns: str = "*") -> Table:
+        """A table of files, with the whole seconds since 1970 of one column; the engines count them differently."""
+        texts = [str(path) for path in paths]
+        if self._spark is None:
+            quoted = ", ".join("'" + text.replace("'", "''") + "'" for text in texts)
+            files = f"read_parquet([{quoted}], hive_partitioning = true)"
+            whole = f"epoch_us({moment}) // 1000000 AS {seconds}"
+            self.connection.raw_sql(f"CREATE OR REPLACE VIEW {name} AS SELECT {columns}, {whole} FROM {files}")
+        else:
+            found = self._spark.read.option("basePath", str(self.root / NAMES[name])).parquet(*texts)
+            found.selectExpr(*columns.split(", "), f"unix_seconds({moment}) AS {seconds}").createOrReplaceTempView(name)
+        return self.connection.table(name)
+
+
+def _spark(progress: bool) -> Any:  # noqa: ANN401 a Spark session
+    try:
+        from pyspark.sql import SparkSession
+    except ImportError as error:
+        raise InputError("engine", "Spark is not installed", "pip install 'gripmap[spark]'") from error
+    builder = SparkSession.builder.appName("gripmap").config("spark.sql.session.timeZone", "UTC")
+    settings = {
+        "spark.ui.enabled": "false",
+        "spark.ui.showConsoleProgress": str(progress).lower(),
+        "spark.sql.execution.arrow.pyspark.enabled": "true",
+        "spark.sql.ansi.enabled": "false",  # Ibis writes 0/0 where there is nothing
+    }
+    for key, value in settings.items():
+        builder = builder.config(key, value)
+    return builder.getOrCreate()
+
+
+def value(t: Table) -> Any:  # noqa: ANN401 an Ibis boolean
+    """Whether rows told a value of mu and not only a bound: they used VALUE_UTILISATION of it (design of the wire).
+
+    NaN is larger than any number in both engines, so that it is asked for.
+    """
+    share = ibis.literal(VALUE_UTILISATION - _NEARLY, "float64")
+    enough = t.mu_utilised.cast("float64") >= share * t.mu.cast("float64")
+    return ~t.mu.isnan() & ~t.mu_utilised.isnan() & enough
+
+
+VALUE_UTILISATION: Final = 0.6  # as in the fusion: with less, a posterior's median is mostly its prior
+_NEARLY: Final = 1e-6  # far below the steps of both, so that engines that round otherwise agree where they are equal
+SLIPPERY: Final = 0.4

@@ -1,0 +1,67 @@
+"""An example to start from: what a week of an archive says, in five figures.
+
+python -m fleet_service.analytics.example --archive DIR --out FOLDER
+python -m fleet_service.analytics.example --out FOLDER            # of an archive that nobody drove
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pyarrow as pa
+
+from fleet_service.analytics import output, synthetic
+from fleet_service.analytics.engines import Engine
+from fleet_service.analytics.options import Options
+from fleet_service.analytics.questions import QUESTIONS
+from fleet_service.archive import layout
+from fleet_service.archive.compaction import compact
+from fleet_service.archive.export import Part
+from schemas.wire import Kind
+
+WORLD = synthetic.World(rows=60_000, days=3, vehicles=60, roads=16, length=80, icy=4)
+
+
+def whole(root: Path) -> Part:
+    """All days of an archive."""
+    days = [layout.day_of(folder) for folder in layout.days(root, layout.TABLES[Kind.OBSERVATION])]
+    return Part(min(days) * layout.DAY_NS, (max(days) + 1) * layout.DAY_NS)
+
+
+def figures(root: Path, folder: Path) -> dict[str, pa.Table]:
+    """Ask, draw, and return what was asked."""
+    folder.mkdir(parents=True, exist_ok=True)
+    engine = Engine("duckdb", root, whole(root))
+    middle = (engine.part.since + engine.part.until) // 2
+    answers = {}
+    for name, ending in (
+        ("grip", "html"), ("worst", "html"), ("spells", "png"), ("before-after", "png"), ("vehicles", "png")
+    ):  # fmt: skip
+        question = QUESTIONS[name]
+        answers[name] = question.ask(engine, Options(at=middle))
+        output.write(answers[name], question, folder / f"{name}.{ending}")
+        print(f"\n{name}: {question.about}\n{output.text(answers[name].slice(0, 5), question)}")
+    return answers
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the example."""
+    parser = argparse.ArgumentParser(prog="python -m fleet_service.analytics.example")
+    parser.add_argument("--archive", type=Path, help="a compacted one; without it, one that nobody drove is made")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the figures")
+    arguments = parser.parse_args(argv)
+    root = arguments.archive
+    if root is None:
+        root = arguments.out / "archive"
+        synthetic.write(root, WORLD)
+        compact(root)
+    figures(root, arguments.out)
+    print(f"\nfigures in {arguments.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,28 @@
+"""What questions may be asked with, beside the part of the archive."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of all questions; a question takes those that it knows.
+
+    Attributes:
+        at: moment of a treatment, or of a replay [ns].
+        stations: table of station readings, CSV or Parquet.
+        least_vehicles: distinct vehicles behind a slippery stretch or spell.
+        step_s: time between the frames of an animated replay; 0 for one map.
+        lateness_s: of the service whose map is replayed.
+        say: takes lines of progress.
+    """
+
+    at: int | None = None
+    stations: Path | None = None
+    least_vehicles: int = 2
+    step_s: float = 0.0
+    lateness_s: float = 120.0
+    say: Callable[[str], None] = print

@@ -1,0 +1,55 @@
+"""The one table of questions: name, what it asks, and what its answer can be shown as."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from fleet_service.analytics.engines import Engine
+    from fleet_service.analytics.options import Options
+
+
+class Question(NamedTuple):
+    """One question.
+
+    Attributes:
+        about: one line for the help.
+        order: column by which the terminal shows rows, descending with a minus in front.
+        colour: column that a map colours cells by; None where the answer has no place.
+        plot: columns of the plot, x and y.
+    """
+
+    name: str
+    about: str
+    order: str
+    colour: str | None
+    plot: tuple[str, str]
+
+    @property
+    def ask(self) -> Callable[[Engine, Options], pa.Table]:
+        """What answers it; imported when it is asked, for Ibis is heavy."""
+        module = import_module(f"fleet_service.analytics.questions.{self.name.replace('-', '_')}")
+        found: Callable[[Engine, Options], pa.Table] = module.ask
+        return found
+
+
+QUESTIONS: Final = {
+    question.name: question
+    for question in (
+        Question("grip", "percentiles of mu per cell and day, and what is not known", "mu_p10", "mu_p50",
+                 ("day", "mu_p50")),
+        Question("worst", "the worst stretches, merged into segments", "-score", "mu", ("length_m", "share_slippery")),
+        Question("spells", "onset and duration of slippery spells, and the time to an alert", "onset", "duration_s",
+                 ("onset", "duration_s")),
+        Question("before-after", "what a treatment changed, with interval", "cells", None, ("period", "mu")),
+        Question("vehicles", "bias and sensor health per vehicle", "-z", None, ("values", "bias")),
+        Question("calibration", "how often the published interval held", "age_h", None, ("age_h", "held")),
+        Question("weather", "grip by temperature of the nearest station", "temperature", None,
+                 ("temperature", "mu_p50")),
+        Question("replay", "the map as of a moment, or a day of it", "-p_slippery", "mu", ("frame", "mu")),
+    )
+}  # fmt: skip

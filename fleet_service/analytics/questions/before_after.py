@@ -1,0 +1,71 @@
+"""`before-after`: what changed at a moment, in the same cells; with an interval that knows that vehicles are biased.
+
+Legend
+    y    a value of mu in cell c, period p (before, after), by vehicle v
+    w    weight of a cell, n_b·n_a / (n_b + n_a), zero where a period has no value
+    D    difference Σ w·(mean after - mean before) / Σ w
+    u_v  influence of a vehicle: Σ over its values of ±w/(n·Σw)·(y - mean of cell and period)
+    sd   sqrt(V/(V-1)·Σ u_v²): values of a vehicle count as one (Liang and Zeger 1986, the sandwich of clusters)
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import ibis
+import numpy as np
+import pyarrow as pa
+
+from fleet_service.analytics.engines import Engine, Table, value
+from fleet_service.analytics.options import Options
+from schemas.errors import InputError
+
+_Z: Final = 1.645  # 5 % to each side
+
+
+def expression(t: Table, at_s: int) -> Table:
+    """One row: cells, vehicles, values, means of both periods, difference and its standard deviation."""
+    t = t.filter(value(t))
+    t = t.select("cell", "sector", "vehicle", after=t.time >= at_s, y=t.mu.cast("float64"))
+    place = ["cell", "sector"]
+    cells = t.group_by(place).aggregate(
+        n_a=t.after.sum(), n_b=(~t.after).sum(),
+        s_a=ibis.ifelse(t.after, t.y, 0.0).sum(), s_b=ibis.ifelse(t.after, 0.0, t.y).sum(),
+    )  # fmt: skip
+    cells = cells.filter(cells.n_a > 0, cells.n_b > 0)
+    weight = cells.n_a * cells.n_b / (cells.n_a + cells.n_b)
+    cells = cells.mutate(w=weight.cast("float64"), mean_a=cells.s_a / cells.n_a, mean_b=cells.s_b / cells.n_b)
+    t = t.inner_join(cells, place)
+    residual = ibis.ifelse(t.after, (t.y - t.mean_a) / t.n_a, (t.mean_b - t.y) / t.n_b)
+    t = t.mutate(u=t.w * residual)
+    by_vehicle = t.group_by("vehicle").aggregate(u=t.u.sum(), n=t.count())
+    spread = by_vehicle.aggregate(
+        vehicles=by_vehicle.count(), values=by_vehicle.n.sum(), squares=(by_vehicle.u**2).sum()
+    )
+    total = cells.aggregate(
+        cells=cells.count(),
+        w=cells.w.sum(),
+        before=(cells.w * cells.mean_b).sum(),
+        later=(cells.w * cells.mean_a).sum(),
+    )
+    return total.cross_join(spread)
+
+
+def ask(engine: Engine, options: Options) -> pa.Table:
+    """Two rows, before and after, with mu and its difference, interval, cells, vehicles and values behind it.
+
+    Raises:
+        InputError: no moment is given, or no cell was measured in both periods.
+    """
+    if options.at is None:
+        raise InputError("at", "no moment of the treatment", "give one, e.g. --at 2026-01-31T07:00:00Z")
+    (row,) = engine.answer(expression(engine.observations(), options.at // 10**9)).to_pylist()
+    if not row["cells"] or row["vehicles"] < 2:
+        raise InputError("at", "no cell was measured in both periods by two vehicles", "give longer periods")
+    difference = (row["later"] - row["before"]) / row["w"]
+    std = float(np.sqrt(row["squares"] * row["vehicles"] / (row["vehicles"] - 1))) / row["w"]
+    return pa.table({
+        "period": ["before", "after"], "mu": [row["before"] / row["w"], row["later"] / row["w"]],
+        "difference": [0.0, difference], "lower": [0.0, difference - _Z * std], "upper": [0.0, difference + _Z * std],
+        "cells": [row["cells"]] * 2, "vehicles": [row["vehicles"]] * 2, "values": [row["values"]] * 2,
+    })  # fmt: skip

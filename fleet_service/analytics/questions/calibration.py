@@ -1,0 +1,50 @@
+"""`calibration`: how often the interval that the map published held against what vehicles measured there afterwards.
+
+A value is held against the snapshots of the map in the HORIZON_S before it. `held`: the value itself lies inside. Its
+own error is in that figure, so that an honest 90 % map stays a little below .9; `compatible`: its interval touches.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import pyarrow as pa
+
+from fleet_service.analytics.engines import Engine, Table, value
+from fleet_service.analytics.options import Options
+
+HORIZON_S: Final = 6 * 3600
+_HOUR_S: Final = 3600
+
+
+def expression(t: Table, maps: Table) -> Table:
+    """One row per basis and hours between snapshot and value."""
+    t = t.filter(value(t)).select(
+        "cell",
+        "sector",
+        "time",
+        "vehicle",
+        y=t.mu.cast("float64"),
+        low=t.mu_lower.cast("float64"),
+        high=t.mu_upper.cast("float64"),
+    )
+    joined = t.inner_join(maps, ["cell", "sector"])
+    joined = joined.filter(joined.time > joined.snapshot, joined.time <= joined.snapshot + HORIZON_S)
+    inside = (joined.y >= joined.mu_lower) & (joined.y <= joined.mu_upper)
+    touches = (joined.high >= joined.mu_lower) & (joined.low <= joined.mu_upper)
+    age = ((joined.time - joined.snapshot) / _HOUR_S).floor().cast("int64")
+    joined = joined.mutate(age_h=age, inside=inside.cast("float64"), touches=touches.cast("float64"))
+    width = (joined.mu_upper - joined.mu_lower).cast("float64")
+    return joined.group_by(["basis", "age_h"]).aggregate(
+        values=joined.count(),
+        by=joined.vehicle.nunique(),
+        held=joined.inside.mean(),
+        compatible=joined.touches.mean(),
+        error=(joined.y - joined.mu.cast("float64")).mean(),
+        width=width.mean(),
+    )
+
+
+def ask(engine: Engine, _: Options) -> pa.Table:
+    """Rows of `expression`."""
+    return engine.answer(expression(engine.observations(), engine.maps()))

@@ -1,0 +1,53 @@
+"""`grip`: percentiles of mu per cell and day; and coverage: of which cells nothing but bounds, or nothing, is known."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import ibis
+import numpy as np
+import pyarrow as pa
+
+from fleet_service.analytics.engines import Engine, Table, value
+from fleet_service.analytics.options import Options
+
+PERCENTILES: Final = {"mu_p10": 0.1, "mu_p50": 0.5, "mu_p90": 0.9}
+
+
+def expression(t: Table) -> Table:
+    """One row per day, cell and sector. Without a value there are no percentiles: mu is at least `utilised_max`."""
+    told = ibis.ifelse(value(t), t.mu.cast("float64"), ibis.null("float64"))
+    t = t.select("day", "cell", "sector", "vehicle", told=told, used=t.mu_utilised.nullif(float("nan")))
+    found = t.group_by(["day", "cell", "sector"]).aggregate(
+        observations=t.count(),
+        values=t.told.count(),
+        vehicles=t.vehicle.nunique(),
+        utilised_max=t.used.max(),
+        all=t.told.quantile(list(PERCENTILES.values())),  # at once: a third cheaper than one by one
+    )
+    return found.mutate(**{name: found["all"][k] for k, name in enumerate(PERCENTILES)}).drop("all")
+
+
+def ask(engine: Engine, options: Options) -> pa.Table:
+    """Rows of `expression`; says the coverage of the network (every cell and sector seen in these days) per day."""
+    found = engine.answer(expression(engine.observations()))
+    for line in coverage(found):
+        options.say(line)
+    return found
+
+
+def coverage(found: pa.Table) -> list[str]:
+    """A line per day: how much of the network had a value, only a bound, no visit at all."""
+    key = found["cell"].to_numpy() * 4 + found["sector"].to_numpy()
+    network = len(np.unique(key))
+    days = found["day"].cast(pa.date32()).cast(pa.int32()).to_numpy()
+    known = found["values"].to_numpy() > 0
+    lines = []
+    for day in np.unique(days):
+        here = days == day
+        told, visited = int((here & known).sum()), int(here.sum())
+        shares = (told / network, (visited - told) / network, 1.0 - visited / network)
+        lines.append("{}: {:.0%} of {} cells measured, {:.0%} only bounded, {:.0%} not visited".format(
+            np.datetime64(int(day), "D"), shares[0], network, *shares[1:]
+        ))  # fmt: skip
+    return lines

@@ -1,0 +1,49 @@
+"""`spells`: when cells became slippery, for how long, and how long an alert of two vehicles took.
+
+A spell is a run of values below SLIPPERY in one cell and sector, in order of time; it ends with the first value of
+grip. `least_vehicles` or more told it. The alert is the first value of a second vehicle, as the service raises it.
+"""
+
+from __future__ import annotations
+
+import ibis
+import pyarrow as pa
+
+from fleet_service.analytics.engines import SLIPPERY, Engine, Table, value
+from fleet_service.analytics.options import Options
+
+
+def expression(t: Table, least_vehicles: int) -> Table:
+    """One row per spell; `end` and `duration_s` are null where it lasted at the end of the data."""
+    t = t.filter(value(t)).select("cell", "sector", "time", "vehicle", "boot", "seq", "row", "mu")
+    place = ["cell", "sector"]
+    order = ["time", "vehicle", "boot", "seq", "row"]
+    t = t.mutate(slippery=(t.mu < SLIPPERY).cast("int64"))
+    w = ibis.window(group_by=place, order_by=order)
+    before = t.slippery.lag().over(w)
+    t = t.mutate(new=(before.isnull() | (before != t.slippery)).cast("int64"), following=t.time.lead().over(w))
+    t = t.mutate(run=t.new.sum().over(ibis.window(group_by=place, order_by=order, preceding=None, following=0)))
+    t = t.filter(t.slippery == 1)
+    mine = ibis.window(group_by=[*place, "run"], order_by=order, preceding=None, following=None)
+    t = t.mutate(first=t.vehicle.first().over(mine))
+    spells = t.group_by([*place, "run"]).aggregate(
+        onset=t.time.min(),
+        last=t.time.max(),
+        end=t.following.max(),
+        open=t.following.isnull().any(),
+        values=t.count(),
+        vehicles=t.vehicle.nunique(),
+        mu=t.mu.cast("float64").mean(),
+        alert=ibis.ifelse(t.vehicle != t["first"], t.time, ibis.null("int64")).min(),
+    )
+    spells = spells.filter(spells.vehicles >= least_vehicles)
+    end = ibis.ifelse(spells.open, ibis.null("int64"), spells.end)
+    return spells.select(
+        *place, "onset", "last", "values", "vehicles", "mu", end=end, duration_s=end - spells.onset,
+        to_alert_s=spells.alert - spells.onset,
+    )  # fmt: skip
+
+
+def ask(engine: Engine, options: Options) -> pa.Table:
+    """Rows of `expression`."""
+    return engine.answer(expression(engine.observations(), options.least_vehicles))

@@ -1,0 +1,95 @@
+"""`weather`: values of mu by the temperature that the nearest station read in that hour; what grip does below 0 °C."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import ibis
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv as pacsv
+import pyarrow.parquet as pq
+
+from fleet_service.analytics.engines import SLIPPERY, Engine, Table, value
+from fleet_service.analytics.options import Options
+from schemas.errors import InputError
+
+NEEDED: Final = ("station", "time", "latitude", "longitude", "temperature")
+BAND: Final = 2.0  # [°C] of one row
+_HOUR_S: Final = 3600
+_BITS: Final = 22  # of a cell below its region: 2·(21 - 10)
+
+
+def expression(t: Table, stations: Table, readings: Table) -> Table:
+    """One row per band of temperature [temperature, temperature + BAND): values, percentiles, share of slippery ones.
+
+    Args:
+        t: observations.
+        stations: `station`, `latitude`, `longitude`.
+        readings: `station`, `hour`, `temperature` [°C].
+    """
+    t = t.filter(value(t)).select(
+        "vehicle",
+        "latitude",
+        "longitude",
+        region=t.cell >> _BITS,
+        hour=(t.time / _HOUR_S).floor().cast("int64"),
+        y=t.mu.cast("float64"),
+    )
+    regions = t.group_by("region").aggregate(lat=t.latitude.mean(), lon=t.longitude.mean())
+    pairs = regions.cross_join(stations)
+    metres = ((pairs.lat - pairs.latitude) ** 2) + (
+        (pairs.lon - pairs.longitude) * (pairs.lat * np.pi / 180).cos()
+    ) ** 2
+    pairs = pairs.mutate(metres=metres)
+    pairs = pairs.mutate(rank=ibis.row_number().over(group_by="region", order_by=[pairs.metres, pairs.station]))
+    nearest = pairs.filter(pairs["rank"] == 0).select("region", "station")
+    t = t.inner_join(nearest, "region").inner_join(readings, ["station", "hour"])
+    t = t.mutate(band=(t.temperature / BAND).floor() * BAND)
+    return t.group_by(temperature=t.band).aggregate(
+        values=t.count(),
+        vehicles=t.vehicle.nunique(),
+        mu_mean=t.y.mean(),
+        mu_p10=t.y.quantile(0.1),
+        mu_p50=t.y.quantile(0.5),
+        share_slippery=(t.y < SLIPPERY).cast("float64").mean(),
+    )
+
+
+def ask(engine: Engine, options: Options) -> pa.Table:
+    """Rows of `expression`.
+
+    Raises:
+        InputError: there is no table of stations, or it lacks a column.
+    """
+    if options.stations is None:
+        raise InputError("stations", "no table of readings", f"give a CSV or Parquet file with {', '.join(NEEDED)}")
+    stations, readings = read(options.stations)
+    return engine.answer(expression(engine.observations(), ibis.memtable(stations), ibis.memtable(readings)))
+
+
+def read(path: Path) -> tuple[pa.Table, pa.Table]:
+    """Stations, and mean readings per station and hour.
+
+    Raises:
+        InputError: it cannot be read, or lacks a column.
+    """
+    try:
+        table = pq.read_table(path) if path.suffix == ".parquet" else pacsv.read_csv(path)
+    except (OSError, pa.ArrowInvalid) as error:
+        raise InputError("stations", f"cannot read {path} ({error})", "give a CSV or Parquet file") from error
+    missing = [name for name in NEEDED if name not in table.schema.names]
+    if missing:
+        raise InputError("stations", f"{path.name} has no {missing[0]}", f"give columns {', '.join(NEEDED)}")
+    time = table["time"].cast(pa.timestamp("s")).cast(pa.int64())
+    table = table.append_column("hour", pc.divide(time, _HOUR_S)).set_column(
+        table.schema.get_field_index("station"), "station", table["station"].cast(pa.string())
+    )
+    stations = table.group_by("station").aggregate([("latitude", "mean"), ("longitude", "mean")])
+    readings = table.group_by(["station", "hour"]).aggregate([("temperature", "mean")])
+    return (
+        stations.rename_columns(["station", "latitude", "longitude"]),
+        readings.rename_columns(["station", "hour", "temperature"]),
+    )

@@ -1,0 +1,99 @@
+"""`worst`: slippery cells, merged with their neighbours into stretches with length, exposure and confidence."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import ibis
+import numpy as np
+import pyarrow as pa
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from fleet_service.analytics.engines import SLIPPERY, Engine, Table, value
+from fleet_service.analytics.options import Options
+from schemas import grid
+from schemas.numeric import FloatArray, IntArray
+
+SHARE: Final = 0.1  # of the values of a cell that were slippery: a stretch that froze one night in ten
+_Z: Final = 1.645  # of the one-sided 95 % bound
+_METRES_PER_DEGREE: Final = 111_195.0
+
+
+def expression(t: Table, least_vehicles: int) -> Table:
+    """Cells and sectors of which SHARE or more of the values were slippery, told by enough vehicles."""
+    told = value(t)
+    cells = t.group_by(["cell", "sector"]).aggregate(
+        observations=t.count(),
+        values=told.sum(),
+        slippery=(told & (t.mu < SLIPPERY)).sum(),
+        mu_sum=ibis.ifelse(told & (t.mu < SLIPPERY), t.mu.cast("float64"), 0.0).sum(),
+        witnesses=ibis.ifelse(told & (t.mu < SLIPPERY), t.vehicle, ibis.null("string")).nunique(),
+    )
+    return cells.filter(
+        cells.slippery >= SHARE * cells["values"], cells.slippery > 0, cells.witnesses >= least_vehicles
+    )
+
+
+def ask(engine: Engine, options: Options) -> pa.Table:
+    """Stretches, the worst first: score = length times the lower bound of the share of slippery values."""
+    cells = engine.answer(expression(engine.observations(), options.least_vehicles))
+    return stretches(cells)
+
+
+def stretches(cells: pa.Table) -> pa.Table:
+    """Cells of one sector that touch, as one row each; the box is that of all its cells."""
+    column = {name: cells[name].to_numpy() for name in cells.schema.names}
+    label = _touching(column["cell"], column["sector"].astype(np.int64))
+    count = int(label.max(initial=-1)) + 1
+
+    def total(values: Any) -> FloatArray:  # noqa: ANN401 columns of several types
+        return np.asarray(np.bincount(label, values, minlength=count), np.float64)
+
+    west, south, east, north = _boxes(column["cell"], label, count)
+    metres = np.cos(np.radians((south + north) / 2)) * _METRES_PER_DEGREE
+    length = np.hypot((east - west) * metres, (north - south) * _METRES_PER_DEGREE)
+    values, slippery = total(column["values"]), total(column["slippery"])
+    lower = wilson(slippery, values)
+    first = np.full(count, np.iinfo(np.int64).max)
+    np.minimum.at(first, label, column["cell"])
+    sector = np.zeros(count, np.int8)
+    sector[label] = column["sector"]
+    found = {
+        "cell": first, "sector": sector, "cells": np.bincount(label, minlength=count), "length_m": length,
+        "exposure": total(column["observations"]).astype(np.int64), "values": values.astype(np.int64),
+        "share_slippery": slippery / np.maximum(values, 1), "share_lower": lower,
+        "mu": total(column["mu_sum"]) / np.maximum(slippery, 1), "score": lower * length,
+        "west": west, "south": south, "east": east, "north": north,
+    }  # fmt: skip
+    return pa.table(found).sort_by([("score", "descending"), ("cell", "ascending")])
+
+
+def wilson(hits: FloatArray, of: FloatArray) -> FloatArray:
+    """Lower 95 % bound of a share (Wilson 1927), (n,)."""
+    n = np.maximum(of, 1.0)
+    p = hits / n
+    spread = _Z * np.sqrt(p * (1 - p) / n + _Z**2 / (4 * n * n))
+    return np.asarray((p + _Z**2 / (2 * n) - spread) / (1 + _Z**2 / n))
+
+
+def _touching(cell: IntArray, sector: IntArray) -> IntArray:
+    """Number of the component of each cell, among cells of its sector that touch, (n,)."""
+    key = cell * grid.SECTORS + sector
+    order = np.argsort(key)
+    beside = grid.neighbours(cell) * grid.SECTORS + sector[:, None]
+    place = np.searchsorted(key[order], beside)
+    there = order[np.minimum(place, len(key) - 1)] if len(key) else place
+    touches = key[there] == beside if len(key) else np.zeros_like(beside, bool)
+    here = np.broadcast_to(np.arange(len(key))[:, None], beside.shape)
+    edges = coo_array((np.ones(int(touches.sum()), bool), (here[touches], there[touches])), shape=(len(key), len(key)))
+    return np.asarray(connected_components(edges, directed=False)[1], np.int64)
+
+
+def _boxes(cell: IntArray, label: IntArray, count: int) -> tuple[FloatArray, ...]:
+    out = []
+    for side, least in zip(grid.bounds(cell), (True, True, False, False), strict=True):
+        extreme = np.full(count, np.inf if least else -np.inf)
+        (np.minimum if least else np.maximum).at(extreme, label, side)
+        out.append(extreme)
+    return tuple(out)

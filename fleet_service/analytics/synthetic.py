@@ -1,0 +1,136 @@
+"""An archive that nobody drove: roads, trips, ice at night, biased vehicles. For the example, the tests and the bench.
+
+Its rows are shaped like those of the real estimator: two visits in three only bound mu, a third tells a value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from hashlib import blake2b
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from fleet_service.archive.segments import Rows, Writer, stepped
+from schemas import grid, mugrid
+from schemas.numeric import BoolArray, ByteArray, FloatArray, IntArray
+from schemas.wire import Kind
+
+START_NS: Final = 1_769_472_000 * 10**9  # 2026-01-27 00:00 UTC
+DAY_S: Final = 86_400
+LATITUDE, LONGITUDE = 57.70, 11.97
+CELL_S: Final = 0.7  # in a cell, at 15 m/s
+ICE, DRY = 0.22, 0.85
+_EXCITED: Final = 0.35  # share of visits that tell a value
+_STD: Final = 0.05
+
+
+@dataclass(frozen=True)
+class World:
+    """How much of it: rows, days, vehicles, roads and cells of a road; one road in `icy` freezes at night."""
+
+    rows: int
+    days: int = 7
+    vehicles: int = 2000
+    roads: int = 400
+    length: int = 250
+    icy: int = 8
+    seed: int = 0
+
+
+def write(root: Path, world: World, segment_rows: int = 20_000) -> None:
+    """Write the inbox of an archive, segment by segment, in order of time.
+
+    Raises:
+        OSError: the disk is full.
+    """
+    writer = Writer(root, "shard-0")
+    for rows in chunks(world):
+        for start in range(0, len(rows["cell"]), segment_rows):
+            part = slice(start, start + segment_rows)
+            writer.write(Kind.OBSERVATION, {name: column[part] for name, column in rows.items()})
+
+
+def chunks(world: World, hours: int = 6) -> Iterator[Rows]:
+    """Rows of a few hours each, in order of time."""
+    rng = np.random.default_rng(world.seed)
+    bias = rng.normal(0.0, 0.04, world.vehicles)
+    spans = world.days * 24 // hours
+    for span in range(spans):
+        rows = world.rows * (span + 1) // spans - world.rows * span // spans
+        if rows:
+            yield _chunk(world, rng, bias, span * hours * 3600, hours * 3600, rows)
+
+
+def _chunk(world: World, rng: np.random.Generator, bias: FloatArray, since_s: int, span_s: int, rows: int) -> Rows:
+    trips = -(-rows // world.length)
+    road, who = rng.integers(0, world.roads, trips), rng.integers(0, world.vehicles, trips)
+    begin = since_s + rng.random(trips) * (span_s - world.length * CELL_S)
+    along = np.tile(np.arange(world.length), trips)[:rows]
+    trip = np.repeat(np.arange(trips), world.length)[:rows]
+    seconds = begin[trip] + along * CELL_S + rng.normal(0.0, 0.05, rows)
+    latitude, longitude, yaw = _places(road[trip], along, rng)
+    truth = truth_of(world, road[trip], along, seconds)
+    excited = rng.random(rows) < _EXCITED
+    used = np.clip(truth * np.where(excited, rng.uniform(0.62, 1.0, rows), rng.uniform(0.05, 0.5, rows)), 0.02, 1.2)
+    told = truth * (1.0 + bias[who[trip]]) + _STD * rng.normal(size=rows)
+    mu = np.clip(np.where(excited, told, np.maximum(0.62, used + 0.2) + 0.03 * rng.normal(size=rows)), 0.06, 1.19)
+    half = np.where(excited, 1.645 * _STD, 0.35)
+    cell = grid.cell_of(latitude, longitude)
+    zeros = np.zeros(rows, np.int64)
+    names = np.array([blake2b(f"{world.seed}/{v}".encode(), digest_size=8).hexdigest() for v in range(world.vehicles)])
+    leave = START_NS + (seconds * 1e9).astype(np.int64)
+    found: Rows = {
+        "enter_time": leave - int(CELL_S * 1e9) - rng.integers(0, 10**7, rows), "leave_time": leave, "cell": cell,
+        "sector": grid.sector_of(yaw), "latitude": latitude, "longitude": longitude,
+        "position_std": np.full(rows, 1.5, np.float32), "yaw": yaw.astype(np.float32),
+        "yaw_std": np.full(rows, 0.02, np.float32), "speed": (15 + rng.normal(0, 2, rows)).astype(np.float32),
+        "mu": mu.astype(np.float32), "mu_lower": np.maximum(mu - half, 0.05).astype(np.float32),
+        "mu_upper": np.minimum(mu + half, 1.2).astype(np.float32), "mu_utilised": used.astype(np.float32),
+        "log_likelihood": _likelihoods(rng, mu, used, excited), "told": np.ones(rows, bool),
+        "health": np.where(rng.random(rows) < 0.01, 16, 0).astype(np.int32), "tyre_season": zeros.astype(np.int8),
+        "air_temperature": (5.0 - 8.0 * night(seconds) + rng.normal(0, 1, rows)).astype(np.float32),
+        "abs_active": np.full(rows, -1, np.int8), "vehicle": names[who[trip]], "boot": (who[trip] + 1) * 7919 + since_s,
+        "region": grid.region_of(cell), "seq": trip * 64 + along // 10 + 1, "row": (along % 10).astype(np.int32),
+        "first_held": trip * 64 + np.maximum(along // 10 - 1, 0) + 1, "estimator": np.full(rows, "aco-fckf"),
+        "received_at": (leave // 50_000_000 + 20) * 50_000_000 + leave // 50_000_000 % 997 * 1000,
+        "late": zeros.astype(bool), "weight": np.full(rows, 0.75, np.float32),
+    }  # fmt: skip
+    order = np.argsort(leave, kind="stable")
+    return {name: column[order] for name, column in stepped(found).items()}
+
+
+def _places(road: IntArray, along: IntArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Position with the receiver's noise, and yaw; a road is straight, one in two runs north."""
+    step = 360.0 / (1 << grid.CELL_ZOOM)
+    north = road % 2 == 1
+    row, column = road // 2 % 20, road // 40
+    x = np.where(north, row * 260 + 130, along + column * 260) * step
+    y = np.where(north, along + column * 260, row * 260 + 130) * step * np.cos(np.radians(LATITUDE))
+    noise = 0.3 * step * rng.normal(size=(2, len(road)))
+    return LATITUDE + y + noise[0] * 0.5, LONGITUDE + x + noise[1], np.where(north, np.pi / 2, 0.0) + 0.02 * noise[0]
+
+
+def night(seconds: FloatArray) -> FloatArray:
+    """Between 0 by day and 1 at four in the morning."""
+    return np.clip(np.cos(2 * np.pi * (seconds / DAY_S - 4 / 24)), 0.0, 1.0)
+
+
+def truth_of(world: World, road: IntArray, along: IntArray, seconds: FloatArray) -> FloatArray:
+    """Friction: dry, and ice on the middle fifth of icy roads in the small hours."""
+    middle = np.abs(along - world.length // 2) < world.length // 10
+    return np.where((road % world.icy == 0) & middle & (night(seconds) > 0.5), ICE, DRY)
+
+
+def _likelihoods(rng: np.random.Generator, mu: FloatArray, used: FloatArray, excited: BoolArray) -> ByteArray:
+    """Likelihoods (n, 32): a flank on each side of a value, of its own steepness; up to the grip used for a bound."""
+    distance = (mugrid.CENTRES - np.where(excited, mu, used)[:, None]).astype(np.float32)
+    flank = rng.uniform(0.02, 0.08, (2, len(mu), 1)).astype(np.float32)
+    below = 0.5 * np.square(distance / flank[0]) * (distance < 0)
+    above = 0.5 * np.square(distance / flank[1]) * (distance > 0) * excited[:, None]
+    floor = rng.uniform(5.0, 12.0, (len(mu), 1)).astype(np.float32)  # contamination: nothing falls below
+    slope = rng.uniform(0.0, 1.5, (len(mu), 1)).astype(np.float32) * np.abs(distance)
+    nats = np.minimum(below + above, floor) + slope * excited[:, None]
+    return np.asarray(np.clip(np.rint((nats - nats.min(axis=1, keepdims=True)) * 16), 0, 255).astype(np.uint8))

@@ -1,0 +1,155 @@
+"""From the log to the data set: inbox rows, sorted by cell and time, as one file per date and zone.
+
+A round takes the oldest segments and only adds:
+
+    1. all files of the round are written and synced as drafts, each with its sources in the footer
+    2. they are renamed into place, and their folders synced
+    3. the segments are deleted
+
+It may die between any two of these steps and need not be finished afterwards. A row of a segment counts as compacted
+if a file of its partition names the segment, so that `reading` sees it once, and the next round takes what is left.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_service.archive import layout, reading, readme, segments
+from fleet_service.archive.files import COMPACTED, exclusive, sync_directory, sync_tree, write_synced
+from schemas.errors import InputError
+from schemas.wire import Kind
+
+# Rows of one round at the most: half a gigabyte while it runs, and files of several row groups.
+ROUND_ROWS: Final = 1_000_000
+
+
+class Compacted(NamedTuple):
+    """What a compaction did: rows moved, segments deleted, files added."""
+
+    rows: int
+    segments: int
+    files: int
+
+
+@contextmanager
+def compacting(root: Path) -> Iterator[None]:
+    """Be the only one that adds to, or rewrites, the compacted files.
+
+    Raises:
+        InputError: another process does.
+    """
+    if not root.is_dir():
+        raise InputError("archive", f"{root} is no folder", "give the archive of a service")
+    with exclusive(root / "compaction.lock", f"{root} is being compacted", "wait until that has ended"):
+        drafts = root / "drafts"
+        drafts.mkdir(exist_ok=True)
+        for draft in drafts.iterdir():  # of a run that died
+            draft.unlink()
+        yield
+
+
+def compact(root: Path, round_rows: int = ROUND_ROWS, stop: threading.Event | None = None) -> Compacted:
+    """Move all rows of the inbox into the compacted files.
+
+    Args:
+        root: of the archive; a service may run on it.
+        round_rows: rows in memory at once.
+        stop: ends it after the round that runs.
+
+    Raises:
+        InputError: another process compacts it.
+        OSError: a file cannot be read or written; nothing is lost.
+    """
+    total = Compacted(0, 0, 0)
+    with compacting(root):
+        readme.keep(root)
+        for kind in Kind:
+            waiting = sorted(segments.paths(root, kind), key=lambda path: layout.age(path.name))
+            done = reading.compacted(layout.compacted(root, kind), {path.name for path in waiting})
+            # A run that died, or found the disk full, may have left its files in place with their names not yet synced:
+            # the segments that they stand for may only be deleted when power loss can no longer forget them.
+            sync_tree(root, {part.folder(root, layout.TABLES[kind]) for parts in done.values() for part in parts})
+            rest = _Rest(root, kind, iter(waiting), done)
+            while not (stop and stop.is_set()) and (moved := _round(rest, round_rows)).segments:
+                total = Compacted(*map(sum, zip(total, moved, strict=True)))
+    pa.default_memory_pool().release_unused()  # hundreds of megabytes that a service would keep till the next time
+    return total
+
+
+class _Rest(NamedTuple):
+    """Segments that wait, old ones first, and where an earlier run compacted some of their rows."""
+
+    root: Path
+    kind: Kind
+    segments: Iterator[Path]
+    done: dict[str, set[layout.Partition]]
+
+
+def _round(rest: _Rest, most: int) -> Compacted:
+    """Move the next segments: so many rows, or one segment at least."""
+    sources: list[Path] = []
+    tables: list[pa.Table] = []
+    while sum(table.num_rows for table in tables) < most and (path := next(rest.segments, None)) is not None:
+        table = reading.load(path)
+        if table is not None:
+            sources.append(path)
+            tables.append(reading.without(table, rest.kind, rest.done.get(path.name, set())))
+    if not sources:
+        return Compacted(0, 0, 0)
+    table = pa.concat_tables(tables)
+    files = _place(rest.root, rest.kind, sources, table)
+    for path in sources:
+        path.unlink()
+    sync_directory(segments.folder(rest.root, rest.kind))
+    return Compacted(table.num_rows, len(sources), files)
+
+
+def _place(root: Path, kind: Kind, sources: list[Path], table: pa.Table) -> int:
+    """Write the files of a round and rename them into place; returns how many."""
+    drafts: list[tuple[Path, Path]] = []
+    footer = {reading.SOURCES.decode(): json.dumps(runs(path.name for path in sources))}
+    for partition, part in partitioned(table, kind):
+        path = partition.folder(root, layout.TABLES[kind]) / sources[-1].name
+        draft = root / "drafts" / f"{len(drafts)}.parquet"
+        write_synced(part, draft, COMPACTED, footer)
+        drafts.append((draft, path))
+    for draft, path in drafts:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        draft.rename(path)
+    sync_tree(root, {path.parent for _, path in drafts})
+    return len(drafts)
+
+
+def runs(names: Iterable[str]) -> list[tuple[str, int, int]]:
+    """Names of segments, in order of age, as runs of consecutive numbers: SHARD-EPOCH, first, last."""
+    out: list[tuple[str, int, int]] = []
+    for name in names:
+        epoch, number, shard = layout.age(name)
+        prefix, n = f"{shard}-{epoch}", int(number)
+        if out and out[-1][0] == prefix and out[-1][2] == n - 1:
+            out[-1] = (prefix, out[-1][1], n)
+        else:
+            out.append((prefix, n, n))
+    return out
+
+
+def partitioned(table: pa.Table, kind: Kind) -> Iterator[tuple[layout.Partition, pa.Table]]:
+    """Rows of each date and zone, sorted by cell and time."""
+    if not table.num_rows:
+        return
+    table = table.combine_chunks()
+    time, cell = segments.nanoseconds(table[layout.TIME[kind]]), table["cell"].to_numpy()
+    day, zone = layout.partitions_of(time, cell)
+    order = np.lexsort((time, cell, day))  # the zone is the cell's leading digits
+    table, day, zone = table.take(order), day[order], zone[order]
+    starts = np.flatnonzero(np.diff(day, prepend=day[0] - 1) | np.diff(zone, prepend=zone[0]))
+    for start, stop in zip(starts.tolist(), [*starts[1:].tolist(), len(order)], strict=True):
+        yield layout.Partition(int(day[start]), int(zone[start])), table.slice(start, stop - start)

@@ -1,0 +1,142 @@
+"""Parts of the archive as files for other programs: GeoParquet, GeoJSON or CSV, by the ending of the name."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv as pacsv
+import pyarrow.parquet as pq
+
+from fleet_service.archive import geo, layout, reading, rollup, snapshots
+from fleet_service.archive.files import MAP, write_table
+from schemas import grid, tables
+from schemas.errors import InputError
+from schemas.wire import Kind
+
+Box = tuple[float, float, float, float]
+
+
+class Part(NamedTuple):
+    """What is wanted: from, to [ns], the second excluded; west, south, east, north [deg]."""
+
+    since: int
+    until: int
+    bbox: Box | None = None
+
+
+def observations(root: Path, part: Part) -> pa.Table:
+    """Rows of observations, inbox included, as points."""
+    where = (pc.field("leave_time") >= _time(part.since)) & (pc.field("leave_time") < _time(part.until))
+    if part.bbox is not None:
+        west, south, east, north = part.bbox
+        where &= (pc.field("longitude") >= west) & (pc.field("longitude") < east)
+        where &= (pc.field("latitude") >= south) & (pc.field("latitude") < north)
+    days = (part.since // layout.DAY_NS, part.until // layout.DAY_NS)
+    found = [*reading.read(root, Kind.OBSERVATION, where=where, days=days), tables.OBSERVATION_ARCHIVE.empty_table()]
+    table = pa.concat_tables(found).sort_by([("cell", "ascending"), ("leave_time", "ascending")])
+    return geo.with_points(table, table["longitude"].to_numpy(), table["latitude"].to_numpy())
+
+
+def map_then(root: Path, part: Part) -> pa.Table:
+    """The last snapshot of the map before `until`."""
+    path = snapshots.newest(root, part.until)
+    if path is None:
+        raise InputError("to", "there is no snapshot of the map so early", "give a later time")
+    table = pq.read_table(path, columns=tables.MAP_ARCHIVE.names, partitioning=None)
+    return geo.with_cells(_inside(table, part.bbox))
+
+
+def cell_hours(root: Path, part: Part) -> pa.Table:
+    """Parts of the roll-up, with the polygons of their cells."""
+    hour = pc.field("hour")
+    where = (hour >= _time(part.since)) & (hour < _time(part.until))
+    days = layout.days(root, rollup.TABLE, part.since // layout.DAY_NS, part.until // layout.DAY_NS)
+    paths = sorted(path for folder in days for path in folder.glob("*/*.parquet"))
+    found = [pq.read_table(path, filters=where, partitioning=None) for path in paths]
+    table = pa.concat_tables([*found, tables.CELL_HOUR_SCHEMA.empty_table()])
+    return geo.with_cells(_inside(table, part.bbox).sort_by([("cell", "ascending"), ("hour", "ascending")]))
+
+
+WHAT: Final[dict[str, Callable[[Path, Part], pa.Table]]] = {
+    "map": map_then, "observations": observations, "rollup": cell_hours,
+}  # fmt: skip
+
+
+def _time(ns: int) -> pa.Scalar[Any]:
+    return pa.scalar(ns // tables.US_STEP, pa.int64()).cast(tables.US)
+
+
+def _inside(table: pa.Table, bbox: Box | None) -> pa.Table:
+    """Cells that touch a box."""
+    if bbox is None:
+        return table
+    west, south, east, north = grid.bounds(table["cell"].to_numpy())
+    keep = (east > bbox[0]) & (north > bbox[1]) & (west < bbox[2]) & (south < bbox[3])
+    return table.filter(pa.array(np.asarray(keep)))
+
+
+def write(table: pa.Table, path: Path) -> None:
+    """Write a GeoParquet table as the ending of the name says; CSV leaves binary and nested columns out.
+
+    Raises:
+        InputError: an unknown ending, or the file cannot be written.
+    """
+    writer = _WRITERS.get(path.suffix)
+    if writer is None:
+        raise InputError("out", f"{path.name} has no known ending", f"use one of {', '.join(_WRITERS)}")
+    try:
+        writer(table, path)
+    except OSError as error:
+        raise InputError("out", f"cannot write {path} ({error.strerror})", "name a file you may write") from error
+
+
+def _geojson(table: pa.Table, path: Path) -> None:
+    flat = _flat(table)
+    with path.open("w") as file:
+        file.write('{"type": "FeatureCollection", "features": [\n')
+        rows = zip(_geometries(table), *(_texts(flat, name) for name in flat.schema.names), strict=True)
+        for place, (geometry, *values) in enumerate(rows):
+            feature = {"type": "Feature", "geometry": geometry}
+            feature["properties"] = dict(zip(flat.schema.names, values, strict=True))
+            file.write((",\n" if place else "") + json.dumps(feature, allow_nan=False))
+        file.write("\n]}\n")
+
+
+def _geometries(table: pa.Table) -> Iterator[dict[str, Any]]:
+    sides = [pc.struct_field(table[geo.BBOX], side).to_pylist() for side in geo.SIDES]
+    for west, south, east, north in zip(*sides, strict=True):
+        if (west, south) == (east, north):
+            yield {"type": "Point", "coordinates": [west, south]}
+        else:
+            ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
+            yield {"type": "Polygon", "coordinates": [ring]}
+
+
+def _texts(table: pa.Table, name: str) -> list[Any]:
+    """Values as JSON has them: times as ISO 8601 text, no NaN, no digits that single precision does not have."""
+    column = table[name]
+    if pa.types.is_timestamp(column.type):
+        us = column.cast(tables.US).cast(pa.int64()).to_numpy().astype("datetime64[us]")
+        return list(np.datetime_as_string(us, "ms", "UTC").tolist())
+    if pa.types.is_floating(column.type):
+        values = column.to_numpy().astype(np.float64).round(6 if column.type == pa.float32() else 9)
+        return [value if np.isfinite(value) else None for value in values.tolist()]
+    return column.to_pylist()
+
+
+def _flat(table: pa.Table) -> pa.Table:
+    plain = [f.name for f in table.schema if not (pa.types.is_nested(f.type) or "binary" in str(f.type))]
+    return table.select(plain)
+
+
+_WRITERS: Final[dict[str, Callable[[pa.Table, Path], None]]] = {
+    ".parquet": lambda table, path: write_table(table, path, MAP),
+    ".geojson": _geojson,
+    ".csv": lambda table, path: pacsv.write_csv(_flat(table), path),
+}

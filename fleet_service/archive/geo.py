@@ -1,0 +1,72 @@
+"""GeoParquet 1.1 with pyarrow alone: WKB geometries, a bounding box per row, and the `geo` key of the footer.
+
+Source: GeoParquet specification 1.1.0 (OGC), and the OGC simple features' well-known binary.
+Axis order is longitude, latitude; a file without `crs` is OGC:CRS84 by the specification.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+
+from schemas import grid
+from schemas.numeric import FloatArray, IntArray
+
+GEO: Final = b"geo"
+GEOMETRY, BBOX = "geometry", "bbox"
+SIDES: Final = ("xmin", "ymin", "xmax", "ymax")
+_POINT: Final = np.dtype([("order", "u1"), ("type", "<u4"), ("xy", "<f8", 2)])
+_BOX: Final = np.dtype([("order", "u1"), ("type", "<u4"), ("rings", "<u4"), ("points", "<u4"), ("xy", "<f8", (5, 2))])
+_LITTLE_ENDIAN, _TYPE_POINT, _TYPE_POLYGON = 1, 1, 3
+
+
+def with_cells(table: pa.Table) -> pa.Table:
+    """A table with a column `cell`, and the cells' polygons beside it, as a GeoParquet table."""
+    west, south, east, north = grid.bounds(table["cell"].to_numpy())
+    return with_boxes(table, west, south, east, north)
+
+
+def with_boxes(table: pa.Table, west: FloatArray, south: FloatArray, east: FloatArray, north: FloatArray) -> pa.Table:
+    """A table with the polygons of boxes [deg], (n,) each, as a GeoParquet table."""
+    wkb = np.zeros(len(west), _BOX)
+    wkb["order"], wkb["type"], wkb["rings"], wkb["points"] = _LITTLE_ENDIAN, _TYPE_POLYGON, 1, 5
+    x, y = np.stack([west, east, east, west, west], axis=1), np.stack([south, south, north, north, south], axis=1)
+    wkb["xy"] = np.stack([x, y], axis=2)
+    return _marked(table, wkb, "Polygon", (west, south, east, north))
+
+
+def with_points(table: pa.Table, longitude: FloatArray, latitude: FloatArray) -> pa.Table:
+    """A table with points [deg], (n,) each, as a GeoParquet table."""
+    wkb = np.zeros(len(longitude), _POINT)
+    wkb["order"], wkb["type"] = _LITTLE_ENDIAN, _TYPE_POINT
+    wkb["xy"] = np.stack([longitude, latitude], axis=1)
+    return _marked(table, wkb, "Point", (longitude, latitude, longitude, latitude))
+
+
+def _marked(table: pa.Table, wkb: np.ndarray[Any, Any], kind: str, sides: tuple[FloatArray, ...]) -> pa.Table:
+    size = wkb.dtype.itemsize
+    offsets: IntArray = np.arange(len(wkb) + 1, dtype=np.int64) * size
+    buffers = [None, pa.py_buffer(offsets.astype(np.int32).tobytes()), pa.py_buffer(wkb.tobytes())]
+    geometry: pa.Array[Any] = pa.Array.from_buffers(pa.binary(), len(wkb), buffers)
+    box = pa.StructArray.from_arrays([pa.array(side) for side in sides], names=list(SIDES))
+    column: dict[str, Any] = {
+        "encoding": "WKB", "geometry_types": [kind] if len(wkb) else [],
+        "covering": {"bbox": {side: [BBOX, side] for side in SIDES}},
+    }  # fmt: skip
+    if kind == "Polygon":
+        column["orientation"] = "counterclockwise"
+    if len(wkb):
+        least, most = [float(side.min()) for side in sides[:2]], [float(side.max()) for side in sides[2:]]
+        column["bbox"] = [*least, *most]
+    geo = {"version": "1.1.0", "primary_column": GEOMETRY, "columns": {GEOMETRY: column}}
+    marked = table.append_column(_field(GEOMETRY, geometry, "WKB, longitude and latitude (OGC:CRS84)"), geometry)
+    marked = marked.append_column(_field(BBOX, box, "of the geometry, deg"), box)
+    metadata: dict[Any, Any] = {**(table.schema.metadata or {}), GEO: json.dumps(geo).encode()}
+    return marked.replace_schema_metadata(metadata)
+
+
+def _field(name: str, column: pa.Array[Any], meaning: str) -> pa.Field[Any]:
+    return pa.field(name, column.type, nullable=False, metadata={"unit": "deg", "meaning": meaning})

@@ -1,0 +1,84 @@
+"""Where everything lies in an archive: names are built and parsed here only.
+
+    inbox/…                                                     the log, see `segments`
+    observations/date=2026-01-31/zone=q1202310/NAME.parquet     compacted, sorted by cell and time
+    states/date=…/zone=…/NAME.parquet                           likewise
+    drafts/                                                     what is being written; nothing there counts
+
+The date is that of the measurement (UTC). NAME is that of the newest segment whose rows the file holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import date, timedelta
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from schemas import grid
+from schemas.numeric import IntArray
+from schemas.wire import Kind
+
+TABLES: Final = {Kind.OBSERVATION: "observations", Kind.STATE: "states"}
+TIME: Final = {Kind.OBSERVATION: "leave_time", Kind.STATE: "time"}  # of the measurement, by which rows are kept
+DAY_NS: Final = 86_400_000_000_000
+_EPOCH: Final = date(1970, 1, 1)
+
+
+class Partition(NamedTuple):
+    """A folder of compacted rows: days since 1970 and z7 zone."""
+
+    day: int
+    zone: int
+
+    def folder(self, root: Path, table: str) -> Path:
+        """Where its files lie. The letter before the zone keeps readers from taking it for a number."""
+        zone = f"zone=q{grid.quadkey(self.zone, grid.ZONE_ZOOM)}"
+        return root / table / f"date={date_of(self.day)}" / zone
+
+
+def partitions_of(time: IntArray, cell: IntArray) -> tuple[IntArray, IntArray]:
+    """Day and zone of rows, (n,) each."""
+    return time // DAY_NS, grid.zone_of(cell)
+
+
+def date_of(day: int) -> date:
+    """The date so many days after 1970-01-01."""
+    return _EPOCH + timedelta(days=day)
+
+
+def day_of(folder: Path) -> int:
+    """Days since 1970 of a folder `date=…`."""
+    return (date.fromisoformat(folder.name.removeprefix("date=")) - _EPOCH).days
+
+
+def partition_of(path: Path) -> Partition:
+    """The partition in whose folder a file lies."""
+    return Partition(day_of(path.parents[1]), grid.from_quadkey(path.parent.name.removeprefix("zone=q")))
+
+
+def compacted(root: Path, kind: Kind, since_day: int | None = None, until_day: int | None = None) -> Iterator[Path]:
+    """Compacted files of a kind, by date, zone and age; both days count as inside."""
+    for folder in days(root, TABLES[kind], since_day, until_day):
+        yield from sorted(folder.glob("zone=*/*.parquet"))
+
+
+def days(root: Path, table: str, since_day: int | None = None, until_day: int | None = None) -> list[Path]:
+    """Folders of a table's days, in order."""
+    found = sorted((root / table).glob("date=*"))
+    return [
+        folder
+        for folder in found
+        if (since_day is None or day_of(folder) >= since_day) and (until_day is None or day_of(folder) <= until_day)
+    ]
+
+
+def segment_name(prefix: str, number: int) -> str:
+    """Name of a segment: `prefix` is SHARD-EPOCH."""
+    return f"{prefix}-{number:08d}.parquet"
+
+
+def age(name: str) -> tuple[str, str, str]:
+    """Sorts segments, and the files that hold their rows, from old to new: epoch, number, shard."""
+    shard, epoch, number = Path(name).stem.rsplit("-", 2)
+    return epoch, number, shard

@@ -1,0 +1,49 @@
+"""Compacted files, snapshots and roll-ups put to another file system: a folder, S3, GCS, HDFS."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import pyarrow as pa
+from pyarrow import fs
+
+from fleet_service.archive.layout import TABLES
+from schemas.errors import InputError
+
+FOLDERS: Final = (*TABLES.values(), "map", "rollup")
+_CHUNK: Final = 1 << 22
+
+
+def put(root: Path, uri: str) -> int:
+    """Put what is not there yet, or was rewritten since; returns how many files.
+
+    What was retired here stays there. A file appears under its name when it is whole.
+
+    Raises:
+        InputError: the place cannot be used.
+        OSError: a file cannot be read or written.
+    """
+    try:
+        there, base = fs.FileSystem.from_uri(uri)
+        there.create_dir(base, recursive=True)
+        sizes = {info.path: info.size for info in there.get_file_info(fs.FileSelector(base, recursive=True))}
+    except (pa.ArrowInvalid, OSError) as error:
+        raise InputError("to", f"cannot use {uri} ({error})", "give a URI such as s3://bucket/folder") from error
+    count = 0
+    for path in sorted(path for folder in FOLDERS for path in (root / folder).rglob("*.parquet")):
+        target = f"{base}/{path.relative_to(root).as_posix()}"
+        if sizes.get(target) != path.stat().st_size:
+            _copy(path, there, target)
+            count += 1
+    return count
+
+
+def _copy(path: Path, there: fs.FileSystem, target: str) -> None:
+    folder, _, name = target.rpartition("/")
+    there.create_dir(folder, recursive=True)
+    draft = f"{folder}/.{name}.tmp"
+    with path.open("rb") as source, there.open_output_stream(draft) as sink:
+        while chunk := source.read(_CHUNK):
+            sink.write(chunk)
+    there.move(draft, target)

@@ -1,0 +1,77 @@
+"""The page that lies in every archive: what is where, and every column with unit and meaning, from the contract."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+from fleet_service.archive.files import sync_directory
+from schemas import mugrid, tables
+from schemas.tables import Field
+
+NAME: Final = "README.md"
+_HEAD: Final = f"""# A GripMap archive
+
+Road grip as vehicles measured it. Plain Parquet (zstd), partitioned by date of measurement (UTC) and z7 zone (a quadkey
+behind the letter q); pyarrow, pandas, polars, DuckDB, Spark and GeoPandas read it as it stands. Unit and meaning of a
+column are in its field metadata too. This page is generated.
+
+| folder | holds |
+|---|---|
+| `observations/date=…/zone=…/` | what each vehicle learned about each cell it visited; sorted by cell and time |
+| `states/date=…/zone=…/` | where vehicles were and how they moved; sorted likewise |
+| `map/date=…/` | the map as it was, an hour apart; GeoParquet 1.1 |
+| `rollup/cell_hour/date=…/zone=…/` | parts of statistics per cell, sector and hour; they add up, and stay for ever |
+| `weather/` | reports of road weather that the map was made with |
+| `inbox/`, `drafts/`, `keys/`, `checkpoints/` | private to the service: do not read or change them |
+
+```python
+import duckdb
+duckdb.sql("select cell, count(*), count(distinct vehicle), median(mu) from 'observations/*/*/*.parquet' group by cell")
+```
+
+- mu is the peak tyre–road adhesion coefficient, mean of the four wheels. NaN is "not said", which is not "dry".
+- `log_likelihood`: {mugrid.BINS} bytes for {mugrid.BINS} equal bins of mu on [{mugrid.LOWER}, {mugrid.UPPER}]; byte k
+  is {mugrid.STEPS_PER_NAT} times how many nats bin k lies below the best. Sums over vehicles are evidence, means of mu
+  are opinions.
+- `cell` is a quadint: the base-4 digits of a Web-Mercator quadkey of zoom 21; a parent is a shift, `cell >> 2*(21-z)`.
+- `vehicle` is a pseudonym that changes with the month.
+- `late` rows were not fused into the map; `weight` is what the vehicle's vote counted.
+"""
+_TABLES: Final[tuple[tuple[str, tuple[Field, ...]], ...]] = (
+    ("observations", tables.kept(*tables.OBSERVATION, *tables.IDENTITY, *tables.BOOKKEEPING)),
+    ("states", tables.kept(*tables.STATE, *tables.IDENTITY, tables.STATE_CELL, *tables.BOOKKEEPING[:1])),
+    ("map", tables.MAP_KEPT),
+    ("rollup/cell_hour", tables.CELL_HOUR),
+)
+
+
+def text() -> str:
+    """The page."""
+    parts = [_HEAD]
+    for name, fields in _TABLES:
+        parts.append(f"\n## `{name}`\n\n| column | type | unit | meaning |\n|---|---|---|---|\n")
+        parts += [f"| `{f.name}` | {f.type} | {_cell(f.unit)} | {_meaning(f)} |\n" for f in fields]
+    return "".join(parts)
+
+
+def _meaning(f: Field) -> str:
+    return _cell(f.meaning) + (f"; multiples of {f.step:g}" if f.step else "")
+
+
+def _cell(value: str) -> str:
+    return value.replace("|", "\\|")
+
+
+def keep(root: Path) -> None:
+    """Write the page into an archive, if it is not there as it should be.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    path, page = root / NAME, text().encode()
+    if not path.exists() or path.read_bytes() != page:  # bytes: power loss may have left any
+        draft = root / f".{NAME}.tmp"
+        draft.write_bytes(page)
+        draft.rename(path)
+        sync_directory(root)

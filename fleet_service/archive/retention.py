@@ -1,0 +1,126 @@
+"""What is given up: raw rows after so many days, when their roll-ups stay; and what one vehicle left.
+
+Only these two rewrite or remove compacted files, one file for one.
+"""
+
+from __future__ import annotations
+
+from datetime import date, timedelta
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from fleet_service.archive import checkpoints, layout, rollup
+from fleet_service.archive.compaction import compact, compacting
+from fleet_service.archive.files import COMPACTED, lock, put_in_place, sync_directory
+from fleet_service.archive.layout import TABLES
+from fleet_service.archive.pseudonyms import Pseudonyms
+from schemas.errors import InputError
+from schemas.wire import Kind
+
+# A batch may come again for thirty days (ServiceConfig.oldest_s), and its rows are what tells that it was there before.
+LEAST_DAYS: Final = 31
+_KEYS: Final = "keys"
+
+
+class Retired(NamedTuple):
+    """Days whose raw rows went, and files."""
+
+    days: int
+    files: int
+
+
+def retire(root: Path, raw_days: int, today: date) -> Retired:
+    """Remove rows measured more than `raw_days` before `today`, after their roll-ups are safe.
+
+    Raises:
+        InputError: too few days, or another process compacts the archive.
+        OSError: a file cannot be read, written or removed.
+    """
+    if raw_days < LEAST_DAYS:
+        raise InputError("raw-days", f"{raw_days} are too few to know a batch again", f"give {LEAST_DAYS} or more")
+    last = (today - timedelta(days=raw_days + 1) - date(1970, 1, 1)).days
+    files = 0
+    with compacting(root):
+        rollup.complete(root, until_day=last)
+        folders = [day for kind in Kind for day in layout.days(root, TABLES[kind], until_day=last)]
+        for folder in folders:
+            for path in sorted(folder.glob("*/*"), reverse=True):
+                path.unlink()
+                files += 1
+            for zone in folder.iterdir():
+                zone.rmdir()
+            folder.rmdir()
+            sync_directory(folder.parent)
+    return Retired(len(folders), files)
+
+
+def forget_period(root: Path, month: str) -> None:
+    """Destroy the key of a month (2026-01): nobody can tell any more whose its pseudonyms were.
+
+    Raises:
+        InputError: there is no such key, or a service runs on the archive.
+    """
+    with lock(root):
+        key = _key(root, month)
+        key.unlink()
+        sync_directory(key.parent)
+
+
+def forget_vehicle(root: Path, vehicle: str, month: str) -> int:
+    """Remove the rows of one vehicle in one month; returns how many. Roll-ups are made anew from what stays.
+
+    Raises:
+        InputError: the month's key is gone, or a service runs on the archive (it remembers more than its files).
+        OSError: a file cannot be read or written.
+    """
+    first = _month(month)
+    with lock(root):
+        _key(root, month)
+        compact(root)
+        noon = (first - date(1970, 1, 1)).days * layout.DAY_NS + layout.DAY_NS // 2
+        pseudonym = Pseudonyms(root / _KEYS).of(vehicle, noon)
+        with compacting(root):
+            checkpoints.remove_all(root)  # what it told is in them
+            return sum(
+                _without(root, kind, path, pseudonym)
+                for kind in Kind
+                # a batch has the pseudonym of its first record and may end a day later
+                for path in layout.compacted(root, kind, (first - date(1970, 1, 1)).days, _last_day(first) + 1)
+            )
+
+
+def _without(root: Path, kind: Kind, path: Path, pseudonym: str) -> int:
+    if pseudonym not in pc.unique(pq.read_table(path, columns=["vehicle"], partitioning=None)["vehicle"]).to_pylist():
+        return 0
+    with pq.ParquetFile(path) as file:
+        whole, footer = file.read(), file.metadata.metadata or {}
+    table = whole.filter(pc.not_equal(whole["vehicle"], pa.scalar(pseudonym)))
+    kept = {key.decode(): value.decode() for key, value in footer.items() if key.startswith(b"gripmap.")}
+    put_in_place(root, table, path, COMPACTED, kept)
+    if kind is Kind.OBSERVATION:
+        rollup.make(root, path)
+    return whole.num_rows - table.num_rows
+
+
+def _key(root: Path, month: str) -> Path:
+    _month(month)
+    path = root / _KEYS / f"{month}.key"
+    if not path.exists():
+        raise InputError("period", f"the archive has no key of {month}", "nobody can tell whose its rows are")
+    return path
+
+
+def _month(month: str) -> date:
+    try:
+        return date.fromisoformat(f"{month}-01")
+    except ValueError as error:
+        raise InputError("period", f"{month!r} is no month", "give one like 2026-01") from error
+
+
+def _last_day(first: date) -> int:
+    following = (first.replace(day=28) + timedelta(days=4)).replace(day=1)
+    return (following - date(1970, 1, 1)).days - 1

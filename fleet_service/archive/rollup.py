@@ -1,0 +1,119 @@
+"""Statistics per cell, sector and hour that can be added up, and that stay when the rows they came from are retired.
+
+    rollup/cell_hour/date=2026-01-31/zone=q1202310/NAME.parquet
+
+One file per compacted file, of the same name: a part. An hour's statistics are the sum over all parts; so a part may be
+made whenever it is missing, and again when its rows were rewritten.
+
+Legend of the merging (columns of `tables.CELL_HOUR`)
+    sums, counts     add
+    mu_min, mu_max   least, largest
+    vehicle_bits     or; V vehicles set about 64·(1 - exp(-V/64)) of 64 bits, so V ≈ -64·ln(share of zeros)
+                     (linear counting: Whang, Vander-Zanden and Taylor 1990, eq. 2)
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_service.archive import layout, reading, segments
+from fleet_service.archive.files import ROLLUP, put_in_place
+from schemas import mugrid, tables
+from schemas.numeric import IntArray
+from schemas.wire import Kind
+
+TABLE: Final = "rollup/cell_hour"
+HOUR_NS: Final = 3_600_000_000_000
+_COLUMNS: Final = ["cell", "sector", "leave_time", "vehicle", "mu", "mu_utilised", "log_likelihood", "weight", "late"]
+_BITS: Final = 64
+
+
+def part_of(path: Path) -> Path:
+    """Where the part of a compacted file of observations lies."""
+    root = path.parents[3]
+    return root / TABLE / path.parents[1].name / path.parent.name / path.name
+
+
+def complete(root: Path, until_day: int | None = None) -> int:
+    """Make the parts that are missing; returns how many.
+
+    Raises:
+        OSError: one cannot be read or written.
+    """
+    missing = [
+        path for path in layout.compacted(root, Kind.OBSERVATION, until_day=until_day) if not part_of(path).exists()
+    ]
+    for path in missing:
+        make(root, path)
+    return len(missing)
+
+
+def make(root: Path, path: Path) -> None:
+    """Make the part of one compacted file, or make it anew.
+
+    Raises:
+        OSError: it cannot be read or written.
+    """
+    table = reading.load(path, _COLUMNS)
+    if table is not None:
+        put_in_place(root, rolled_up(table), part_of(path), ROLLUP)
+
+
+def rolled_up(table: pa.Table) -> pa.Table:
+    """Rows of observations as statistics per cell, sector and hour, sorted by them."""
+    rows = segments.rows_of(table)
+    hour = rows["leave_time"] // HOUR_NS
+    order = np.lexsort((hour, rows["sector"], rows["cell"]))
+    rows = {name: column[order] for name, column in rows.items()}
+    hour = hour[order]
+    new = np.diff(rows["cell"], prepend=-1).astype(bool) | (np.diff(hour, prepend=-1) != 0)
+    starts = np.flatnonzero(new | (np.diff(rows["sector"], prepend=-1) != 0))
+    if not len(starts):
+        return tables.CELL_HOUR_SCHEMA.empty_table()
+    columns = _statistics(rows, starts)
+    columns |= {
+        "cell": rows["cell"][starts],
+        "sector": rows["sector"][starts],
+        "hour": hour[starts] * (HOUR_NS // 1000),
+    }
+    arrays = [_array(columns[f.name], f.type) for f in tables.CELL_HOUR_SCHEMA]
+    return pa.Table.from_arrays(arrays, schema=tables.CELL_HOUR_SCHEMA)
+
+
+def _statistics(rows: segments.Rows, starts: IntArray) -> dict[str, Any]:
+    n = len(rows["cell"])
+    group = np.repeat(np.arange(len(starts)), np.diff(starts, append=n))
+    said = ~np.isnan(rows["mu"])
+    mu = np.where(said, rows["mu"], 0.0).astype(np.float64)
+    bin_ = np.clip(np.searchsorted(mugrid.EDGES, mu, side="right") - 1, 0, mugrid.BINS - 1)
+    histogram = np.zeros((len(starts), mugrid.BINS), np.int32)
+    np.add.at(histogram, (group[said], bin_[said]), 1)
+    _, who = np.unique(rows["vehicle"].astype(str), return_inverse=True)
+    names = np.array([int(name[:2], 16) % _BITS for name in np.unique(rows["vehicle"].astype(str))], np.uint64)
+    pairs = np.unique(group * (int(who.max()) + 1) + who)
+    return {
+        "observations": np.diff(starts, append=n),
+        "late": np.add.reduceat(rows["late"].astype(np.int64), starts),
+        "vehicles": np.bincount(pairs // (int(who.max()) + 1), minlength=len(starts)),
+        "vehicle_bits": np.bitwise_or.reduceat(np.uint64(1) << names[who], starts).view(np.int64),
+        "mu_count": np.add.reduceat(said.astype(np.int64), starts),
+        "mu_sum": np.add.reduceat(mu, starts), "mu_sum_squares": np.add.reduceat(mu * mu, starts),
+        "mu_min": np.minimum.reduceat(np.where(said, rows["mu"], np.inf), starts),
+        "mu_max": np.maximum.reduceat(np.where(said, rows["mu"], -np.inf), starts),
+        "utilised_max": np.fmax.reduceat(rows["mu_utilised"], starts),
+        "mu_histogram": histogram,
+        "log_likelihood_sum": np.add.reduceat(rows["log_likelihood"].astype(np.int32), starts, axis=0),
+    }  # fmt: skip
+
+
+def _array(values: Any, kind: pa.DataType) -> pa.Array[Any]:  # noqa: ANN401 columns of many types
+    if pa.types.is_list(kind):
+        offsets = np.arange(len(values) + 1, dtype=np.int32) * mugrid.BINS
+        buffers = [None, pa.py_buffer(offsets.tobytes())]
+        return pa.Array.from_buffers(kind, len(values), buffers, children=[pa.array(values.reshape(-1), pa.int32())])
+    column: pa.Array[Any] = pa.array(values).cast(kind, safe=False)
+    return column

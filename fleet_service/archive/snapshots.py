@@ -1,0 +1,50 @@
+"""The map as it was, for people: one GeoParquet file an hour.
+
+map/date=2026-01-31/20260131T070000Z.parquet      cells that are public, their polygons, sorted by cell
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_service.archive import geo, layout
+from fleet_service.archive.files import MAP, put_in_place
+from schemas import tables
+
+TABLE: Final = "map"
+_NAME: Final = "%Y%m%dT%H%M%SZ"
+
+
+def write(root: Path, table: pa.Table, now: int) -> Path:
+    """Keep the map of a moment [ns]; `table` has the schema of the map.
+
+    Raises:
+        OSError: it could not be written; nothing is left of it.
+    """
+    moment = datetime.fromtimestamp(now // 10**9, UTC)
+    folder = root / TABLE / f"date={moment:%Y-%m-%d}"
+    path = folder / f"{moment:{_NAME}}.parquet"
+    time = pa.array(np.full(table.num_rows, now // tables.US_STEP)).cast(tables.US)
+    table = table.append_column("snapshot_time", time).sort_by([("cell", "ascending"), ("sector", "ascending")])
+    kept = table.cast(tables.MAP_ARCHIVE, safe=False)
+    put_in_place(root, geo.with_cells(kept), path, MAP)
+    return path
+
+
+def time_of(path: Path) -> int:
+    """Moment [ns] of a snapshot."""
+    return int(datetime.strptime(path.stem, _NAME).replace(tzinfo=UTC).timestamp()) * 10**9
+
+
+def newest(root: Path, until: int) -> Path | None:
+    """The last snapshot that was taken until a moment [ns]."""
+    for folder in reversed(layout.days(root, TABLE, until_day=until // layout.DAY_NS)):
+        for path in sorted(folder.glob("*.parquet"), reverse=True):
+            if time_of(path) <= until:
+                return path
+    return None

@@ -1,0 +1,150 @@
+"""The configuration of a router: mutual TLS, and an access list that denies what is not written here. Pure.
+
+| role    | puts                                     | hears and asks                      |
+|---------|------------------------------------------|-------------------------------------|
+| vehicle | obs/*/*/*/NAME, state/*/*/*/NAME, token alive/NAME | map and alert; ack/NAME   |
+| reader  | nothing                                  | map and alert                       |
+| weather | weather/**                               | nothing                             |
+| service | everything under gripmap/                | everything under gripmap/           |
+| router  | what others were let put, between routers | likewise                           |
+
+Zenoh decides by the common name of the certificate and reads the list once, at its start. Denials are silent for the
+sender. A put on a wildcard counts as a put on every key of it, so that it must lie within a rule as a whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from fleet_service.enrolment.fleet import Enrolment
+from schemas import keys, wire
+
+PUBLIC: Final = (f"{keys.ROOT}/map/**", f"{keys.ROOT}/alert/**")
+WEATHER: Final = f"{keys.ROOT}/weather/**"
+EVERYTHING: Final = "gripmap/**"
+MESSAGES: Final = (
+    "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable", "liveliness_token",
+    "liveliness_query", "declare_liveliness_subscriber",
+)  # fmt: skip
+MAX_SESSIONS: Final = 5000  # one per vehicle; Zenoh's own limit is 1000
+# A whole tile as GeoJSON is about 50 MB; Zenoh would put together a gigabyte from fragments before it looks at it.
+MAX_MESSAGE: Final = 64 * 1024 * 1024
+LEASE_MS: Final = 3000  # after which a silent peer counts as gone
+
+Section = dict[str, Any]
+
+
+def router_configuration(fleet: Enrolment, name: str, certificates: Path) -> Section:
+    """What router `name` is started with; `certificates` is the folder with its certificate and key."""
+    router = fleet.routers[name]
+    before = list(fleet.routers)[: list(fleet.routers).index(name)]
+    certificate, key = (str(certificates / f"{name}.{ending}") for ending in ("pem", "key"))
+    return {
+        "mode": "router",
+        "listen": {"endpoints": [router.listens]},
+        "connect": {"endpoints": [fleet.routers[other].endpoint for other in before]},
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}, "delay": 0},
+        "transport": {
+            "shared_memory": {"enabled": False},  # drops samples silently when a receiver stalls
+            "unicast": {"max_sessions": MAX_SESSIONS},
+            "link": {
+                "protocols": ["tls"],
+                "tx": {"lease": LEASE_MS},
+                "rx": {"max_message_size": MAX_MESSAGE},
+                "tls": {
+                    "root_ca_certificate": str(certificates / "trust.pem"),
+                    "listen_certificate": certificate,
+                    "listen_private_key": key,
+                    "connect_certificate": certificate,
+                    "connect_private_key": key,
+                    "enable_mtls": True,
+                    "verify_name_on_connect": True,
+                    "close_link_on_expiration": True,
+                },
+            },
+        },
+        "access_control": access_control(fleet),
+        "low_pass_filter": [_no_larger()],
+        "qos": {"network": [_priority(keys.TOPICS[kind]) for kind in wire.Kind]},
+    }
+
+
+def access_control(fleet: Enrolment) -> Section:
+    """The access list of all routers."""
+    rules = [
+        _rule("everything", ("ingress", "egress"), MESSAGES, [EVERYTHING]),
+        _rule("ask", ("ingress",), ("declare_subscriber", "query"), PUBLIC),
+        _rule("told", ("egress",), ("put", "reply"), PUBLIC),
+        # Declared publishers and queriers send nothing, silently, until they are told that somebody listens.
+        _rule("listened", ("egress",), ("declare_subscriber",), [f"{keys.ROOT}/{kind}/**" for kind in wire.Kind]),
+        _rule("weather", ("ingress",), ("put",), [WEATHER]),
+        _rule("weathered", ("egress",), ("declare_subscriber",), [WEATHER]),
+        _rule("answered", ("egress",), ("declare_queryable",), [f"{keys.ROOT}/map/**"]),
+    ]
+    roles = {
+        "routers": list(fleet.routers), "services": fleet.services, "readers": fleet.readers, "weather": fleet.weather,
+    }  # fmt: skip
+    subjects = [{"id": f"role/{role}", "cert_common_names": names} for role, names in roles.items() if names]
+    subjects += [{"id": name, "cert_common_names": [name]} for name in fleet.vehicles]
+    trusted = [f"role/{role}" for role in ("routers", "services") if roles[role]]
+    policies = [{"rules": ["everything"], "subjects": trusted}]
+    if public := [*(["role/readers"] if fleet.readers else []), *fleet.vehicles]:
+        policies.append({"rules": ["ask", "told", "answered"], "subjects": public})
+    if fleet.weather:
+        policies.append({"rules": ["weather", "weathered"], "subjects": ["role/weather"]})
+    if fleet.vehicles:
+        policies.append({"rules": ["listened"], "subjects": fleet.vehicles})
+    for name in fleet.vehicles:
+        own = _own(name)
+        rules += own
+        policies.append({"rules": [rule["id"] for rule in own], "subjects": [name]})
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": subjects,
+        "policies": policies,
+    }
+
+
+def _own(name: str) -> list[Section]:
+    return [
+        _rule(f"put/{name}", ("ingress",), ("put",), [f"{keys.ROOT}/{kind}/*/*/*/{name}" for kind in wire.Kind]),
+        _rule(f"alive/{name}", ("ingress",), ("liveliness_token",), [keys.alive_key(name)]),
+        _rule(f"hear/{name}", ("ingress",), ("declare_subscriber",), [keys.ack_key(name)]),
+        _rule(f"ack/{name}", ("egress",), ("put",), [keys.ack_key(name)]),
+    ]
+
+
+def _rule(name: str, flows: Sequence[str], messages: Sequence[str], expressions: Sequence[str]) -> Section:
+    return {
+        "id": name,
+        "permission": "allow",
+        "flows": list(flows),
+        "messages": list(messages),
+        "key_exprs": list(expressions),
+    }
+
+
+def _no_larger() -> Section:
+    """No batch larger than the service reads travels further than the first router."""
+    return {
+        "id": "batches",
+        "flows": ["ingress"],
+        "messages": ["put"],
+        "key_exprs": [f"{keys.ROOT}/{kind}/**" for kind in wire.Kind],
+        "size_limit": wire.MAX_BYTES,
+    }
+
+
+def _priority(topic: keys.Topic) -> Section:
+    """A vehicle's own idea of its importance does not count: the priority is that of the topic."""
+    return {
+        "id": f"priority-{topic.name}",
+        "flows": ["ingress"],
+        "messages": ["put"],
+        "key_exprs": [f"{keys.ROOT}/{topic.name}/**"],
+        "overwrite": {"priority": topic.priority.lower(), "express": False},
+    }

@@ -1,0 +1,178 @@
+"""A certificate authority in a folder, and the certificates that it issues (elliptic curve P-256, X.509 version 3).
+
+DIR/authority/ca.pem  ca.key      signs; stays on this machine
+DIR/authority/next.*  old.pem     another authority on its way in, or out
+DIR/trust.pem                     what everyone trusts
+DIR/NAME.pem  NAME.key            of each name
+DIR/revoked/NAME.pem              of names that were taken off the list
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+from collections.abc import Sequence
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from schemas.errors import InputError
+
+SKEW: Final = timedelta(minutes=10)  # clocks of vehicles may be behind the authority's
+Key = ec.EllipticCurvePrivateKey
+
+
+class Pair(NamedTuple):
+    """A certificate and its private key."""
+
+    certificate: x509.Certificate
+    key: Key
+
+    def write(self, stem: Path) -> None:
+        """To STEM.pem and STEM.key; a pair that was cut off half way is seen by `read`."""
+        secret = self.key.private_bytes(
+            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+        )
+        write(stem.with_name(stem.name + ".key"), secret, 0o600)
+        write(stem.with_name(stem.name + ".pem"), pem(self.certificate), 0o644)
+
+
+def pem(certificate: x509.Certificate) -> bytes:
+    """A certificate as text."""
+    return certificate.public_bytes(serialization.Encoding.PEM)
+
+
+def write(path: Path, data: bytes, mode: int) -> None:
+    """Replace a file whole; it never has a wider mode than `mode`."""
+    draft = path.with_name(path.name + ".tmp")
+    draft.unlink(missing_ok=True)
+    with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+        os.fchmod(file.fileno(), mode)
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    draft.rename(path)
+
+
+def read(stem: Path) -> Pair | None:
+    """The pair at STEM.pem and STEM.key; None where it is missing or its halves do not belong together.
+
+    Raises:
+        InputError: a file is there and is none.
+    """
+    certificate = read_certificate(stem.with_name(stem.name + ".pem"))
+    path = stem.with_name(stem.name + ".key")
+    if certificate is None or not path.exists():
+        return None
+    try:
+        key = serialization.load_pem_private_key(path.read_bytes(), None)
+    except (ValueError, TypeError) as error:
+        raise InputError("out", f"{path} is no private key", "move it away; it will be made anew") from error
+    if not isinstance(key, Key) or key.public_key() != certificate.public_key():
+        return None
+    return Pair(certificate, key)
+
+
+def read_certificate(path: Path) -> x509.Certificate | None:
+    """A certificate; None where there is none.
+
+    Raises:
+        InputError: the file is none.
+    """
+    if not path.exists():
+        return None
+    try:
+        return x509.load_pem_x509_certificate(path.read_bytes())
+    except ValueError as error:
+        raise InputError("out", f"{path} is no certificate", "move it away; it will be made anew") from error
+
+
+def new_authority(days: float, now: datetime) -> Pair:
+    """An authority that signs itself, and nobody else's authority."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = _subject(f"gripmap authority {now:%Y-%m-%d} {x509.random_serial_number():x}"[:64])
+    certificate = (
+        _builder(name, name, key, now, now + timedelta(days=days))
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_usage(signs=True), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    return Pair(certificate, key)
+
+
+def issue(authority: Pair, name: str, hosts: Sequence[str], days: float, now: datetime) -> Pair:
+    """A certificate for a name; with `hosts` it may also be that of a server under them.
+
+    Raises:
+        InputError: it would outlive the authority.
+    """
+    until = now + timedelta(days=days)
+    if until > authority.certificate.not_valid_after_utc:
+        end = authority.certificate.not_valid_after_utc
+        raise InputError(
+            "days", f"the authority ends before, on {end:%Y-%m-%d}", "give fewer, or bring in another (--ca next)"
+        )
+    key = ec.generate_private_key(ec.SECP256R1())
+    uses = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
+    certificate = (
+        _builder(_subject(name), authority.certificate.subject, key, now, until)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_usage(signs=False), critical=True)
+        .add_extension(x509.ExtendedKeyUsage(uses), critical=False)
+        .add_extension(x509.SubjectAlternativeName(alternatives(name, hosts)), critical=False)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key()), critical=False)
+        .sign(authority.key, hashes.SHA256())
+    )
+    return Pair(certificate, key)
+
+
+def alternatives(name: str, hosts: Sequence[str]) -> list[x509.GeneralName]:
+    """The names and addresses that a certificate is good for."""
+    found: list[x509.GeneralName] = [x509.DNSName(name)]
+    for host in hosts:
+        try:
+            found.append(x509.IPAddress(ipaddress.ip_address(host)))
+        except ValueError:
+            found.append(x509.DNSName(host))
+    return found
+
+
+def signed(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
+    """Whether the authority issued the certificate."""
+    try:
+        certificate.verify_directly_issued_by(authority)
+    except (InvalidSignature, ValueError, TypeError):  # another key, another name, another kind of key
+        return False
+    return True
+
+
+def _subject(name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+
+
+def _builder(
+    subject: x509.Name, issuer: x509.Name, key: Key, now: datetime, until: datetime
+) -> x509.CertificateBuilder:
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(issuer)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - SKEW)
+        .not_valid_after(until)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+    )
+
+
+def _usage(*, signs: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not signs, key_cert_sign=signs, crl_sign=signs, content_commitment=False,
+        key_encipherment=False, data_encipherment=False, key_agreement=False, encipher_only=False, decipher_only=False,
+    )  # fmt: skip

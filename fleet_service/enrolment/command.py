@@ -1,0 +1,52 @@
+"""`fleet-service certs`: checks its options, enrols, and says what is to be done next."""
+
+from __future__ import annotations
+
+import argparse
+from datetime import UTC, datetime
+from pathlib import Path
+
+from schemas.errors import InputError
+
+LONGEST_DAYS = 36525.0  # a century; beyond, dates end
+SHOWN = 8  # names of a kind
+
+
+def add_command(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Declare the command and its options."""
+    certs = commands.add_parser("certs", help="certificates and router configurations for everyone on a list")
+    certs.add_argument("--fleet", metavar="FILE", type=Path, required=True, help="JSON: who takes part, by role")
+    certs.add_argument("--out", metavar="DIR", type=Path, required=True, help="run it again to renew and to revoke")
+    certs.add_argument("--days", type=float, default=365.0, help="how long a certificate is good (default 365)")
+    certs.add_argument("--ca-days", type=float, default=3650.0, help="how long a new authority is good (default 3650)")
+    certs.add_argument("--renew-days", type=float, default=30.0, help="renew what ends sooner (default 30)")
+    certs.add_argument("--ca", choices=("next", "switch", "drop"), help="a step on the way to another authority")
+    certs.set_defaults(command=_certs)
+
+
+def _certs(arguments: argparse.Namespace) -> int:
+    from fleet_service.enrolment.fleet import Enrolment
+    from schemas.config import load
+
+    days, out = (arguments.days, arguments.ca_days, arguments.renew_days), arguments.out
+    for name, value in zip(("days", "ca-days", "renew-days"), days, strict=True):
+        if not 0.0 < value <= LONGEST_DAYS:
+            raise InputError(name, f"{value:g} is no time", f"give more than 0 and at most {LONGEST_DAYS:g} days")
+    if days[2] >= days[0]:
+        raise InputError("renew-days", f"is not less than the {days[0]:g} days of a certificate", "give fewer")
+    fleet = load(arguments.fleet, Enrolment)
+    try:
+        from fleet_service.enrolment.enrol import Registry, Terms
+    except ImportError as error:
+        raise InputError("certs", "the package cryptography is missing", "pip install 'gripmap[certs]'") from error
+    try:
+        done = Registry(out, Terms(*days), datetime.now(UTC)).enrol(fleet, arguments.ca)
+    except OSError as error:
+        problem = f"cannot write {error.filename or out} ({error.strerror})"
+        raise InputError("out", problem, "give a folder you may write") from error
+    for word, names in (("issued", done.made), ("kept", done.kept), ("revoked", done.revoked)):
+        if names:
+            more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+            print(f"{word} {len(names)}: {', '.join(names[:SHOWN])}{more}")
+    print(f"routers: restart {', '.join(fleet.routers)} one at a time, each with its file in {out}")
+    return 0

@@ -1,0 +1,156 @@
+"""From the enrolment file to certificates and router configurations: what is missing is made, what is gone is revoked.
+
+Running it again changes nothing but what changed in the file or comes to its end.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Final
+
+from cryptography import x509
+
+from fleet_service.enrolment import authority as ca
+from fleet_service.enrolment.access import router_configuration
+from fleet_service.enrolment.fleet import Enrolment, Step
+from schemas.errors import InputError
+
+PRIVATE: Final = 0o700  # of the authority's folder
+
+
+@dataclass(frozen=True)
+class Terms:
+    """For how long, in days.
+
+    Attributes:
+        days: of a certificate.
+        ca_days: of an authority.
+        renew_days: a certificate that ends sooner is issued anew.
+    """
+
+    days: float = 365.0
+    ca_days: float = 3650.0
+    renew_days: float = 30.0
+
+
+@dataclass
+class Done:
+    """Names by what became of them."""
+
+    made: list[str] = field(default_factory=list)
+    kept: list[str] = field(default_factory=list)
+    revoked: list[str] = field(default_factory=list)
+
+
+class Registry:
+    """The folder of an authority.
+
+    Args:
+        folder: DIR of `authority`; made if it is not there.
+        terms: validity.
+        now: the time, with zone.
+    """
+
+    def __init__(self, folder: Path, terms: Terms, now: datetime) -> None:
+        self._folder, self._terms, self._now = folder, terms, now
+        self._authority = folder / "authority"
+        self._revoked = folder / "revoked"
+        folder.mkdir(parents=True, exist_ok=True)
+        for inner in (self._authority, self._revoked):
+            inner.mkdir(mode=PRIVATE, exist_ok=True)
+
+    def enrol(self, fleet: Enrolment, step: Step | None = None) -> Done:
+        """Bring certificates and router configurations up to date.
+
+        Args:
+            fleet: who takes part.
+            step: of the way to another authority.
+
+        Raises:
+            InputError: a file is damaged, a name was revoked, or a step is out of order.
+        """
+        signer = self._signer(step)
+        done = Done()
+        for name in fleet.names:
+            hosts = fleet.routers[name].hosts if name in fleet.routers else []
+            if self._good(name, hosts, signer.certificate):
+                done.kept.append(name)
+            else:
+                self._refuse_revoked(name, signer.certificate)
+                ca.issue(signer, name, hosts, self._terms.days, self._now).write(self._folder / name)
+                done.made.append(name)
+        done.revoked += self._revoke(set(fleet.names))
+        self._trust()
+        for name in fleet.routers:
+            text = json.dumps(router_configuration(fleet, name, self._folder), indent=1)
+            ca.write(self._folder / f"{name}.json5", text.encode() + b"\n", 0o644)
+        return done
+
+    def _signer(self, step: Step | None) -> ca.Pair:
+        current, coming = self._authority / "ca", self._authority / "next"
+        if step == "next" and ca.read(coming) is None:
+            ca.new_authority(self._terms.ca_days, self._now).write(coming)
+        if step == "switch":
+            self._switch()
+        if step == "drop":
+            (self._authority / "old.pem").unlink(missing_ok=True)
+        signer = ca.read(current)
+        if signer is None:
+            if (self._authority / "ca.pem").exists():
+                raise InputError(
+                    "out", f"{self._authority} lacks the authority's key", "restore ca.key from its backup"
+                )
+            signer = ca.new_authority(self._terms.ca_days, self._now)
+            signer.write(current)
+        return signer
+
+    def _switch(self) -> None:
+        """Let the next authority sign; cut off half way, it can be done again."""
+        following, leaving = ca.read(self._authority / "next"), ca.read_certificate(self._authority / "ca.pem")
+        if following is None or leaving is None:
+            raise InputError("ca", "there is no next authority", "begin with --ca next, and bring trust.pem to all")
+        if leaving != following.certificate:
+            ca.write(self._authority / "old.pem", ca.pem(leaving), 0o644)
+        following.write(self._authority / "ca")
+        for ending in (".key", ".pem"):
+            (self._authority / f"next{ending}").unlink()
+
+    def _good(self, name: str, hosts: list[str], signer: x509.Certificate) -> bool:
+        pair = ca.read(self._folder / name)
+        if pair is None:
+            return False
+        found = pair.certificate
+        names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        soon = self._now + timedelta(days=self._terms.renew_days)
+        return (
+            ca.signed(found, signer)
+            and found.not_valid_after_utc > soon
+            and list(names) == ca.alternatives(name, hosts)
+        )
+
+    def _refuse_revoked(self, name: str, signer: x509.Certificate) -> None:
+        """The access list knows names, so that a lost certificate would be good again with its name."""
+        lost = ca.read_certificate(self._revoked / f"{name}.pem")
+        if lost is None or lost.not_valid_after_utc < self._now or not ca.signed(lost, signer):
+            return
+        until = f"{lost.not_valid_after_utc:%Y-%m-%d}"
+        raise InputError(
+            "fleet", f"{name!r} was revoked and its certificate is good until {until}", "give another name"
+        )
+
+    def _revoke(self, names: set[str]) -> list[str]:
+        """Certificates of names that are no longer on the list go aside, their keys away."""
+        gone = [path for path in sorted(self._folder.glob("*.pem")) if path.stem not in names | {"trust"}]
+        for path in gone:
+            path.with_suffix(".key").unlink(missing_ok=True)
+            path.with_suffix(".json5").unlink(missing_ok=True)
+            path.rename(self._revoked / path.name)
+        return [path.stem for path in gone]
+
+    def _trust(self) -> None:
+        found = (ca.read_certificate(self._authority / f"{name}.pem") for name in ("ca", "next", "old"))
+        trusted = [certificate for certificate in found if certificate is not None]
+        ca.write(self._folder / "trust.pem", b"".join(map(ca.pem, trusted)), 0o644)

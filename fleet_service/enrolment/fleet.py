@@ -1,0 +1,73 @@
+"""The enrolment file: every name that may open a session, by role. The one source of certificates and of the ACL."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from collections import Counter
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field, model_validator
+
+from schemas.config import Settings, VehicleName
+
+_HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9-]{0,62}\.?)*")
+
+
+def _checked_host(host: str) -> str:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        if len(host) > 253 or not _HOST.fullmatch(host):
+            raise ValueError(f"{host[:60]!r} is no host name and no address") from None
+    return host
+
+
+Step = Literal["next", "switch", "drop"]  # of the way to another authority
+Host = Annotated[str, AfterValidator(_checked_host)]
+
+
+class Router(Settings):
+    """One router."""
+
+    hosts: list[Host] = Field(
+        default=["127.0.0.1", "localhost"], min_length=1, description="names and addresses by which others reach it"
+    )
+    listen: Host = Field(default="127.0.0.1", description="address that it listens on; :: for every one")
+    port: int = Field(default=7447, ge=1, le=65535)
+
+    @property
+    def endpoint(self) -> str:
+        """Where others reach it."""
+        return _endpoint(self.hosts[0], self.port)
+
+    @property
+    def listens(self) -> str:
+        """Where it listens."""
+        return _endpoint(self.listen, self.port)
+
+
+def _endpoint(host: str, port: int) -> str:
+    return f"tls/[{host}]:{port}" if ":" in host else f"tls/{host}:{port}"
+
+
+class Enrolment(Settings):
+    """Names by role. A name has one role, because the certificate bears nothing but the name."""
+
+    routers: dict[VehicleName, Router] = Field(min_length=1, description="each connects to those before it")
+    services: list[VehicleName] = Field(default=["shard-0"], description="everything under gripmap/")
+    readers: list[VehicleName] = Field(default=[], description="map and alerts, nothing else")
+    weather: list[VehicleName] = Field(default=[], description="who puts road weather, and does nothing else")
+    vehicles: list[VehicleName] = Field(default=[], description="their own keys; map and alerts to read")
+
+    @property
+    def names(self) -> list[str]:
+        """Everybody."""
+        return [*self.routers, *self.services, *self.readers, *self.weather, *self.vehicles]
+
+    @model_validator(mode="after")
+    def _one_role_each(self) -> Enrolment:
+        twice = [name for name, times in Counter(self.names).items() if times > 1]
+        if twice:
+            raise ValueError(f"{twice[0]!r} is there twice, and a name has one role")
+        return self

@@ -1,0 +1,110 @@
+"""What a vehicle said in a cell before: its entries in the window, chained, and the pair's row for what is older."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fleet_service.fusion.belief import VALUE
+from fleet_service.fusion.cells import NONE, SECOND, Records
+from fleet_service.fusion.pools import PAIRS
+from fleet_service.fusion.table import pair_place
+from schemas.numeric import BoolArray, IntArray, compiled
+
+_FIBONACCI = np.uint64(0x9E3779B97F4A7C15)  # 2⁶⁴ over the golden ratio: its multiples lie far apart
+
+
+@compiled
+def earlier(entries: Records, a: int, b: int) -> bool:
+    """Whether entry `a` is folded before `b`: by time, then by identity."""
+    if entries[a].time != entries[b].time:
+        return bool(entries[a].time < entries[b].time)
+    if entries[a].number != entries[b].number:
+        return bool(entries[a].number < entries[b].number)
+    if entries[a].boot != entries[b].boot:
+        return bool(entries[a].boot < entries[b].boot)
+    return bool(entries[a].place < entries[b].place)
+
+
+@compiled
+def pair_of(pairs: Records, used: IntArray, slot: int, vehicle: int) -> int:
+    """Place of a pair; makes it where there is none."""
+    pair = pair_place(pairs, slot, vehicle)
+    if pairs[pair].slot == NONE:
+        pairs[pair].slot = slot
+        pairs[pair].vehicle = vehicle
+        pairs[pair].last = NONE
+        pairs[pair].waiting = 0
+        pairs[pair].time[0] = 0
+        pairs[pair].time[1] = 0
+        used[PAIRS] += 1
+    return pair
+
+
+@compiled
+def chain(entries: Records, pairs: Records, pair: int, entry: int) -> None:
+    """Put an entry among those of its vehicle in its window."""
+    pairs[pair].waiting += 1
+    entries[entry].pair = pair
+    before, after = int(pairs[pair].last), NONE
+    while before != NONE and earlier(entries, entry, before):
+        before, after = int(entries[before].before), before
+    entries[entry].before = before
+    entries[entry].after = after
+    if before != NONE:
+        entries[before].after = entry
+    if after == NONE:
+        pairs[pair].last = entry
+    else:
+        entries[after].before = entry
+
+
+@compiled
+def remember(entries: Records, pairs: Records, entry: int) -> None:
+    """What an entry said becomes what its vehicle said before the checkpoint; later ones stand alone."""
+    pair, kind = int(entries[entry].pair), int(entries[entry].kind)
+    pairs[pair].time[kind] = entries[entry].time // SECOND
+    pairs[pair].mean[kind] = entries[entry].last_mean
+    pairs[pair].spent[kind] = entries[entry].spent
+    if kind == VALUE:
+        pairs[pair].std = entries[entry].last_std
+    pairs[pair].waiting -= 1
+    if entries[entry].after == NONE:
+        pairs[pair].last = NONE
+    else:
+        entries[entries[entry].after].before = NONE
+
+
+@compiled
+def moved(entries: Records, old: Records, new: Records, stay: BoolArray) -> IntArray:
+    """Move the pairs that `stay` (places,) to another table; returns the places of the others."""
+    gone, count = np.empty(len(old), np.int64), 0
+    for place in range(len(old)):
+        if old[place].slot == NONE:
+            continue
+        if not stay[place]:
+            gone[count] = place
+            count += 1
+            continue
+        to = pair_place(new, old[place].slot, old[place].vehicle)
+        new[to] = old[place]
+        entry = int(old[place].last)
+        while entry != NONE:
+            entries[entry].pair = to
+            entry = int(entries[entry].before)
+    return gone[:count]
+
+
+@compiled
+def returning(number: int) -> np.uint64:
+    """The bit of `Cells.returned` that a vehicle has."""
+    return np.uint64(1) << ((np.uint64(number) * _FIBONACCI) >> np.uint64(58))
+
+
+@compiled
+def mark_returned(cells: Records, kept: Records, slots: IntArray, numbers: IntArray) -> None:
+    """Note in cells (k,) that vehicles (k,) were there, though what they said is forgotten."""
+    for k in range(len(slots)):
+        slot, bit = slots[k], returning(numbers[k])
+        cells[slot].returned |= bit
+        if cells[slot].window != NONE:
+            kept[cells[slot].window].returned |= bit

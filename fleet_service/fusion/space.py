@@ -1,0 +1,57 @@
+"""Where a visit may have been instead: its fix's error spreads it over the cells before and behind. Vectorised, pure.
+
+Legend
+    σ      standard deviation of the position along the heading     (n,), m
+    w      length of a cell along the heading                        (n,), m
+    π_k    P(what was learned belongs to the k-th cell further on)   (n,)
+    G(x)   x·Φ(x) + φ(x), the integral of the normal distribution function
+
+A visit lies anywhere in its cell, so that π_k is a uniform of width w and a normal error, seen by cells of width w:
+π_k = σ/w · [G((k+1)·w/σ) - 2·G(k·w/σ) + G((k-1)·w/σ)]. All of them sum to one.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from scipy.special import ndtr
+
+from fleet_service.fusion import constants as c
+from schemas import grid
+from schemas.numeric import Float32Array, FloatArray, IntArray
+
+_EARTH_M: Final = 40_075_016.686  # circumference at the equator, WGS 84
+_STEPS: Final = np.array([k for k in range(-c.SPREAD_CELLS, c.SPREAD_CELLS + 1) if k])
+
+
+def places(
+    cell: IntArray, latitude: FloatArray, yaw: FloatArray, position_std: FloatArray
+) -> tuple[IntArray, Float32Array]:  # fmt: skip
+    """Other cells of visits (n,), and the probability that the vehicle was there instead, both (n, 2·SPREAD_CELLS).
+
+    -1 and 0 where it is less than SPREAD_LEAST, where yaw or the standard deviation is unknown, and in another region,
+    which another service may hold. The probabilities leave at least nothing for `cell`: no vote is doubled.
+    """
+    cosine, sine = np.cos(np.nan_to_num(yaw)), np.sin(np.nan_to_num(yaw))
+    steep = np.maximum(np.abs(cosine), np.abs(sine))
+    side = _EARTH_M / (1 << grid.CELL_ZOOM) * np.cos(np.radians(np.clip(latitude, -85.0, 85.0)))
+    share = shares(np.nan_to_num(position_std), side / steep)
+    x, y = grid.deinterleave(cell)
+    n = 1 << grid.CELL_ZOOM
+    ahead = np.rint(_STEPS * (cosine / steep)[:, None]), np.rint(_STEPS * (-sine / steep)[:, None])
+    columns, rows = (x[:, None] + ahead[0].astype(np.int64)) % n, y[:, None] + ahead[1].astype(np.int64)
+    other = grid.interleave(columns, np.clip(rows, 0, n - 1))
+    good = (share >= c.SPREAD_LEAST) & np.isfinite(yaw)[:, None] & (rows >= 0) & (rows < n)
+    good &= grid.region_of(other) == grid.region_of(cell)[:, None]
+    return np.where(good, other, -1), np.where(good, share, 0.0).astype(np.float32)
+
+
+def shares(std: FloatArray, length: FloatArray) -> FloatArray:
+    """π of the cells behind and ahead, (n, 2·SPREAD_CELLS), for σ and w (n,)."""
+    ratio = (length / np.maximum(std, 1e-6 * length))[:, None]
+    return np.asarray((_g((_STEPS + 1) * ratio) - 2.0 * _g(_STEPS * ratio) + _g((_STEPS - 1) * ratio)) / ratio)
+
+
+def _g(x: FloatArray) -> FloatArray:
+    return np.asarray(x * ndtr(x) + np.exp(-0.5 * np.square(x)) / np.sqrt(2.0 * np.pi))

@@ -1,0 +1,93 @@
+"""All that a fusion knows as plain arrays, and back: so that a snapshot goes on exactly where the fusion was. Pure.
+
+A column is a one-dimensional array. Columns of one length belong together: `Image` is a table of tables, by name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_service.fusion.cells import CELL, Records
+from fleet_service.fusion.fuse import Fusion
+from fleet_service.fusion.pools import ENTRY, FREE_ENTRIES, FREE_WINDOWS, PAIR, PEER, VEHICLE, VOICE, VOICES, WINDOW
+from fleet_service.fusion.stores import Stores
+from fleet_service.fusion.weather import Reports
+from schemas import mugrid
+
+Image = dict[str, dict[str, NDArray[Any]]]
+_RECORDS: Final = {
+    "cells": CELL, "kept": CELL, "windows": WINDOW, "entries": ENTRY, "pairs": PAIR, "voices": VOICE, "peers": PEER,
+    "names": VEHICLE,
+}  # fmt: skip
+_BELIEFS: Final = ("belief", "kept_belief")
+
+
+def image_of(fusion: Fusion) -> Image:
+    """Everything that a fusion holds. Windows, entries and pairs keep their places, since they point at each other."""
+    stores, state = fusion.stores, fusion.stores.state
+    used = {"cells": stores.size, "voices": int(state.used[VOICES]), "peers": stores.vehicles, "names": stores.vehicles}
+    whole = {name: getattr(state, name, None) for name in _RECORDS} | {"peers": stores.peers, "names": stores.names}
+    image = {name: _flat(array[: used.get(name)]) for name, array in whole.items() if array is not None}
+    image["belief"] = {"bins": state.belief[: stores.size].reshape(-1)}
+    image["kept_belief"] = {"bins": state.kept_belief.reshape(-1)}
+    image["free_windows"] = {"row": state.free_windows[: int(state.used[FREE_WINDOWS])]}
+    image["free_entries"] = {"row": state.free_entries[: int(state.used[FREE_ENTRIES])]}
+    image["used"] = {"count": state.used, "more": np.array([stores.size, stores.vehicles, stores.hour, fusion.epoch])}
+    image["trust"] = {
+        "epoch": np.concatenate([np.full(len(weights), epoch) for epoch, weights, _ in fusion.trusts]),
+        "weight": np.concatenate([weights for _, weights, _ in fusion.trusts]),
+    }
+    image["trusts"] = {
+        "epoch": np.array([epoch for epoch, _, _ in fusion.trusts]),
+        "vehicles": np.array([len(weights) for _, weights, _ in fusion.trusts]),
+        "newcomer": np.array([newcomer for _, _, newcomer in fusion.trusts]),
+    }
+    reports = fusion.reports
+    image["weather"] = {f.name: getattr(reports, f.name).reshape(-1) for f in fields(Reports)}
+    return {name: {key: column.copy() for key, column in table.items()} for name, table in image.items()}
+
+
+def fusion_of(image: Image, lateness_s: float) -> Fusion:
+    """The fusion of an image, with the lateness that it had."""
+    fusion = Fusion(lateness_s)
+    records = {name: _records(image[name], kind) for name, kind in _RECORDS.items()}
+    beliefs = {name: image[name]["bins"].reshape(-1, mugrid.BINS).copy() for name in _BELIEFS}
+    free = {name: _padded(image[name]["row"], len(records[name.removeprefix("free_")])) for name in _FREE}
+    peers, names = records.pop("peers"), records.pop("names")
+    size, vehicles, hour, epoch = image["used"]["more"].tolist()
+    parts: dict[str, Any] = {**records, **beliefs, **free, "used": image["used"]["count"].copy()}
+    state = fusion.stores.state._replace(**parts)
+    fusion.stores = Stores.of(state, peers, names, size, vehicles, hour)
+    ends = np.cumsum(image["trusts"]["vehicles"])[:-1]
+    weights = np.split(image["trust"]["weight"], ends)
+    epochs, newcomers = image["trusts"]["epoch"].tolist(), image["trusts"]["newcomer"].tolist()
+    trusts = list(zip(epochs, weights, newcomers, strict=True))
+    columns = {f.name: image["weather"][f.name] for f in fields(Reports)}
+    columns["prior"] = columns["prior"].reshape(-1, mugrid.BINS)
+    fusion.resume(None if epoch < 0 else epoch, trusts, Reports(**columns))
+    return fusion
+
+
+_FREE: Final = ("free_windows", "free_entries")
+
+
+def _flat(records: Records) -> dict[str, NDArray[Any]]:
+    return {name: records[name].reshape(-1) for name in records.dtype.names or ()}
+
+
+def _records(table: dict[str, NDArray[Any]], kind: np.dtype[Any]) -> Records:
+    names = kind.names or ()
+    out = np.zeros(len(table[names[0]]) // int(np.prod(kind[names[0]].shape, dtype=np.int64)), kind)
+    for name in names:
+        out[name] = table[name].reshape(out[name].shape)
+    return out
+
+
+def _padded(rows: NDArray[Any], places: int) -> NDArray[Any]:
+    out = np.zeros(places, np.int32)
+    out[: len(rows)] = rows
+    return out

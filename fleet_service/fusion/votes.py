@@ -1,0 +1,204 @@
+"""One vote: how much of it is new, and how it is folded into a row of cells. Compiled."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from fleet_service.fusion import constants as c
+from fleet_service.fusion.belief import (
+    BOUND,
+    REACH,
+    VALUE,
+    Bins,
+    PackedArray,
+    describe,
+    doubt,
+    forget,
+    kind_of,
+    mean_of,
+    mix,
+    pack,
+    spread,
+    unpack,
+    vote,
+)  # fmt: skip
+from fleet_service.fusion.cells import NONE, SECOND, Records
+from fleet_service.fusion.pairs import returning
+from fleet_service.fusion.pools import GRIP, ICE, WITNESSES
+from fleet_service.fusion.weather import Weather, aged
+from schemas import mugrid
+from schemas.numeric import compiled
+
+# Rows of scratch, (3, SCRATCH) single precision: the belief, what `forget` and `spread` need, and the likelihood.
+P, PADDED, LIKELIHOOD = 0, 1, 2
+SCRATCH: Final = mugrid.BINS + 2 * REACH
+_HOUR: Final = 3600
+_FORGOTTEN: Final = int(c.FORGOTTEN_S)
+
+
+@compiled
+def voice_of(entries: Records, entry: int, scratch: Bins) -> None:
+    """Kind of an entry's vote, and what describes it; leaves its likelihood in the scratch."""
+    evidence, likelihood = entries[entry].evidence, scratch[LIKELIHOOD]
+    kind = kind_of(evidence)
+    _clear(scratch)
+    spread(evidence, kind, scratch[PADDED], likelihood)
+    mean = mean_of(likelihood)
+    entries[entry].kind = kind
+    entries[entry].mean = mean
+    if kind == VALUE:
+        std, slippery = describe(likelihood, mean)
+        entries[entry].std = max(std, c.NOVELTY_STD)
+        entries[entry].slippery = slippery
+
+
+@compiled
+def respread(entries: Records, entry: int, scratch: Bins) -> None:
+    """The likelihood of an entry into the scratch again."""
+    _clear(scratch)
+    spread(entries[entry].evidence, int(entries[entry].kind), scratch[PADDED], scratch[LIKELIHOOD])
+
+
+@compiled
+def _clear(scratch: Bins) -> None:
+    for i in range(REACH):
+        scratch[PADDED, i] = 0.0
+        scratch[PADDED, SCRATCH - 1 - i] = 0.0
+
+
+@compiled
+def recall(entries: Records, pairs: Records, entry: int) -> None:
+    """How much of a vote is new, from what its vehicle said here before: in the window, or before the checkpoint.
+
+    Times are whole seconds from either, so that it does not matter which.
+    """
+    kind, pair = int(entries[entry].kind), entries[entry].pair
+    now = entries[entry].time // SECOND
+    least = now - now % _HOUR - _FORGOTTEN
+    time, mean, std, spent = 0, np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    earlier = entries[entry].before
+    seen = earlier != NONE
+    while earlier != NONE and entries[earlier].kind != kind:
+        earlier = entries[earlier].before
+    if earlier != NONE:
+        time, mean, std = entries[earlier].time // SECOND, entries[earlier].last_mean, entries[earlier].last_std
+        spent = entries[earlier].spent
+    else:
+        seen = seen or pairs[pair].time[BOUND] >= max(least, 1) or pairs[pair].time[VALUE] >= max(least, 1)
+        time, mean, std = int(pairs[pair].time[kind]), pairs[pair].mean[kind], pairs[pair].std
+        spent = pairs[pair].spent[kind]
+    new_mean, new_std = entries[entry].mean, entries[entry].std
+    power = np.float32(1.0)
+    if time > 0 and time >= least:
+        renewed = -math.expm1(-max(now - time, 0) / c.VOTE_RENEWAL_S)
+        spent *= np.float32(1.0 - renewed)
+        novelty = 0.0
+        if now - time >= c.REVISIT_S:
+            novelty = _novelty(kind, float(mean), float(std), float(new_mean), float(new_std))
+        power = np.float32(max(renewed, min(novelty, c.VOTES - float(spent))))
+        new_mean = mean + power * (new_mean - mean)
+        new_std = std + power * (new_std - std)
+    else:
+        spent = np.float32(0.0)
+    entries[entry].power = power
+    entries[entry].last_mean = new_mean
+    entries[entry].last_std = new_std
+    entries[entry].spent = spent + power
+    entries[entry].fresh = 0 if seen else 1
+
+
+@compiled
+def _novelty(kind: int, mean: float, std: float, new_mean: float, new_std: float) -> float:
+    if kind == BOUND:  # the mean of "at least u" against the uniform prior moves by half of u
+        share = 2.0 * (new_mean - mean) / c.NOVELTY_UTILISED
+    else:
+        deviations = abs(new_mean - mean) / math.hypot(std, new_std)
+        share = (deviations - c.NOVELTY_FROM) / (c.NOVELTY_FULL - c.NOVELTY_FROM)
+    return min(max(share, 0.0), 1.0)
+
+
+@compiled
+def fold(
+    belief: PackedArray, cells: Records, row: int, voices: Records, voice: int, entries: Records, entry: int,
+    weather: Weather, scratch: Bins,
+) -> None:  # fmt: skip
+    """Fold one entry, whose likelihood is in the scratch, onto a row of cells; `voice` is its row of witnesses."""
+    time, kind = entries[entry].time, int(entries[entry].kind)
+    key, p, seconds, passed = cells[row].key, scratch[P], 0.0, 0.0
+    unpack(belief, row, p)
+    new = cells[row].time == 0
+    if new:
+        cells[row].first = time
+        _, _, prior = aged(weather, key, time, time)
+        if prior:
+            mix(p, 1.0, weather.prior[prior])
+    else:
+        passed = (time - cells[row].time) * 1e-9
+        seconds = max(passed, 0.0) + cells[row].aged
+    change, prior = 0.0, 0
+    cells[row].aged = seconds
+    if seconds >= c.FORGET_S:
+        drift, change, prior = aged(weather, key, time - int(seconds * 1e9), time)
+        forget(p, drift, change, weather.prior[prior], scratch[PADDED])
+        cells[row].aged = 0.0
+    weight = float(entries[entry].weight)
+    if 0.0 < weight < c.WITNESS_TRUST or cells[row].crowd[0] + cells[row].crowd[1] > 0.0:
+        weight = _crowded(cells, row, kind, float(entries[entry].power), weight, passed)
+    strength = weight * entries[entry].power * entries[entry].share
+    if kind == VALUE and not new:
+        doubt(p, change, strength, weather.prior[prior])
+    vote(p, scratch[LIKELIHOOD], (1.0 - c.CONTAMINATION) * strength)
+    pack(p, belief, row)
+    cells[row].time = time
+    _count(cells, row, entries, entry)
+    if kind == VALUE:
+        cells[row].values += np.float32(strength)
+        if weight * entries[entry].share >= c.WITNESS_TRUST:
+            if entries[entry].slippery >= c.WITNESS_SHARE:
+                _witness(voices, voice, ICE, entries[entry].vehicle, time)
+            elif entries[entry].slippery <= 1.0 - c.WITNESS_SHARE:
+                _witness(voices, voice, GRIP, entries[entry].vehicle, time)
+
+
+@compiled
+def _count(cells: Records, row: int, entries: Records, entry: int) -> None:
+    """Visits and vehicles; who was probably elsewhere is not counted."""
+    if entries[entry].share < c.HERE_SHARE:
+        return
+    cells[row].visits += np.uint32(1)
+    if entries[entry].fresh and not cells[row].returned & returning(entries[entry].number):
+        cells[row].vehicles += np.uint32(1)
+
+
+@compiled
+def _crowded(cells: Records, row: int, kind: int, power: float, weight: float, passed: float) -> float:
+    """Weight of a vote among others that are not trusted either: the k-th new one counts 1/k², all together 1.6 votes.
+
+    So names cost nothing and bring nothing. A vehicle's repeated vote is discounted by its `power` already.
+    """
+    left = np.float32(math.exp(-max(passed, 0.0) / c.VOTE_RENEWAL_S))
+    cells[row].crowd[BOUND] *= left
+    cells[row].crowd[VALUE] *= left
+    if not 0.0 < weight < c.WITNESS_TRUST:
+        return weight
+    crowd = cells[row].crowd[kind]
+    cells[row].crowd[kind] = crowd + np.float32(power)
+    return weight / float((np.float32(1.0) + crowd) ** 2)
+
+
+@compiled
+def _witness(voices: Records, voice: int, side: int, vehicle: int, time: int) -> None:
+    """Note a witness: at its own place if it has one, else at that of the oldest."""
+    witness, witnessed = voices[voice].witness, voices[voice].witnessed
+    place = 0
+    for k in range(WITNESSES):
+        if witness[side, k] == vehicle:
+            place = k
+            break
+        if witnessed[side, k] < witnessed[side, place]:
+            place = k
+    witness[side, place] = vehicle
+    witnessed[side, place] = time // SECOND

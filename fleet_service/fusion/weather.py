@@ -1,0 +1,155 @@
+"""What the weather does to forgetting: how fast a region's roads age, and what is believed of one that nobody knows.
+
+Without a word about a region its roads age by the clock. A report holds from its time on, until the next one or for
+VALID_S. Pure; the ageing is compiled.
+
+Legend
+    τ_d, τ_c   road time of drift and of change: ∫ rate dt                     [s]
+    T_a, T_r   temperature of the air, of the road                             [°C]
+    R          precipitation, as water                                         [mm/h]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from schemas import grid, mugrid
+from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray, compiled
+
+VALID_NS: Final = 3 * 3600 * 10**9  # a service's forecasts and stations renew hourly; two may fail
+WET_MM_H: Final = 0.1  # least that a gauge tells from nothing
+# Water on a road takes, and leaves, some tenths of an hour; a shower passes in as much (CHANGE_S / 4 is 45 minutes).
+WET_CHANGE: Final = 4.0
+WET_DRIFT: Final = 2.0
+# Around freezing the same water is ice, slush or wet within minutes, and salt comes: CHANGE_S / 8 is 22 minutes.
+FREEZING_C: Final = (-4.0, 1.0)  # road; below, snow is dry and the road keeps
+AIR_ABOVE_ROAD_C: Final = 2.0  # a road radiates: so much colder than the air on a clear night
+FREEZING_CHANGE: Final = 8.0
+FROST_CHANGE: Final = 2.0  # around freezing without precipitation: rime, and meltwater that freezes again
+# Warm and dry nothing comes over a road but dirt: it keeps twice as long. Not more: a gauge is not on this road.
+STEADY_CHANGE: Final = 0.5
+STEADY_C: Final = 5.0
+# A prior from outside is a guess about a region and not about this road: with this share it is uniform all the same, so
+# that a wrong one is outvoted by two vehicles.
+UNIFORM_SHARE: Final = 0.5
+
+
+@dataclass(frozen=True)
+class Reports:
+    """Weather of regions, arrays of shape (n,): region, time from which it acts [ns], air and road temperature [°C],
+    precipitation [mm/h], each NaN where unknown; `prior` (n, 32), NaN where there is none."""
+
+    region: IntArray
+    time: IntArray
+    air_temperature: FloatArray
+    road_temperature: FloatArray
+    precipitation: FloatArray
+    prior: FloatArray
+
+    def take(self, rows: IntArray | BoolArray) -> Reports:
+        """Some of the rows."""
+        return Reports(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+
+class Weather(NamedTuple):
+    """Road time of regions: rows `start[k]` to `start[k + 1]` belong to `region[k]`, in order of time; row 0 to none.
+
+    Attributes:
+        region: (r,) sorted.
+        start: (r + 1,) first row of each region.
+        time: (m,) from which a row acts [ns].
+        clock: (m, 2) τ_d and τ_c at that time [s].
+        rate: (m, 2) at which they run from then on.
+        prior: (m, 32) what is believed of a road nobody measured; uniform in row 0.
+    """
+
+    region: IntArray
+    start: IntArray
+    time: IntArray
+    clock: FloatArray
+    rate: FloatArray
+    prior: Float32Array
+
+
+def rates(reports: Reports) -> FloatArray:
+    """Rates of drift and of change, (n, 2); 1 where nothing is known."""
+    road = np.where(
+        np.isnan(reports.road_temperature), reports.air_temperature - AIR_ABOVE_ROAD_C, reports.road_temperature
+    )
+    wet, dry = reports.precipitation >= WET_MM_H, reports.precipitation < WET_MM_H  # both False where unknown
+    freezing = (road >= FREEZING_C[0]) & (road <= FREEZING_C[1])
+    change = np.select(
+        [wet & freezing, wet, freezing, dry & (road >= STEADY_C)],
+        [FREEZING_CHANGE, WET_CHANGE, FROST_CHANGE, STEADY_CHANGE], 1.0,
+    )  # fmt: skip
+    return np.stack([np.where(wet, WET_DRIFT, 1.0), change], axis=1)
+
+
+def priors(reports: Reports) -> Float32Array:
+    """Priors (n, 32), mixed with the uniform one."""
+    told = np.where(np.isnan(reports.prior), mugrid.PRIOR, reports.prior)
+    told = told / told.sum(axis=1, keepdims=True)
+    mixed: FloatArray = UNIFORM_SHARE * mugrid.PRIOR + (1.0 - UNIFORM_SHARE) * told
+    return mixed.astype(np.float32)
+
+
+def weather_of(reports: Reports) -> Weather:
+    """Road time of all regions in `reports`; of several of one region and time the last counts."""
+    last = np.lexsort((np.arange(len(reports.time)), reports.time, reports.region))
+    keep = np.append(np.diff(reports.region[last]) != 0, True) | np.append(np.diff(reports.time[last]) != 0, True)
+    reports = reports.take(last[keep[: len(last)]])
+    rate, prior = rates(reports), priors(reports)
+    rows: list[tuple[int, float, float, Float32Array]] = [(0, 1.0, 1.0, mugrid.PRIOR.astype(np.float32))]
+    region, begin = np.unique(reports.region, return_index=True)
+    starts = [1]
+    for first, end in zip(begin.tolist(), np.append(begin, len(reports.time))[1:].tolist(), strict=True):
+        for k in range(first, end):
+            rows.append((int(reports.time[k]), rate[k, 0], rate[k, 1], prior[k]))
+            until = int(reports.time[k]) + VALID_NS
+            if k + 1 == end or reports.time[k + 1] > until:
+                rows.append((until, 1.0, 1.0, rows[0][3]))
+        starts.append(len(rows))
+    time = np.array([row[0] for row in rows])
+    return _clocked(region, np.array(starts), time, np.array([row[1:3] for row in rows]), [row[3] for row in rows])
+
+
+def _clocked(region: IntArray, start: IntArray, time: IntArray, rate: FloatArray, prior: list[Float32Array]) -> Weather:
+    clock = np.zeros_like(rate)
+    for first, end in zip(start[:-1].tolist(), start[1:].tolist(), strict=True):
+        passed = np.diff(time[first:end])[:, None] * 1e-9 * rate[first : end - 1]
+        clock[first + 1 : end] = np.cumsum(passed, axis=0)
+    return Weather(region, start, time, clock, rate, np.array(prior))
+
+
+def no_reports() -> Reports:
+    """Nothing known of any region."""
+    nothing, never = np.zeros(0, np.int64), np.zeros(0)
+    return Reports(nothing, nothing, never, never, never, np.zeros((0, mugrid.BINS)))
+
+
+_SHIFT: Final = 2 * (grid.CELL_ZOOM - grid.REGION_ZOOM) + 2  # from a slot's key to its region
+
+
+@compiled
+def aged(weather: Weather, key: int, begin: int, end: int) -> tuple[float, float, int]:
+    """Road time of drift and change between two times [ns], and the row whose prior holds at the end; 0 without one."""
+    seconds = (end - begin) * 1e-9
+    if len(weather.region) == 0:
+        return seconds, seconds, 0
+    region = key >> _SHIFT
+    k = np.searchsorted(weather.region, region)
+    if k == len(weather.region) or weather.region[k] != region:
+        return seconds, seconds, 0
+    first, last = weather.start[k], weather.start[k + 1]
+    drift, change, row = 0.0, 0.0, 0
+    for time, sign in ((begin, -1.0), (end, 1.0)):
+        place = first + np.searchsorted(weather.time[first:last], time, side="right") - 1
+        row = place if place >= first else 0
+        at = max(place, first)
+        passed = (time - weather.time[at]) * 1e-9
+        drift += sign * (weather.clock[at, 0] + passed * (weather.rate[at, 0] if row else 1.0))
+        change += sign * (weather.clock[at, 1] + passed * (weather.rate[at, 1] if row else 1.0))
+    return drift, change, row

@@ -1,0 +1,72 @@
+"""Who is listened to, and how much: a bucket of bytes per vehicle, before anything of a message is read.
+
+A bucket fills at a constant rate and holds a burst, so that a vehicle that comes back from an outage is not hindered.
+What does not fit is dropped, counted and not acknowledged: its sender keeps it and sends it again. It is no rejection.
+The name is the last chunk of the key; routers with an access list see to it that it is the sender's.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Collection
+from typing import Final
+
+# Reading, checking and refusing the smallest message costs as much as a few dozen records.
+LEAST_BYTES: Final = 1024
+# Names that have a bucket of their own. More are sent by nobody but who makes them up: they share one.
+MOST_NAMES: Final = 100_000
+_OTHERS: Final = ""
+
+
+class Limits:
+    """The buckets of one service.
+
+    Args:
+        rate: [bytes/s] of a vehicle in the long run.
+        burst: [bytes] that it may send at once.
+        known: names that are enrolled; None: any.
+        counts: takes `limited` and `refused.unknown`.
+        clock: [s].
+    """
+
+    def __init__(
+        self,
+        rate: float,
+        burst: float,
+        known: Collection[str] | None,
+        counts: Counter[str],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._rate, self._burst, self._known, self._counts, self._clock = rate, burst, known, counts, clock
+        self._buckets: dict[str, tuple[float, float]] = {}  # what is left, and when that was [s]
+        self._swept = -float("inf")
+
+    def lets(self, key: str, size: int) -> bool:
+        """Whether a message of `size` bytes on `key` is to be looked at; else it is counted."""
+        name = key.rpartition("/")[2]
+        if self._known is not None and name not in self._known:
+            self._counts["refused.unknown"] += 1
+            return False
+        now = self._clock()
+        if name not in self._buckets and len(self._buckets) >= MOST_NAMES and not self._forget(now):
+            name = _OTHERS
+        left, since = self._buckets.get(name, (self._burst, now))
+        left = min(self._burst, left + (now - since) * self._rate)
+        cost = max(size, LEAST_BYTES)
+        fits = left >= cost
+        self._buckets[name] = (left - cost if fits else left, now)
+        if not fits:
+            self._counts["limited"] += 1
+        return fits
+
+    def __len__(self) -> int:
+        return len(self._buckets)
+
+    def _forget(self, now: float) -> bool:
+        """Drop the buckets that are full again, but not at every message; whether there is room now."""
+        rate, burst = self._rate, self._burst
+        if now - self._swept >= burst / rate:
+            self._swept = now
+            self._buckets = {n: b for n, b in list(self._buckets.items()) if b[0] + (now - b[1]) * rate < burst}
+        return len(self._buckets) < MOST_NAMES

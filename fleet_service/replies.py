@@ -1,0 +1,76 @@
+"""Answering queries: in Zenoh's thread where it is quick, in a thread of its own where the archive has to be replayed.
+
+One past is rebuilt at a time; who asks meanwhile is told to ask again. So nobody can keep the others from the map by
+asking for history.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterable
+from typing import Final
+
+import zenoh
+
+from schemas import keys, query
+from schemas.errors import InputError
+from schemas.query import MapQuery
+
+TEXT: Final = "text/plain"
+Answering = Callable[[MapQuery, Callable[[int], bool]], list[tuple[int, bytes]]]
+
+
+class Replies:
+    """The callback of the queryables.
+
+    Args:
+        answer: gives tile and payload of every reply to a query, for the tiles that a predicate wants.
+        counts: takes `queries`, and `bad_queries.FIELD`.
+    """
+
+    def __init__(self, answer: Answering, counts: Counter[str]) -> None:
+        self._answer, self._counts = answer, counts
+        self._past = threading.Lock()
+
+    def __call__(self, asked: zenoh.Query) -> None:
+        """Answer one query, now or a little later."""
+        self._counts["queries"] += 1
+        try:
+            pairs: Iterable[tuple[str, str]] = asked.parameters  # type: ignore[assignment] # stub: no iterable
+            wanted = query.parse({name: value for name, value in pairs if not name.startswith("_")})  # Zenoh's own
+        except InputError as error:
+            self._refuse(asked, error)
+            return
+        if wanted.at is None:
+            self._reply(asked, wanted)
+        elif self._past.acquire(blocking=False):
+            threading.Thread(target=self._rebuild, args=(asked, wanted), name="past", daemon=True).start()
+        else:
+            self._refuse(asked, InputError("at", "another past is being rebuilt", "ask again later"))
+
+    def _rebuild(self, asked: zenoh.Query, wanted: MapQuery) -> None:
+        try:
+            self._reply(asked, wanted)
+        except zenoh.ZError:  # the session closed meanwhile: nobody is there to hear it
+            pass
+        finally:
+            self._past.release()
+
+    def _reply(self, asked: zenoh.Query, wanted: MapQuery) -> None:
+        with asked:
+            try:
+                self._send(asked, wanted)
+            except InputError as error:
+                self._refuse(asked, error)
+
+    def _send(self, asked: zenoh.Query, wanted: MapQuery) -> None:
+        expression = asked.key_expr
+        for tile, payload in self._answer(wanted, lambda t: expression.intersects(zenoh.KeyExpr(keys.map_key(t)))):
+            asked.reply(keys.map_key(tile), payload, encoding=wanted.format.encoding)
+
+    def _refuse(self, asked: zenoh.Query, error: InputError) -> None:
+        field = error.field if error.field in MapQuery.model_fields else "query"  # else the asker's own word
+        self._counts[f"bad_queries.{field}"] += 1
+        with asked:
+            asked.reply_err(str(error), encoding=TEXT)

@@ -1,0 +1,116 @@
+"""Which batches were admitted: a watermark and the seqs above it, per (vehicle, boot, kind, region). Pure.
+
+Bounded by what was admitted: every seq above a watermark is a batch in the archive, there are at most MAX_GAPS of them,
+and a stream whose newest record is older than the service lets in is forgotten.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+
+from schemas.numeric import IntArray
+from schemas.wire import Kind
+
+# Batches above the first that is missing: an agent sends old ones first, so that it has some hundreds after an outage.
+MAX_GAPS: Final = 1 << 16
+_NONE: Final[frozenset[int]] = frozenset()
+
+
+class Stream:
+    """Which batches of one stream were admitted.
+
+    Attributes:
+        low: every seq up to here is settled, or will never come.
+        seen: the admitted ones above.
+        newest: time of the newest admitted batch's first record [ns].
+    """
+
+    __slots__ = ("low", "newest", "seen")
+
+    def __init__(self) -> None:
+        self.low, self.newest = 0, 0
+        self.seen: set[int] | frozenset[int] = _NONE
+
+    def admitted(self, seq: int) -> bool:
+        """Whether this seq was admitted before."""
+        return seq <= self.low or seq in self.seen
+
+    def admit(self, seq: int, time: int = 0) -> bool:
+        """Note a seq and the time of its first record [ns]; False if too many are missing before it (not noted)."""
+        if seq == self.low + 1:
+            self.low = seq
+            self._close()
+        elif seq > self.low:
+            if len(self.seen) >= MAX_GAPS:
+                return False
+            if not isinstance(self.seen, set):
+                self.seen = set()
+            self.seen.add(seq)
+        self.newest = max(self.newest, time)
+        return True
+
+    def raise_to(self, first_held: int) -> None:
+        """Older than `first_held` never comes."""
+        if first_held - 1 > self.low:
+            if isinstance(self.seen, set):
+                if first_held - self.low > len(self.seen):
+                    self.seen = {seq for seq in self.seen if seq >= first_held}
+                else:
+                    self.seen.difference_update(range(self.low, first_held))
+            self.low = first_held - 1
+            self._close()
+
+    def _close(self) -> None:
+        if isinstance(self.seen, set):
+            while self.low + 1 in self.seen:
+                self.low += 1
+                self.seen.remove(self.low)
+            if not self.seen:
+                self.seen = _NONE
+
+
+StreamKey = tuple[int, int, Kind, int]  # number of the vehicle's pseudonym, boot, kind, region
+
+
+class Streams:
+    """All streams of one service."""
+
+    def __init__(self) -> None:
+        self._streams: dict[StreamKey, Stream] = {}
+
+    def __getitem__(self, key: StreamKey) -> Stream:
+        stream = self._streams.get(key)
+        if stream is None:
+            stream = self._streams[key] = Stream()
+        return stream
+
+    def __len__(self) -> int:
+        return len(self._streams)
+
+    def __iter__(self) -> Iterator[Stream]:
+        return iter(self._streams.values())
+
+    def forget(self, before: int) -> None:
+        """Drop streams without a batch from `before` [ns] on: one that came again would be refused as too old."""
+        self._streams = {key: stream for key, stream in self._streams.items() if stream.newest >= before}
+
+    def restore(
+        self, kind: Kind, vehicle: IntArray, boot: IntArray, region: IntArray,
+        seq: IntArray, first_held: IntArray, time: IntArray,
+    ) -> None:  # fmt: skip
+        """Note archived rows (n,) of one kind, in any order; `time` [ns] of each record."""
+        if not len(seq):
+            return
+        order = np.lexsort((seq, region, boot, vehicle))
+        names = np.stack([vehicle, boot, region])[:, order]
+        seq, first_held, time = seq[order], first_held[order], time[order]
+        starts = np.flatnonzero(np.r_[True, (np.diff(names) != 0).any(axis=0)])
+        for start, stop in zip(starts.tolist(), [*starts[1:].tolist(), len(order)], strict=True):
+            stream = self[int(names[0, start]), int(names[1, start]), kind, int(names[2, start])]
+            stream.raise_to(int(first_held[start:stop].max()))
+            newest = int(time[start:stop].max())
+            for one in np.unique(seq[start:stop]).tolist():
+                stream.admit(one, newest)

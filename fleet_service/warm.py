@@ -1,0 +1,35 @@
+"""Kernels loaded or compiled before the service is ready: compiling takes seconds, and vehicles wait meanwhile."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from fleet_service.alerts import Alerts
+from fleet_service.fusion import Fusion, Observations
+from fleet_service.fusion.constants import EPOCH_NS
+from fleet_service.map_state import cell_table
+from schemas import mugrid
+
+CELLS: Final = 1 << 14  # more than a map has room for at first
+
+
+def warm_up() -> None:
+    """Take a throw-away map through its life: fold, grow, advance, fold late within the window, settle, believe."""
+    fusion = Fusion(2 * EPOCH_NS * 1e-9)
+    for epoch, cells in ((1, 2), (2, CELLS), (1, 2), (9, 2)):
+        o = _visits(epoch * EPOCH_NS, cells)
+        Alerts(fusion).folded(fusion.fold(o).slots)
+        fusion.slots_of(o.cell, o.sector)
+    cell_table(fusion, np.arange(2), 10 * EPOCH_NS)
+
+
+def _visits(time: int, cells: int) -> Observations:
+    """One visit to each of so many cells, by two vehicles."""
+    one, number, sector = np.ones(cells, np.int64), np.arange(cells), np.zeros(cells, np.int8)
+    evidence = mugrid.encode_log_likelihood(np.zeros((cells, mugrid.BINS)))
+    return Observations(
+        time * one, number, sector, (sector - 1).astype(np.int8), number % 2, one, one, number, evidence,
+        np.full((cells, 1), -1), np.zeros((cells, 1), np.float32),
+    )  # fmt: skip

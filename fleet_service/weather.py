@@ -1,0 +1,177 @@
+"""Road weather in: from Zenoh and from a Parquet file, checked, archived, and then used by the map.
+
+    weather/NAME-TIME.parquet     reports as they came, with the time from which the map used them
+
+A report acts on observations of which none was folded yet (`acts_from`). It is durable before it acts, so that a replay
+of the archive finds the weather that the map had, and gives the same map.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from fleet_service.archive.files import write_table
+from fleet_service.fusion import Fusion
+from fleet_service.fusion.weather import VALID_NS, Reports
+from schemas import grid, keys, mugrid, tables, weather
+from schemas.errors import InputError
+from schemas.weather import Report
+
+FOLDER: Final = "weather"
+WAITING: Final = 10_000  # reports that wait at the most: a whole continent's regions; the oldest go first
+AHEAD_NS: Final = 86_400 * 10**9  # a forecast for tomorrow is weather, one for next year a wrong clock
+COLUMNS: Final = ("region", "time", *weather.RANGES, "prior")
+
+
+class Heard(NamedTuple):
+    """One sample on a weather key."""
+
+    key: str
+    payload: bytes
+    encoding: str
+
+
+class WeatherDesk:
+    """Takes reports in for one fusion.
+
+    Args:
+        root: of the archive.
+        name: of the service, part of the file names.
+        fusion: that uses them.
+        counts: refusals are counted here, under `refused.weather`.
+    """
+
+    def __init__(self, root: Path, name: str, fusion: Fusion, counts: Counter[str]) -> None:
+        self._folder, self._name, self._fusion, self._counts = root / FOLDER, name, fusion, counts
+        self._waiting: deque[Heard] = deque(maxlen=WAITING)
+        self._last = 0
+
+    def hear(self, heard: Heard) -> None:
+        """Keep a sample for the next `take`; from any thread."""
+        self._waiting.append(heard)
+
+    def take(self, now: int) -> Reports | None:
+        """Archive what was heard; returns it for the map, None where there is nothing."""
+        found: list[tuple[int, Report]] = []
+        while self._waiting:
+            heard = self._waiting.popleft()
+            try:
+                found.append(_report(heard, now))
+            except InputError:
+                self._counts["refused.weather"] += 1
+        return self._archived(found, now) if found else None
+
+    def begin(self, path: Path, known: Reports, now: int) -> Reports | None:
+        """Archive the reports of a file that may still act and are not `known`; returns them for the map.
+
+        Raises:
+            InputError: the file cannot be read, or a row breaks a rule.
+        """
+        told = set(zip(known.region.tolist(), known.time.tolist(), strict=True))
+        found = []
+        for region, report in read_file(path):
+            acts = max(report.time, self._fusion.next_epoch)
+            if report.time > acts - VALID_NS and not {(region, report.time), (region, acts)} & told:
+                found.append((region, report))
+        return self._archived(found, now) if found else None
+
+    def _archived(self, found: list[tuple[int, Report]], now: int) -> Reports | None:
+        table = _table(found, now, self._fusion.next_epoch)
+        self._last = max(time.time_ns(), self._last + 1)
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            write_table(table, self._folder / f"{self._name}-{self._last:020d}.parquet")
+        except OSError:  # what is not archived must not act; the next report comes within the hour
+            self._counts["weather_failures"] += 1
+            return None
+        return _reports(table)
+
+
+def _report(heard: Heard, now: int) -> tuple[int, Report]:
+    region = keys.parse(heard.key).place
+    report = weather.decode(heard.payload, heard.encoding)
+    if region is None or not now - VALID_NS <= report.time <= now + AHEAD_NS:
+        raise InputError("time", "too old, or more than a day ahead", "set the clock")
+    return region, report
+
+
+def _table(found: list[tuple[int, Report]], now: int, next_epoch: int) -> pa.Table:
+    found = sorted(found, key=lambda pair: pair[1].time)
+    reports = [report for _, report in found]
+    columns: dict[str, Any] = {name: [getattr(r, name) for r in reports] for name in weather.RANGES}
+    columns["region"] = [region for region, _ in found]
+    columns["time"] = [r.time for r in reports]
+    columns["prior"] = [None if r.prior is None else r.prior.tolist() for r in reports]
+    columns["received_at"] = [now] * len(found)
+    columns["acts_from"] = [max(r.time, next_epoch) for r in reports]
+    fields = tables.arrow_schema(*tables.WEATHER)
+    table = pa.Table.from_arrays([pa.array(columns[f.name], f.type) for f in fields], schema=fields)
+    return table.cast(tables.WEATHER_ARCHIVE, safe=False)
+
+
+def _reports(table: pa.Table) -> Reports:
+    prior = [np.full(mugrid.BINS, np.nan) if row is None else np.array(row) for row in table["prior"].to_pylist()]
+    air, road, water = (table[name].to_numpy().astype(np.float64) for name in weather.RANGES)
+    acts = table["acts_from"].cast(tables.NS).cast(pa.int64()).to_numpy()
+    return Reports(table["region"].to_numpy(), acts, air, road, water, np.array(prior).reshape(-1, mugrid.BINS))
+
+
+def archived(root: Path, received_until: int | None = None, received_after: int | None = None) -> Reports:
+    """Every report that a map used, in the order in which they came, as far as received in that time [ns].
+
+    Raises:
+        OSError: the archive cannot be read.
+    """
+    parts = []
+    for path in sorted((root / FOLDER).glob("*.parquet"), key=lambda p: p.stem[-20:]):
+        try:
+            parts.append(pq.read_table(path))
+        except pa.ArrowInvalid:  # damaged on disk: its roads age by the clock
+            path.rename(path.with_name(path.name + ".bad"))
+    table = pa.concat_tables([tables.WEATHER_ARCHIVE.empty_table(), *parts])
+    received = table["received_at"].cast(tables.NS).cast(pa.int64()).to_numpy()
+    if received_until is not None:
+        table = table.filter(pa.array(received <= received_until))
+    elif received_after is not None:
+        table = table.filter(pa.array(received > received_after))
+    return _reports(table)
+
+
+def read_file(path: Path) -> list[tuple[int, Report]]:
+    """Region and report of every row of a Parquet file: `region` (z10 quadint, or quadkey of 10 digits) and `time`
+    (timestamp, or ns), and any of the others; null or NaN is unknown.
+
+    Raises:
+        InputError: names the row, the column and the fix.
+    """
+    try:
+        rows = pq.read_table(path).to_pylist()
+    except (OSError, pa.ArrowInvalid) as error:
+        raise InputError("weather", f"cannot read {path}", "give a Parquet file of road weather") from error
+    return [_row(number, row) for number, row in enumerate(rows)]
+
+
+def _row(number: int, row: dict[str, Any]) -> tuple[int, Report]:
+    fix = f"give region, time and any of {', '.join(COLUMNS[2:])}"
+    if unknown := row.keys() - set(COLUMNS):
+        raise InputError("weather", f"{sorted(unknown)[0]} is no column of it", fix)
+    try:
+        region, at = row["region"], row["time"]
+        region = grid.from_quadkey(region) if isinstance(region, str) else int(region)
+        when = int(at) if isinstance(at, int) else int(np.datetime64(at.replace(tzinfo=None), "ns").astype(np.int64))
+        values = {name: np.nan if row.get(name) is None else float(row[name]) for name in weather.RANGES}
+        prior = None if row.get("prior") is None else np.array(row["prior"], np.float64)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError("weather", f"row {number}: no region, time and numbers", fix) from error
+    problem = weather.broken(values, prior)
+    if problem is not None or not 0 <= region < 1 << (2 * grid.REGION_ZOOM):
+        said = problem or InputError("region", "is no z10 region", "use its quadint or quadkey")
+        raise InputError(f"weather row {number}, {said.field}", said.problem, said.fix)
+    return region, Report(when, prior=prior, **values)

@@ -1,0 +1,127 @@
+"""How a running part is seen: OpenMetrics at `/metrics`, its health at `/healthz`, on loopback unless told otherwise.
+
+Values are read when they are asked for; nothing is counted twice for the sake of being shown.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+
+from schemas.errors import InputError
+
+if TYPE_CHECKING:
+    from prometheus_client.registry import CollectorRegistry
+
+PREFIX: Final = "gripmap_"
+READ_S: Final = 5.0  # a client that says nothing is cut off
+
+
+class Metric(NamedTuple):
+    """One family of values: a counter only grows. `label` names what tells the values apart; "" for a single one."""
+
+    name: str
+    kind: Literal["counter", "gauge"]
+    help: str
+    values: Mapping[str, float]
+    label: str = ""
+
+
+def gauge(name: str, text: str, value: float) -> Metric:
+    """A single value that goes up and down."""
+    return Metric(name, "gauge", text, {"": value})
+
+
+Read = Callable[[], Sequence[Metric]]
+Troubles = Callable[[], Sequence[str]]
+
+
+@contextmanager
+def serving(host: str, port: int | None, read: Read, troubles: Troubles) -> Iterator[str | None]:
+    """Serve while the block runs; gives the address, or None where `port` is None. Port 0 is a free one.
+
+    Args:
+        host, port: where to listen.
+        read: all values, now.
+        troubles: what is not as it should be, a sentence each; none is healthy.
+
+    Raises:
+        InputError: the port is taken, or the package for the format is missing.
+    """
+    if port is None:
+        yield None
+        return
+    handler = type(
+        "Handler", (_Handler,), {"exposition": staticmethod(_exposition(read)), "troubles": staticmethod(troubles)}
+    )
+    try:
+        server = ThreadingHTTPServer((host, port), handler)
+    except OSError as error:
+        raise InputError(
+            "metrics_port", f"cannot listen on {host}:{port} ({error.strerror})", "give another"
+        ) from error
+    server.daemon_threads = True
+    thread = Thread(target=server.serve_forever, name="monitor", daemon=True)
+    thread.start()
+    try:
+        yield f"http://{host}:{server.server_address[1]}"
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+def _exposition(read: Read) -> Callable[[], tuple[str, bytes]]:
+    try:
+        from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
+        from prometheus_client.openmetrics.exposition import CONTENT_TYPE_LATEST, generate_latest
+        from prometheus_client.registry import Collector, CollectorRegistry
+    except ImportError as error:
+        fix = "pip install 'gripmap[metrics]', or leave the port out"
+        raise InputError("metrics_port", "the package prometheus-client is missing", fix) from error
+
+    class Values(Collector):
+        def collect(self) -> Iterator[CounterMetricFamily | GaugeMetricFamily]:
+            for metric in read():
+                family = CounterMetricFamily if metric.kind == "counter" else GaugeMetricFamily
+                found = family(PREFIX + metric.name, metric.help, labels=[metric.label] if metric.label else [])
+                for label, value in sorted(metric.values.items()):
+                    found.add_metric([label] if metric.label else [], value)
+                yield found
+
+    registry: CollectorRegistry = CollectorRegistry()
+    registry.register(Values())
+    return lambda: (CONTENT_TYPE_LATEST, generate_latest(registry))  # type: ignore[no-untyped-call] # the library's
+
+
+class _Handler(BaseHTTPRequestHandler):
+    exposition: Callable[[], tuple[str, bytes]]
+    troubles: Troubles
+    timeout = READ_S
+    server_version, sys_version = "gripmap", ""
+
+    def do_GET(self) -> None:
+        path = self.path.partition("?")[0]
+        if path == "/metrics":
+            self._send(200, *self.exposition())
+        elif path == "/healthz":
+            troubles = list(self.troubles())
+            state = {"status": "trouble" if troubles else "ok", "troubles": troubles}
+            self._send(503 if troubles else 200, "application/json", json.dumps(state).encode())
+        else:
+            self._send(404, "text/plain", b"/metrics and /healthz\n")
+
+    def _send(self, status: int, form: str, body: bytes) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", form)
+        self.send_header("Content-Length", str(len(body)))
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002
+        """A scrape is no event."""

@@ -1,0 +1,70 @@
+"""Lines for the operator of a running agent or service: text for people, or JSON lines for programs."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import UTC, datetime
+from typing import Any, Literal, TextIO
+
+Form = Literal["text", "json"]
+
+
+class Line(str):
+    """A line with its numbers by name, for those who read JSON."""
+
+    __slots__ = ("values",)
+
+    def __new__(cls, text: str, **values: object) -> Line:
+        """Text for people, values for programs."""
+        line = super().__new__(cls, text)
+        line.values = values
+        return line
+
+    values: dict[str, object]
+
+
+def tell(line: str, stream: TextIO) -> None:
+    """Print a line at once; what lies behind the stream (a full disk, a reader that left) never ends the process."""
+    with suppress(OSError):
+        print(line, file=stream, flush=True)
+
+
+def teller(form: Form, stream: TextIO, **who: object) -> Callable[[str], None]:
+    """What takes the lines; as JSON each with time, process and `who`, the first word as its event."""
+
+    def text(line: str) -> None:
+        tell(line, stream)
+
+    def as_json(line: str) -> None:
+        event = line.partition(":")[0] if ":" in line else line.partition(" ")[0]
+        values = line.values if isinstance(line, Line) else {}
+        tell(_record("info", **{"event": event, "message": str(line), **who, **values}), stream)
+
+    return text if form == "text" else as_json
+
+
+def log_as(form: Form, stream: TextIO, **who: object) -> None:
+    """Let warnings of the program and its libraries go to `stream` in this form."""
+    handler = logging.StreamHandler(stream)
+    handler.setFormatter(_Formatter(who) if form == "json" else logging.Formatter("%(levelname)s: %(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
+
+
+class _Formatter(logging.Formatter):
+    def __init__(self, who: dict[str, object]) -> None:
+        super().__init__()
+        self._who = who
+
+    def format(self, record: logging.LogRecord) -> str:
+        raised = {"error": self.formatException(record.exc_info)} if record.exc_info else {}
+        level, event = record.levelname.lower(), record.name
+        return _record(level, event=event, message=record.getMessage(), **self._who, **raised)
+
+
+def _record(level: str, **values: Any) -> str:  # noqa: ANN401 whatever JSON takes
+    now = datetime.now(UTC).isoformat(timespec="milliseconds")
+    return json.dumps({"time": now, "level": level, "pid": os.getpid(), **values}, default=str)

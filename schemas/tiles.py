@@ -1,0 +1,69 @@
+"""Reading a tile of the map, an Arrow stream, as if a stranger had sent it.
+
+Arrow trusts its sender: it unpacks what is compressed, however large it becomes, and takes lengths and offsets as they
+come. So the head of each message is looked at before Arrow sees its body, and the result is checked in full.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+import pyarrow as pa
+
+from schemas.errors import WireError
+from schemas.tables import MAP_SCHEMA
+
+MAX_BYTES: Final = 64 * 1024 * 1024  # the largest message that a router passes
+MAX_ROWS: Final = 1 << 17  # a tile has 2^14 cells of four sectors; twice that
+_BATCH: Final = 3  # type of a record batch's head in the format's schema
+_TYPE, _HEAD, _COMPRESSION = 1, 2, 3  # places of fields in the tables Message and RecordBatch
+
+
+def decode_tile(payload: bytes) -> pa.Table:
+    """The cells of a tile.
+
+    Raises:
+        WireError: too large, compressed, not of the map's columns, or damaged.
+    """
+    if len(payload) > MAX_BYTES:
+        raise WireError("tile", f"{len(payload)} bytes", f"send at most {MAX_BYTES}")
+    try:
+        _refuse_compressed(payload)
+        with pa.ipc.open_stream(payload) as stream:
+            if not stream.schema.equals(MAP_SCHEMA):
+                raise WireError("tile", "has other columns than the map", "use the schema of `tables.MAP_SCHEMA`")
+            table = _rows(stream)
+        table.validate(full=True)
+    except (pa.ArrowException, OSError, struct.error, IndexError, UnicodeDecodeError) as error:
+        raise WireError("tile", f"is no Arrow stream ({type(error).__name__})", "write it with Arrow") from error
+    return table
+
+
+def _rows(stream: pa.RecordBatchStreamReader) -> pa.Table:
+    batches: list[pa.RecordBatch] = []
+    for batch in stream:
+        batches.append(batch)
+        if batch.num_rows < 0 or sum(one.num_rows for one in batches) > MAX_ROWS:
+            raise WireError("tile", f"has more than {MAX_ROWS} cells", "send one tile at a time")
+    return pa.Table.from_batches(batches, schema=stream.schema)
+
+
+def _refuse_compressed(payload: bytes) -> None:
+    for message in pa.ipc.MessageReader.open_stream(payload):
+        head = message.metadata.to_pybytes()
+        root = struct.unpack_from("<I", head, 0)[0]
+        kind, body = _field(head, root, _TYPE), _field(head, root, _HEAD)
+        if kind and body and head[kind] == _BATCH:
+            batch = body + struct.unpack_from("<I", head, body)[0]
+            if _field(head, batch, _COMPRESSION):
+                raise WireError("tile", "is compressed", "send it as it is; a small message may not become a large one")
+
+
+def _field(data: bytes, table: int, place: int) -> int:
+    """Where a field of a FlatBuffers table lies; 0 where it is absent."""
+    layout = table - int(struct.unpack_from("<i", data, table)[0])
+    if 4 + 2 * place >= int(struct.unpack_from("<H", data, layout)[0]):
+        return 0
+    offset = int(struct.unpack_from("<H", data, layout + 4 + 2 * place)[0])
+    return table + offset if offset else 0

@@ -1,0 +1,72 @@
+"""Road weather: its rules, and its bytes on the wire. A temperature or precipitation that is not known is NaN.
+
+One report tells of a z10 region from a time on. Everything in it is optional, but something must be said.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas import mugrid, wire
+from schemas.errors import WireError
+from schemas.proto import gripmap_pb2 as pb
+
+# What a road of this earth can have; anything else is a fault of the sender (a unit, a filler like -9999).
+RANGES: Final = {
+    "air_temperature": (-90.0, 60.0), "road_temperature": (-90.0, 90.0), "precipitation": (0.0, 500.0),
+}  # fmt: skip
+PRIOR_SUM_ERROR: Final = 0.01  # single precision and a few digits of text
+
+
+@dataclass(frozen=True)
+class Report:
+    """Weather of a region from `time` [ns] on: air and road temperature [°C], precipitation [mm/h as water], each NaN
+    where unknown; `prior`: probabilities (32,) of a road there, or None."""
+
+    time: int
+    air_temperature: float = np.nan
+    road_temperature: float = np.nan
+    precipitation: float = np.nan
+    prior: NDArray[np.float64] | None = None
+
+
+def encode(report: Report) -> bytes:
+    """Protobuf bytes of a report."""
+    known = {name: getattr(report, name) for name in RANGES if not np.isnan(getattr(report, name))}
+    prior = [] if report.prior is None else np.asarray(report.prior).tolist()
+    return pb.Weather(time=report.time, prior=prior, **known).SerializeToString()
+
+
+def decode(payload: bytes, encoding: str = wire.WEATHER_ENCODING) -> Report:
+    """Read a report, protobuf or JSON, and ask the rules.
+
+    Raises:
+        WireError: no Weather, a value out of range, a prior that is none, or nothing said.
+    """
+    message: Any = wire.parse(payload, encoding, pb.Weather, wire.WEATHER_ENCODING)
+    values = {name: getattr(message, name) if message.HasField(name) else np.nan for name in RANGES}
+    prior = np.array(message.prior, np.float64) if len(message.prior) else None
+    problem = broken(values, prior)
+    if problem is not None:
+        raise problem
+    return Report(message.time, prior=prior, **values)
+
+
+def broken(values: dict[str, float], prior: NDArray[np.float64] | None) -> WireError | None:
+    """The first rule that a report breaks."""
+    for name, (least, most) in RANGES.items():
+        if not (np.isnan(values[name]) or least <= values[name] <= most):
+            return WireError(name, f"{values[name]:g} lies outside [{least:g}, {most:g}]", "leave out what is unknown")
+    if prior is None:
+        if all(np.isnan(value) for value in values.values()):
+            return WireError("weather", "says nothing", f"give one of {', '.join(RANGES)} or prior")
+        return None
+    if prior.shape != (mugrid.BINS,):
+        return WireError("prior", f"has {prior.size} bins", f"give {mugrid.BINS}, those of the friction grid, or none")
+    if not (np.isfinite(prior).all() and (prior >= 0.0).all() and abs(prior.sum() - 1.0) <= PRIOR_SUM_ERROR):
+        return WireError("prior", "is no probability", "give finite numbers from 0 that sum to 1")
+    return None

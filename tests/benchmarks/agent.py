@@ -1,0 +1,117 @@
+"""The edge agent as processes: how soon it answers, what a vehicle costs, how many a core carries, how jobs scale."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from edge_agent.backfill import backfill, tasks_of
+from edge_agent.banks import bank_of
+from edge_agent.cli import main as edge
+from edge_agent.sources.replay import read_log
+from schemas.figures import Figure
+from schemas.vehicle import load_vehicle
+from tests.benchmarks.measure import median_s
+from tests.faults.processes import stage
+
+EDGE = (sys.executable, "-c", "import sys; from edge_agent.cli import main; sys.exit(main(sys.argv[1:]))")
+FIRST = """import sys
+from pathlib import Path
+from edge_agent.banks import bank_of
+from edge_agent.sources.replay import read_log
+from schemas.vehicle import load_vehicle
+bank = bank_of("aco-fckf", [load_vehicle(Path(sys.argv[2]))])
+block = next(read_log(Path(sys.argv[1])).blocks(0))
+bank.advance(block.t[:1], block.signals[:1])
+"""
+LIVE_S = 20.0
+START_S = 5.0  # of a run that only pays for its start
+FLEET, FLEET_RATE_HZ, FLEET_S = 100, 50, 20.0
+LOGS, LOG_S = 16, 60.0
+
+
+def agent() -> list[Figure]:
+    """The edge agent's processes: start, a vehicle's share of a core, vehicles on a core, replay with two jobs."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        with stage(folder / "stage") as there:
+            found = [*live(folder, there.endpoint), *fleet(folder, there.endpoint)]
+        return [*start(folder), *found, *replay(folder)]
+
+
+def drive(folder: Path, name: str, seed: int, seconds: float) -> tuple[Path, Path]:
+    """A simulated log and its vehicle file."""
+    log, vehicle = folder / f"{name}.parquet", folder / f"{name}.json"
+    files = ["--out", str(log), "--vehicle-out", str(vehicle), "--duration", str(seconds), "--seed", str(seed)]
+    edge(["simulate", "slalom", *files])
+    return log, vehicle
+
+
+def start(folder: Path) -> list[Figure]:
+    """Help, and a new process's first estimate, compiled code in the cache."""
+    files = [str(path) for path in drive(folder, "short", 0, 2.0)]
+
+    def process(*words: str) -> None:
+        subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
+
+    return [
+        Figure("bench.start.help_s", median_s(lambda: process(*EDGE, "--help")), "s", 0.4),
+        Figure(
+            "bench.start.first_estimate_s", median_s(lambda: process(sys.executable, "-c", FIRST, *files)), "s", 1.5
+        ),
+    ]
+
+
+def used(folder: Path, endpoint: str, *words: str) -> tuple[float, float]:
+    """CPU [s] and resident memory [MB] of a command of the edge agent.
+
+    Raises:
+        ArithmeticError: it left something unacknowledged, so that its figures would flatter.
+    """
+    config = folder / "agent.json"
+    config.write_text(json.dumps({"zenoh": {"connect": [endpoint]}, "spool": str(folder / "spool.sqlite")}))
+    with (folder / "out").open("w+") as out:
+        process = subprocess.Popen([*EDGE, *words, "--config", str(config)], stdout=out, stderr=subprocess.DEVNULL)
+        _, _, cost = os.wait4(process.pid, 0)
+        out.seek(0)
+        counted = json.loads(out.read().splitlines()[-1])
+    if counted["unsettled"]:
+        raise ArithmeticError(f"{counted['unsettled']} batches were left unsettled")
+    return cost.ru_utime + cost.ru_stime, cost.ru_maxrss / 1024
+
+
+def live(folder: Path, endpoint: str) -> list[Figure]:
+    """One vehicle at 100 Hz: CPU between a short and a long run, so that the start does not count."""
+    log, vehicle = drive(folder, "live", 0, START_S + LIVE_S + 1.0)
+    words = ("run", "--source", str(log), "--vehicle", str(vehicle), "--name", "bench-car", "--duration")
+    short, _ = used(folder, endpoint, *words, str(START_S))
+    long, memory = used(folder, endpoint, *words, str(START_S + LIVE_S))
+    return [
+        Figure("bench.agent.core_share", (long - short) / LIVE_S, "of a core, 100 Hz", 0.03),
+        Figure("bench.agent.resident_mb", memory, "MB", 280),
+    ]
+
+
+def fleet(folder: Path, endpoint: str) -> list[Figure]:
+    """How many vehicles a core carries in real time: plant, estimator, publishing; the CPU of a whole fleet says it."""
+    words = ("fleet", "--rate", str(FLEET_RATE_HZ), "--vehicles", str(FLEET), "--duration")
+    short, _ = used(folder, endpoint, *words, str(START_S))
+    long, _ = used(folder, endpoint, *words, str(START_S + FLEET_S))
+    return [
+        Figure("bench.fleet.vehicles", FLEET * FLEET_S / (long - short), "vehicles at 50 Hz on a core", 200, "more")
+    ]
+
+
+def replay(folder: Path) -> list[Figure]:
+    """Share of the kernel's speed times two cores that a backfill of many logs reaches, Parquet included."""
+    logs = [drive(folder, f"log-{seed:02d}", seed, LOG_S) for seed in range(LOGS)]
+    log, vehicle = read_log(logs[0][0]), load_vehicle(logs[0][1])
+    block = next(log.blocks(0))
+    kernel = LOGS * median_s(lambda: bank_of("aco-fckf", [vehicle]).advance(block.t, block.signals), 3)
+    tasks = tasks_of([log for log, _ in logs], None, folder / "estimates")
+    whole = median_s(lambda: list(backfill(tasks, "aco-fckf", 2)), 3)
+    return [Figure("bench.replay.efficiency", kernel / (2 * whole), "of two cores at the kernel's speed", 0.5, "more")]

@@ -1,0 +1,217 @@
+"""`make analytics-bench`: archive and analytics on ten million synthetic observations, every bar of theirs in one file.
+
+Writes `.analytics/figures.json` and prints the table; `--rows` tries it with fewer. Durations are wall time on two
+threads, medians of ROUNDS; rows per second of the compaction are per CPU second.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+
+import geoparquet_validator
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pacsv
+
+from fleet_service.analytics import output, synthetic
+from fleet_service.analytics.engines import Engine
+from fleet_service.analytics.options import Options
+from fleet_service.analytics.questions import QUESTIONS
+from fleet_service.analytics.synthetic import DAY_S, START_NS, World
+from fleet_service.archive import reading, rollup, segments, snapshots
+from fleet_service.archive.compaction import compact
+from fleet_service.archive.export import Part
+from fleet_service.archive.rebuild import Since, replay
+from fleet_service.fusion import Fusion
+from fleet_service.map_state import cell_table
+from schemas import figures
+from schemas.figures import Figure
+from schemas.wire import Kind
+from tests.benchmarks.past import past
+from tests.fleet_service.analytics.agreement import differs
+from tests.fleet_service.archive.readers import READERS, by_spark
+
+FOLDER = Path(".analytics")
+ROWS, DAYS, ROUNDS, SEED = 10_000_000, 7, 3, 0
+TIMED = ("grip", "worst", "vehicles", "weather")
+CELLS_ASKED = 30
+SMALL = World(rows=24_000, days=2, vehicles=40, roads=8, length=60, icy=4)
+PART = Part(START_NS, START_NS + DAYS * DAY_S * 10**9)
+HALF = START_NS + DAY_S * 10**9
+
+
+def tell(line: str) -> None:
+    """Progress."""
+    print(f"  {line}", flush=True)
+
+
+def median_s(work: Callable[[], object], rounds: int = ROUNDS) -> float:
+    """Median duration [s]."""
+    spent = []
+    for _ in range(rounds):
+        began = time.perf_counter()
+        work()
+        spent.append(time.perf_counter() - began)
+    return float(np.median(spent))
+
+
+def stations(folder: Path) -> Path:
+    """Hourly readings of five stations."""
+    hours = np.arange(DAYS * 24)
+    names = np.repeat([f"station-{k}" for k in range(5)], len(hours))
+    place = np.repeat(np.arange(5), len(hours))
+    table = pa.table({
+        "station": names, "time": (np.tile(hours, 5) * 3600 + START_NS // 10**9).astype("datetime64[s]"),
+        "latitude": 57.6 + 0.1 * place, "longitude": 11.9 + 0.1 * place,
+        "temperature": np.tile(5.0 - 8.0 * synthetic.night(hours * 3600.0), 5) + 0.1 * place,
+    })  # fmt: skip
+    path = folder / "stations.csv"
+    pacsv.write_csv(table, path)
+    return path
+
+
+def archive(root: Path, rows: int) -> list[Figure]:
+    """Rows per second of compaction, bytes of an observation."""
+    tell(f"writing {rows:,} observations")
+    synthetic.write(root, World(rows, DAYS))
+    inbox = sum(path.stat().st_size for path in segments.paths(root, Kind.OBSERVATION))
+    began = time.process_time()
+    done = compact(root)
+    spent = time.process_time() - began
+    tell(f"compacted into {done.files} files")
+    size = sum(path.stat().st_size for path in (root / "observations").rglob("*.parquet"))
+    return [
+        Figure("archive.compaction_rows_per_s", done.rows / spent, "rows per CPU second", 400_000, "more"),
+        Figure("archive.bytes_per_observation", size / done.rows, "bytes", 60),
+        Figure("archive.bytes_per_observation.inbox", inbox / done.rows, "bytes"),
+    ]
+
+
+def questions(root: Path, readings: Path) -> list[Figure]:
+    """Seconds of four questions on all rows; milliseconds of the history of one cell."""
+    found = []
+    for name in TIMED:
+        options = Options(stations=readings, say=lambda _: None)
+        began = time.process_time()
+        spent = median_s(lambda name=name, options=options: QUESTIONS[name].ask(Engine("duckdb", root, PART), options))  # type: ignore[misc]
+        busy = (time.process_time() - began) / ROUNDS
+        tell(f"{name}: {spent:.2f} s, {busy:.2f} s of CPU")
+        found += [Figure(f"analytics.{name}_s", spent, "s", 5), Figure(f"analytics.{name}_cpu_s", busy, "s of CPU")]
+    t = Engine("duckdb", root, PART).observations()
+    cells = np.unique(next(reading.read(root, Kind.OBSERVATION, ["cell"]))["cell"].to_numpy())
+    chosen = np.random.default_rng(SEED).choice(cells, CELLS_ASKED)
+    columns = ("time", "vehicle", "mu", "mu_lower", "mu_upper", "mu_utilised")
+
+    def history(cell: int) -> None:
+        t.filter(t.cell == cell).select(*columns).order_by("time").to_pyarrow()
+
+    spent = np.median([median_s(lambda cell=int(cell): history(cell), 1) for cell in chosen])  # type: ignore[misc]
+    return [*found, Figure("analytics.one_cell_ms", float(spent) * 1e3, "ms", 50)]
+
+
+def small(root: Path) -> dict[int, pa.Table]:
+    """A small archive with snapshots; returns them by time."""
+    synthetic.write(root, SMALL, 4000)
+    compact(root)
+    rollup.complete(root)
+    maps = {}
+    for hour in (12, 24, 36):
+        now = START_NS + hour * 3600 * 10**9
+        fusion = Fusion(120.0)
+        for _ in replay(root, fusion, Since(until=now)):
+            pass
+        slots = np.flatnonzero(fusion.live.vehicles[: fusion.size] > 0)
+        maps[now] = cell_table(fusion, slots, now)
+        snapshots.write(root, maps[now], now)
+    return maps
+
+
+def agreement(root: Path, readings: Path) -> list[Figure]:
+    """Files that a validator refuses, readers that fail, questions that engines answer differently."""
+    invalid = sum(bool(_refused(path)) for path in _geo_files(root))
+    expected = sum(table.num_rows for table in reading.read(root, Kind.OBSERVATION, ["seq"]))
+    readers = READERS | ({"spark": by_spark} if find_spec("pyspark") else {})
+    failed = sum(not _reads(reader, root, expected) for reader in readers.values())
+    tell(f"readers: {', '.join(readers)}")
+    different = _different(root, readings) if find_spec("pyspark") else float("nan")
+    return [
+        Figure("archive.geoparquet_invalid", invalid, "files", 0),
+        Figure("archive.readers_failed", failed, f"of {len(readers)} tools", 0),
+        Figure("analytics.engines_differ", different, f"of {len(QUESTIONS) - 1} questions", 0),
+    ]
+
+
+def _geo_files(root: Path) -> Iterator[Path]:
+    yield from (root / "map").rglob("*.parquet")
+    for name in ("worst", "spells", "grip"):
+        path = root.parent / f"{name}.geo.parquet"
+        answer = QUESTIONS[name].ask(Engine("duckdb", root, PART), Options(say=lambda _: None))
+        output.write(answer, QUESTIONS[name], path)
+        yield path
+
+
+def _refused(path: Path) -> list[str]:
+    report = geoparquet_validator.check(str(path))
+    return [*geoparquet_validator.failed(report, "core"), *geoparquet_validator.failed(report, "covering")]
+
+
+def _reads(reader: Callable[[Path], tuple[float, ...]], root: Path, expected: int) -> bool:
+    try:
+        return reader(root)[0] == expected
+    except Exception as error:  # noqa: BLE001 whatever a tool of others raises is what is counted
+        tell(f"{reader.__name__}: {error}")
+        return False
+
+
+def _different(root: Path, readings: Path) -> int:
+    count = 0
+    for question in QUESTIONS.values():
+        if question.name == "replay":  # asks no engine
+            continue
+        options = Options(at=HALF, stations=readings, say=lambda _: None)
+        answers = [question.ask(Engine(name, root, PART), options) for name in ("duckdb", "spark")]
+        said = differs(*answers, question)
+        tell(f"{question.name}: {said or 'the engines agree'}")
+        count += said is not None
+    return count
+
+
+@contextmanager
+def folder() -> Iterator[Path]:
+    """An empty folder for the archives; they are gone afterwards, the figures stay."""
+    FOLDER.mkdir(exist_ok=True)
+    work = FOLDER / "work"
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir()
+    try:
+        yield work
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def main() -> int:
+    """Measure everything; exit code 1 where a bar does not hold."""
+    parser = argparse.ArgumentParser(prog="make analytics-bench", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--rows", type=int, default=ROWS, help="observations (default ten million)")
+    rows = parser.parse_args().rows
+    with folder() as work:
+        readings = stations(work)
+        found = archive(work / "large", rows)
+        found += questions(work / "large", readings)
+        small(work / "small")
+        found += agreement(work / "small", readings)
+        found += past(work / "past", tell)
+    figures.write(FOLDER / "figures.json", "analytics", [SEED], found)
+    print(f"\n{figures.markdown(found)}\n\n{FOLDER}/figures.json")
+    return 0 if all(figure.holds for figure in found if figure.bar is not None) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,31 @@
+"""What an estimator costs per vehicle and sample."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edge_agent.banks import bank_of
+from edge_agent.simulation import simulate_manoeuvre
+from schemas.figures import Figure
+from schemas.numeric import FloatArray
+from schemas.signals import CHANNELS
+from tests.benchmarks.measure import SEED, median_s
+
+
+def estimators() -> list[Figure]:
+    """Microseconds per vehicle and sample of the default estimator, for one vehicle and for a bank."""
+    log, vehicle = simulate_manoeuvre("double-lane-change", seed=SEED)
+    signals = np.stack([log[name].to_numpy(zero_copy_only=False) for name in CHANNELS], axis=-1)[:, None, :]
+    t: FloatArray = log["t"].to_numpy()[:, None]
+
+    def drive(n: int, samples: int) -> float:
+        block, times = np.repeat(signals[:samples], n, axis=1), np.repeat(t[:samples], n, axis=1)
+        seconds = median_s(lambda: bank_of("aco-fckf", [vehicle] * n).advance(times, block), 3)
+        return seconds / (n * samples) * 1e6
+
+    one, many = drive(1, len(t)), drive(200, 100)
+    return [
+        Figure("bench.aco_fckf.us", one, "us per vehicle-step, N = 1", 40),
+        Figure("bench.aco_fckf.flatness", many / one, "N = 200 over N = 1", 1.2),
+        Figure("bench.replay.real_time", 1e6 / (100 * one), "times real time at 100 Hz"),
+    ]

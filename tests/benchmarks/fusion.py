@@ -1,0 +1,93 @@
+"""What the fusion costs per observation: folding, settling and reputation included. Processor time of one thread."""
+
+from __future__ import annotations
+
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from fleet_service.fusion import Fusion, Observations
+from schemas import grid, mugrid
+from schemas.figures import Figure
+from tests.benchmarks.measure import ROUNDS, SEED
+
+BATCH = 5_000  # rows of a turn of the service under load
+VEHICLES = 5_000
+EXCITED = 1 / 9  # visits that give a value
+SECOND = 10**9
+START = 1_800_000_000 * SECOND
+CELLS = 1_000_000
+
+
+def visits(rng: np.random.Generator, rows: int, cells: int, begin_s: float, seconds: float) -> Observations:
+    """Visits to cells of a square, anywhere in `seconds`, in order of time."""
+    side = int(np.ceil(np.sqrt(cells)))
+    x, y = grid.deinterleave(grid.cell_of(57.7, 11.97))
+    k, vehicle = rng.integers(0, cells, rows), rng.integers(0, VEHICLES, rows)
+    cell = grid.interleave(x + k % side, y + k // side)
+    time_ns = START + np.sort(((begin_s + seconds * rng.random(rows)) * SECOND).astype(np.int64))
+    mu = rng.uniform(0.2, 0.9, rows)[:, None]
+    value = -0.5 * np.square((mugrid.CENTRES - mu) / 0.06)
+    bound = np.where(0.4 * mu > mugrid.CENTRES, -6.0, 0.0)
+    evidence = mugrid.encode_log_likelihood(np.where((rng.random(rows) < EXCITED)[:, None], value, bound))
+    return Observations(
+        time_ns, cell, np.zeros(rows, np.int8), np.full(rows, -1, np.int8), vehicle, vehicle + 1, grid.region_of(cell),
+        np.arange(rows), evidence, np.full((rows, 1), -1), np.zeros((rows, 1), np.float32),
+    )  # fmt: skip
+
+
+def filled(cells: int, per_cell: int, seconds: float) -> tuple[Fusion, np.random.Generator]:
+    """A fusion that heard so many visits of each cell, and the generator to go on with."""
+    rng, fusion = np.random.default_rng(SEED), Fusion(120.0)
+    parts = max(cells * per_cell // 100_000, 1)
+    for part in range(parts):
+        for batch in batches(visits(rng, cells * per_cell // parts, cells, part * seconds / parts, seconds / parts)):
+            fusion.fold(batch)
+    return fusion, rng
+
+
+def batches(o: Observations) -> Iterator[Observations]:
+    """Turns of the service."""
+    for rows in np.array_split(np.arange(len(o.time)), max(len(o.time) // BATCH, 1)):
+        yield o.take(rows)
+
+
+def per_observation_s(cells: int, per_s: int = 5_000) -> float:
+    """Processor seconds per observation in a fusion of so many cells: median over ROUNDS minutes."""
+    fusion, rng = filled(cells, 1, 600.0)
+    spent = []
+    for minute in range(ROUNDS + 3):  # until the window is full
+        parts = list(batches(visits(rng, 60 * per_s, cells, 660.0 + 60.0 * minute, 60.0)))
+        began = time.process_time()
+        for part in parts:
+            fusion.fold(part)
+        spent.append((time.process_time() - began) / (60 * per_s))
+    return statistics.median(spent[3:])
+
+
+def resident() -> None:
+    """Print the resident memory [MB] of a service's process with 10⁶ cells of three visits in a day."""
+    import fleet_service.service  # noqa: F401 what a service has loaded
+    from fleet_service.map_state import MapState
+
+    fusion, _ = filled(CELLS, 3, 86_400.0)
+    MapState(fusion).tiles()
+    with open("/proc/self/status") as status:  # noqa: PTH123
+        kilobytes = next(int(line.split()[1]) for line in status if line.startswith("VmRSS"))
+    print(kilobytes * 1024 / 1e6, fusion.size)
+
+
+def fusion() -> list[Figure]:
+    """Observations per second of the fusion alone into 10⁶ cells, what more cells do to it, and their memory."""
+    few, many = per_observation_s(10_000), per_observation_s(CELLS)
+    command = [sys.executable, "-c", "from tests.benchmarks.fusion import resident; resident()"]
+    megabytes, _ = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
+    return [
+        Figure("bench.fusion.per_s", 1.0 / many, "observations/s, settling included", 1_000_000, "more"),
+        Figure("bench.growth.cells_ratio", many / few, "cost in 10^6 cells over that in 10^4", 1.3),
+        Figure("bench.state.resident_mb", float(megabytes), "MB, a service's process with 10^6 cells", 400),
+    ]

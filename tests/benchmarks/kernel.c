@@ -1,0 +1,144 @@
+/* The limit for a Python filter: `paper-aco-fckf` as one would write it by hand in C, bare of checks and reports.
+
+   State x = [v_x, v_y, a_x, a_y, r, mu], four Dugoff tyres, twelve cubature points carried by Heun's rule, square-root
+   prediction and update by Householder reflections, R adapted by five fuzzy sets. One vehicle is one struct.
+   Equations and legend: edge_agent/estimators/paper_aco_fckf.py, gaussian/planar.py, dynamics, filters/squareroot.py. */
+
+#include <math.h>
+
+enum { N = 6, POINTS = 12, ROWS = 3, WIDE = POINTS + N };
+enum { MASS, INERTIA, TO_FRONT, TO_REAR, TRACK_FRONT, TRACK_REAR, HEIGHT, RADIUS, WHEEL_INERTIA, SLOPE_X, SLOPE_Y };
+enum { AX, AY, RATE, DELTA, OMEGA = DELTA + 4, INPUTS = OMEGA + 4 };
+
+typedef struct {
+    double mean[N], root[N][N], actual[ROWS], theoretical[ROWS], factor[ROWS], before[INPUTS];
+} Filter;
+
+typedef struct {
+    double process[N], noise[ROWS], sets_in[5], sets_out[5], least, largest, step_s, window_s, lower, upper, mu_std;
+} Setting;
+
+static double clip(double v, double low, double high) { return v < low ? low : v > high ? high : v; }
+
+static void respond(const double *p, double vx, double vy, double r, double ax, double ay, const double *c,
+                    const double *s, const double *omega, double mu, double *out) {
+    double base = p[TO_FRONT] + p[TO_REAR], weight = p[MASS] * 9.81, pitch = p[MASS] * ax * p[HEIGHT] / base;
+    double front = weight * p[TO_REAR] / base - pitch, rear = weight * p[TO_FRONT] / base + pitch;
+    double roll = ay * p[HEIGHT] / 9.81, least = 0.02 * weight / 4.0, fx = 0.0, fy = 0.0, moment = 0.0;
+    for (int w = 0; w < 4; w++) {
+        double axle = w < 2 ? front : rear, track = w < 2 ? p[TRACK_FRONT] : p[TRACK_REAR];
+        double left = w % 2 ? -1.0 : 1.0, x = w < 2 ? p[TO_FRONT] : -p[TO_REAR], y = left * 0.5 * track;
+        double load = fmax(0.5 * axle - left * axle * roll / track, least), grip = mu * load;
+        double ahead = vx - y * r, aside = vy + x * r;
+        double along = c[w] * ahead + s[w] * aside, across = c[w] * aside - s[w] * ahead;
+        double speed = fmax(fabs(along), 0.5);
+        double tx = p[SLOPE_X] * load * (p[RADIUS] * omega[w] - along) / speed / grip;
+        double ty = p[SLOPE_Y] * load * -across / speed / grip, theta = sqrt(tx * tx + ty * ty);
+        double gain = theta < 1e-12 ? 0.0 : grip * (theta <= 0.5 ? 1.0 : (1.0 - 0.25 / theta) / theta);
+        double f_ahead = c[w] * gain * tx - s[w] * gain * ty, f_left = s[w] * gain * tx + c[w] * gain * ty;
+        fx += f_ahead, fy += f_left, moment += x * f_left - y * f_ahead;
+    }
+    out[0] = fx / p[MASS], out[1] = fy / p[MASS], out[2] = moment / p[INERTIA];
+}
+
+static void lower_triangle(double *a, int rows, int columns, int stride) {
+    for (int i = 0; i < rows; i++) {
+        double *u = a + i * stride, square = 0.0;
+        for (int j = i + 1; j < columns; j++) square += u[j] * u[j];
+        if (square > 0.0) {
+            double head = u[i], norm = sqrt(head * head + square);
+            double pivot = head <= 0.0 ? head - norm : -square / (head + norm), gain = 2.0 / (square + pivot * pivot);
+            for (int k = i + 1; k < rows; k++) {
+                double *v = a + k * stride, dot = v[i] * pivot;
+                for (int j = i + 1; j < columns; j++) dot += v[j] * u[j];
+                dot *= gain;
+                v[i] -= dot * pivot;
+                for (int j = i + 1; j < columns; j++) v[j] -= dot * u[j];
+            }
+            u[i] = norm;
+            for (int j = i + 1; j < columns; j++) u[j] = 0.0;
+        } else if (u[i] < 0.0) {
+            for (int k = i; k < rows; k++) a[k * stride + i] *= -1.0;
+        }
+    }
+}
+
+static double infer(double mismatch, const double *in, const double *out) {
+    if (mismatch <= in[0]) return out[0];
+    for (int k = 0; k < 4; k++)
+        if (mismatch < in[k + 1]) {
+            double share = (mismatch - in[k]) / (in[k + 1] - in[k]);
+            return (1.0 - share) * out[k] + share * out[k + 1];
+        }
+    return out[4];
+}
+
+static void step(Filter *f, const double *p, const Setting *z, const double *now, double gone) {
+    double x[POINTS][N], c[2][4], s[2][4], work[N + ROWS][WIDE] = {{0}}, pace = gone / z->step_s, spread = sqrt(N);
+    const double *ends[2] = {f->before, now};
+    for (int e = 0; e < 2; e++)
+        for (int w = 0; w < 4; w++) c[e][w] = cos(ends[e][DELTA + w]), s[e][w] = sin(ends[e][DELTA + w]);
+    for (int k = 0; k < POINTS; k++) {
+        double sign = k < N ? spread : -spread, a[3], b[3], *v = x[k];
+        for (int i = 0; i < N; i++) v[i] = f->mean[i] + sign * f->root[i][k % N];
+        double mu = clip(v[5], z->lower, z->upper);
+        respond(p, v[0], v[1], v[4], v[2], v[3], c[0], s[0], ends[0] + OMEGA, mu, a);
+        double kx = v[2] + v[4] * v[1], ky = v[3] - v[4] * v[0];
+        double vx = v[0] + gone * kx, vy = v[1] + gone * ky, r = v[4] + gone * a[2];
+        respond(p, vx, vy, r, v[2], v[3], c[1], s[1], now + OMEGA, mu, b);
+        double nx = v[0] + 0.5 * gone * (kx + b[0] + r * vy), ny = v[1] + 0.5 * gone * (ky + b[1] - r * vx);
+        v[4] += 0.5 * gone * (a[2] + b[2]), v[0] = nx, v[1] = ny;
+        respond(p, v[0], v[1], v[4], v[2], v[3], c[1], s[1], now + OMEGA, mu, a);
+        v[2] = a[0], v[3] = a[1];
+    }
+    for (int i = 0; i < N; i++) {
+        double total = 0.0;
+        for (int k = 0; k < POINTS; k++) total += (x[k][i] - x[0][i]) / POINTS;
+        f->mean[i] = x[0][i] + total;
+        for (int k = 0; k < POINTS; k++) work[i][k] = (x[k][i] - f->mean[i]) / sqrt(POINTS);
+        work[i][POINTS + i] = z->process[i] * sqrt(pace);
+    }
+    lower_triangle(&work[0][0], N, WIDE, WIDE);
+    for (int i = 0; i < N; i++)
+        for (int j = 0; j < N; j++) f->root[i][j] = j <= i ? work[i][j] : 0.0;
+    double joint[N + ROWS][N + ROWS] = {{0}}, white[ROWS], keep = pow(0.5, gone / z->window_s);
+    for (int q = 0; q < ROWS; q++) {
+        double variance = 0.0, miss;
+        for (int j = 0; j < N; j++) joint[q][j] = f->root[2 + q][j], variance += joint[q][j] * joint[q][j];
+        miss = white[q] = now[q] - f->mean[2 + q];
+        joint[q][N + q] = sqrt(f->factor[q] * z->noise[q]);
+        f->actual[q] = keep * f->actual[q] + (1.0 - keep) * miss * miss;
+        f->theoretical[q] = keep * f->theoretical[q] + (1.0 - keep) * (variance + f->factor[q] * z->noise[q]);
+        double more = pace * infer(f->actual[q] / f->theoretical[q] - 1.0, z->sets_in, z->sets_out);
+        f->factor[q] = clip(f->factor[q] * exp(more), z->least, z->largest);
+    }
+    for (int i = 0; i < N; i++)
+        for (int j = 0; j <= i; j++) joint[ROWS + i][j] = f->root[i][j];
+    lower_triangle(&joint[0][0], N + ROWS, N + ROWS, N + ROWS);
+    for (int q = 0; q < ROWS; q++) {
+        for (int j = 0; j < q; j++) white[q] -= joint[q][j] * white[j];
+        white[q] /= joint[q][q];
+        for (int i = 0; i < N; i++) f->mean[i] += joint[ROWS + i][q] * white[q];
+    }
+    for (int i = 0; i < N; i++)
+        for (int j = 0; j < N; j++) f->root[i][j] = j <= i ? joint[ROWS + i][ROWS + j] : 0.0;
+    f->mean[5] = clip(f->mean[5], z->lower, z->upper);
+    double square = 0.0;
+    for (int j = 0; j < N; j++) square += f->root[5][j] * f->root[5][j];
+    if (sqrt(square) > z->mu_std)
+        for (int j = 0; j < N; j++) f->root[5][j] *= z->mu_std / sqrt(square);
+    for (int i = 0; i < INPUTS; i++) f->before[i] = now[i];
+}
+
+/* readings (samples, vehicles, INPUTS), parameters (vehicles, 12), out (samples, vehicles, N): the means. */
+void drive(Filter *filters, const double *parameters, const Setting *z, const double *readings, double gone, int samples,
+           int vehicles, double *out) {
+#pragma omp parallel for schedule(static)
+    for (int n = 0; n < vehicles; n++)
+        for (int k = 0; k < samples; k++) {
+            step(filters + n, parameters + 12 * n, z, readings + ((long)k * vehicles + n) * INPUTS, gone);
+            for (int i = 0; i < N; i++) out[((long)k * vehicles + n) * N + i] = filters[n].mean[i];
+        }
+}
+
+int filter_bytes(void) { return sizeof(Filter); }

@@ -1,0 +1,119 @@
+"""The map as it was, over Zenoh, and the map after a restart beside the one before."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import zenoh
+
+from deploy.router import open_router
+from fleet_service.analytics import synthetic
+from fleet_service.analytics.synthetic import DAY_S, START_NS, World
+from fleet_service.archive.compaction import compact
+from fleet_service.engine import Engine
+from fleet_service.service import Service
+from schemas import grid, keys
+from schemas.config import ServiceConfig, ZenohSettings
+from schemas.figures import Figure
+from schemas.transport import open_session
+from tests.waiting import until
+
+WORLD = World(1_000_000, days=3)
+SIDE, QUERIES = 320, 15  # cells of a box's side: a thousand of them were visited
+
+
+def past(root: Path, tell: Callable[[str], None]) -> list[Figure]:
+    """Milliseconds of `at=` for a box of a thousand cells; largest change of a probability by a restart."""
+    synthetic.write(root, WORLD)
+    compact(root)
+    synthetic.write(root, World(20_000, 1, seed=1))  # rows that are not compacted yet
+    with closing(Engine(ServiceConfig(), root)) as engine:
+        before = _beliefs(engine)
+    with closing(Engine(ServiceConfig(), root)) as engine:
+        after = _beliefs(engine)
+    difference = _largest(before, after)
+    tell(f"restart: {len(before[0])} cells, {difference:.1e}")
+    spent, cells = _asked(root)
+    tell(f"at=: {np.round(np.array(spent) * 1e3)} ms, {cells} cells")
+    return [
+        Figure("archive.at_query_p50_ms", float(np.median(spent)) * 1e3, f"ms, {cells} cells", 500),
+        Figure("archive.restart_difference", difference, "probability", 1e-6),
+    ]
+
+
+def _beliefs(engine: Engine) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[type-arg]
+    fusion = engine.fusion
+    slots = np.arange(fusion.size)
+    order = np.lexsort((fusion.sector[slots], fusion.cell[slots]))
+    return (fusion.cell[slots] * grid.SECTORS + fusion.sector[slots])[order], fusion.beliefs(slots, END)[order]
+
+
+END = START_NS + WORLD.days * DAY_S * 10**9
+
+
+def _largest(before: tuple[np.ndarray, np.ndarray], after: tuple[np.ndarray, np.ndarray]) -> float:  # type: ignore[type-arg]
+    if len(before[0]) != len(after[0]) or (before[0] != after[0]).any():
+        return 1.0
+    return float(np.abs(before[1] - after[1]).max())
+
+
+@contextmanager
+def _service(root: Path) -> Iterator[zenoh.Session]:
+    """A client of a running service on the archive."""
+    router, endpoints = open_router(listen="tcp/127.0.0.1:0")
+    settings = ZenohSettings(connect=endpoints)
+    lines: list[str] = []
+    stop = threading.Event()
+    with router:
+        service = Service(ServiceConfig(zenoh=settings, compact_s=0.0, snapshot_s=0.0), root, lines.append)
+        thread = threading.Thread(target=service.run, args=(stop,))
+        thread.start()
+        try:
+            until(lambda: any(line.startswith("ready") for line in lines), 300.0)
+            session = open_session(settings)
+            assert session is not None
+            with session:
+                yield session
+        finally:
+            stop.set()
+            thread.join()
+
+
+def _answer(session: zenoh.Session, selector: str) -> tuple[float, list[pa.Table]]:
+    """Seconds of an answer, and its tiles; asks again while the past before is being put away."""
+    while True:
+        began = time.perf_counter()
+        replies = list(session.get(selector, timeout=120.0))
+        seconds = time.perf_counter() - began
+        refused = [reply.err.payload.to_string() for reply in replies if reply.err]
+        if not refused:
+            payloads = [reply.ok.payload.to_bytes() for reply in replies if reply.ok]
+            return seconds, [pa.ipc.open_stream(payload).read_all() for payload in payloads]
+        if "another past" not in refused[0]:
+            raise RuntimeError(refused[0])
+
+
+def _asked(root: Path) -> tuple[list[float], int]:
+    """Seconds of each query, and cells of the answers."""
+    rng = np.random.default_rng(0)
+    step = 360.0 / (1 << grid.CELL_ZOOM)
+    spent, cells = [], 0
+    with _service(root) as session:
+        for _ in range(QUERIES):
+            row, column = int(rng.integers(0, 8)) * 2, int(rng.integers(0, 8))
+            west = synthetic.LONGITUDE + column * 260 * step
+            south = synthetic.LATITUDE + row * 260 * step * np.cos(np.radians(synthetic.LATITUDE))
+            box = (west, south, west + SIDE * step, south + SIDE * step * np.cos(np.radians(synthetic.LATITUDE)))
+            at = datetime.fromtimestamp(START_NS // 10**9 + int(rng.integers(DAY_S, WORLD.days * DAY_S)), UTC)
+            selector = f"{keys.ROOT}/map/**?bbox={','.join(f'{v:.6f}' for v in box)};at={at:%Y-%m-%dT%H:%M:%SZ}"
+            seconds, tables = _answer(session, selector)
+            spent.append(seconds)
+            cells += sum(table.num_rows for table in tables)
+    return spent, cells // QUERIES

@@ -1,0 +1,127 @@
+"""The same filter (f, h, Q and R) as people would write it in numpy, or take it from a library."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import datetime, timedelta
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from edge_agent.estimators.paper_aco_fckf import STEP_S, Setting
+from schemas.numeric import FloatArray
+from tests.benchmarks.reference import measured, move
+
+PYTHON_STEPS = 300  # enough for a median: these are slow
+
+
+class Problem(NamedTuple):
+    """What a peer is given."""
+
+    row: FloatArray  # (12,) of the vehicle
+    readings: FloatArray  # (T, 11)
+    gone: float  # [s] between samples
+    speed: float  # [m/s] at the first
+
+    def start(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Mean (6,), covariance (6, 6), Q (6, 6) per sample and R (3, 3)."""
+        setting = Setting()
+        mean = np.array([self.speed, 0.0, *self.readings[0, :3], setting.mu])
+        noise = np.diag(setting.process) * self.gone / STEP_S
+        return mean, np.diag(setting.start), noise, np.diag(setting.noise)
+
+
+class Peer(NamedTuple):
+    """A peer and how many times as fast the bank shall be."""
+
+    drive: Callable[[Problem], object]
+    bar: float
+
+
+def by_numpy(problem: Problem) -> FloatArray:
+    """A cubature filter on numpy arrays, its points moved together; the mean at the end (6,)."""
+    mean, cov, noise, R = problem.start()
+    n = len(mean)
+    xi = np.sqrt(n) * np.concatenate([np.eye(n), -np.eye(n)])
+    for k in range(1, PYTHON_STEPS + 1):
+        before, now = problem.readings[k - 1], problem.readings[k]
+        points = move(mean + xi @ np.linalg.cholesky(cov).T, problem.row, before, now, problem.gone)
+        mean = points.mean(0)
+        cov = (points - mean).T @ (points - mean) / len(xi) + noise
+        points = mean + xi @ np.linalg.cholesky(cov).T
+        outcomes = measured(points)
+        expected = outcomes.mean(0)
+        S = (outcomes - expected).T @ (outcomes - expected) / len(xi) + R
+        K = np.linalg.solve(S, (outcomes - expected).T @ (points - mean) / len(xi)).T
+        mean = mean + K @ (now[:3] - expected)
+        cov = cov - K @ S @ K.T
+    return mean
+
+
+def by_filterpy(problem: Problem) -> FloatArray:
+    """filterpy's cubature filter; the mean at the end (6, 1)."""
+    from filterpy.kalman import CubatureKalmanFilter
+
+    inputs: dict[str, FloatArray] = {}
+
+    def f(x: FloatArray, gone: float) -> FloatArray:
+        return move(x.reshape(1, -1), problem.row, inputs["before"], inputs["now"], gone).reshape(x.shape)
+
+    def h(x: FloatArray) -> FloatArray:
+        return measured(x.reshape(1, -1)).reshape(3, *x.shape[1:])
+
+    made = CubatureKalmanFilter(6, 3, problem.gone, h, f)
+    mean, made.P, made.Q, made.R = problem.start()
+    made.x = mean.reshape(made.x.shape)
+    for k in range(1, PYTHON_STEPS + 1):
+        inputs["before"], inputs["now"] = problem.readings[k - 1], problem.readings[k]
+        made.predict()
+        made.update(problem.readings[k, :3].reshape(made.z.shape if made.z.size == 3 else (3, 1)))
+    return np.asarray(made.x)
+
+
+def by_stonesoup(problem: Problem) -> FloatArray:
+    """Stone Soup's cubature predictor and updater; the mean at the end (6, 1)."""
+    from stonesoup.models.measurement.linear import LinearGaussian
+    from stonesoup.models.transition.base import TransitionModel
+    from stonesoup.predictor.kalman import CubatureKalmanPredictor
+    from stonesoup.types.detection import Detection
+    from stonesoup.types.hypothesis import SingleHypothesis
+    from stonesoup.types.state import GaussianState
+    from stonesoup.updater.kalman import CubatureKalmanUpdater
+
+    mean, cov, noise, R = problem.start()
+    inputs: dict[str, FloatArray] = {}
+
+    class Motion(TransitionModel):  # type: ignore[misc]
+        """f with Q."""
+
+        ndim_state = 6
+
+        def function(self, state: Any, noise: bool = False, **rest: object) -> Any:  # noqa: ANN401
+            points = np.asarray(state.state_vector, dtype=float)
+            moved = move(points.T, problem.row, inputs["before"], inputs["now"], problem.gone).T
+            return type(state.state_vector)(moved)
+
+        def covar(self, **rest: object) -> FloatArray:
+            return noise
+
+        def rvs(self, *args: object, **rest: object) -> FloatArray:
+            return np.zeros((6, 1))
+
+        def pdf(self, *args: object, **rest: object) -> float:
+            return 0.0
+
+    predictor = CubatureKalmanPredictor(Motion())
+    updater = CubatureKalmanUpdater(LinearGaussian(6, (2, 3, 4), R))
+    began = datetime(2026, 1, 1)
+    state = GaussianState(mean.reshape(-1, 1), cov, began)
+    for k in range(1, PYTHON_STEPS + 1):
+        inputs["before"], inputs["now"] = problem.readings[k - 1], problem.readings[k]
+        moment = began + timedelta(seconds=k * problem.gone)
+        told = Detection(problem.readings[k, :3].reshape(-1, 1), timestamp=moment)
+        state = updater.update(SingleHypothesis(predictor.predict(state, moment), told))
+    return np.asarray(state.state_vector, dtype=float)
+
+
+PEERS = {"numpy": Peer(by_numpy, 100), "filterpy": Peer(by_filterpy, 500), "stonesoup": Peer(by_stonesoup, 500)}

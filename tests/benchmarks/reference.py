@@ -1,0 +1,58 @@
+"""The same process and measurement as kernel.c in numpy, for the filters that people would take from a library."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edge_agent.dynamics.parameters import GRAVITY, P
+from schemas.mugrid import LOWER, UPPER
+from schemas.numeric import FloatArray
+
+RATE, DELTA, OMEGA = 2, 3, 7
+
+
+def move(points: FloatArray, row: FloatArray, before: FloatArray, now: FloatArray, gone: float) -> FloatArray:
+    """f: states (P, 6) after `gone` [s] by Heun's rule; row (12,), before and now (11,)."""
+    mu = np.clip(points[:, 5], LOWER, UPPER)
+    vx, vy, ax, ay, rate = points[:, 0], points[:, 1], points[:, 2], points[:, 3], points[:, 4]
+    _, _, turn = respond(row, vx, vy, rate, ax, ay, before, mu)
+    slope_x, slope_y = ax + rate * vy, ay - rate * vx
+    x, y, r = vx + gone * slope_x, vy + gone * slope_y, rate + gone * turn
+    bx, by, again = respond(row, x, y, r, ax, ay, now, mu)
+    new_x, new_y = vx + 0.5 * gone * (slope_x + bx + r * y), vy + 0.5 * gone * (slope_y + by - r * x)
+    new_rate = rate + 0.5 * gone * (turn + again)
+    felt_x, felt_y, _ = respond(row, new_x, new_y, new_rate, ax, ay, now, mu)
+    return np.stack([new_x, new_y, felt_x, felt_y, new_rate, points[:, 5]], axis=1)
+
+
+def respond(
+    row: FloatArray, vx: FloatArray, vy: FloatArray, rate: FloatArray, ax: FloatArray, ay: FloatArray,
+    readings: FloatArray, mu: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    """(a_x, a_y, yaw acceleration), each (P,), of four Dugoff tyres."""
+    front = np.array([True, True, False, False])
+    left = np.array([1.0, -1.0, 1.0, -1.0])
+    base, weight = row[P.TO_FRONT] + row[P.TO_REAR], row[P.MASS] * GRAVITY
+    pitch = (row[P.MASS] * ax * row[P.CG_HEIGHT] / base)[:, None]
+    axle = np.where(front, weight * row[P.TO_REAR] / base - pitch, weight * row[P.TO_FRONT] / base + pitch)
+    track = np.where(front, row[P.TRACK_FRONT], row[P.TRACK_REAR])
+    roll = (ay * row[P.CG_HEIGHT] / GRAVITY)[:, None]
+    load = np.maximum(0.5 * axle - left * axle * roll / track, 0.02 * weight / 4.0)
+    x, y = np.where(front, row[P.TO_FRONT], -row[P.TO_REAR]), left * 0.5 * track
+    cos, sin = np.cos(readings[DELTA:OMEGA]), np.sin(readings[DELTA:OMEGA])
+    ahead, aside = vx[:, None] - y * rate[:, None], vy[:, None] + x * rate[:, None]
+    along, across = cos * ahead + sin * aside, cos * aside - sin * ahead
+    speed, grip = np.maximum(np.abs(along), 0.5), mu[:, None] * load
+    theta_x = row[P.SLOPE_X] * load * (row[P.RADIUS] * readings[OMEGA:] - along) / speed / grip
+    theta_y = row[P.SLOPE_Y] * load * -across / speed / grip
+    theta = np.maximum(np.hypot(theta_x, theta_y), 1e-12)
+    gain = grip * np.where(theta <= 0.5, theta, 1.0 - 0.25 / theta) / theta
+    force_x, force_y = gain * theta_x, gain * theta_y
+    f_ahead, f_left = cos * force_x - sin * force_y, sin * force_x + cos * force_y
+    moment = x * f_left - y * f_ahead
+    return f_ahead.sum(1) / row[P.MASS], f_left.sum(1) / row[P.MASS], moment.sum(1) / row[P.YAW_INERTIA]
+
+
+def measured(points: FloatArray) -> FloatArray:
+    """h: a_x, a_y and yaw rate (P, 3) of states (P, 6)."""
+    return points[:, 2:5]

@@ -1,0 +1,175 @@
+"""What the running service answers under load: queries beside a bare queryable, and alerts from publish to subscriber.
+
+Router, service, load, bare queryable and client are processes of their own, as in life.
+"""
+
+from __future__ import annotations
+
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from queue import SimpleQueue
+
+import numpy as np
+import zenoh
+
+from deploy.router import open_router
+from schemas import grid, keys, mugrid, wire
+from schemas.config import ZenohSettings
+from schemas.figures import Figure
+from schemas.transport import open_session
+from schemas.wire import Batch, Kind
+
+RATE = 20_000  # observations/s of the load
+ROWS = 10  # of a message
+VEHICLES = 500
+CELLS = 1_000
+QUERIES, ALERTS = 200, 60
+BARE = "gripmap-bare/tile"
+LATITUDE, LONGITUDE = 57.7, 11.97
+SECOND = 10**9
+_TILE = int(grid.tile_of(grid.cell_of(LATITUDE, LONGITUDE)))
+_X, _Y = (int(v) for v in grid.deinterleave(grid.from_quadkey(grid.quadkey(_TILE, grid.TILE_ZOOM) + "0" * 7)))
+
+
+def batch(vehicle: str, seq: int, column: np.ndarray, row: np.ndarray, ice: bool) -> Batch:
+    """Visits to cells of the tile, just now: what was used, or ice."""
+    cell = grid.interleave(_X + column.astype(np.int64), _Y + row.astype(np.int64))
+    latitude, longitude = grid.centre(cell)
+    n, now = len(cell), time.time_ns()
+    shape = -0.5 * np.square((mugrid.CENTRES - 0.15) / 0.04) if ice else np.where(mugrid.CENTRES < 0.2, -6.0, 0.0)
+    columns = {
+        "enter_time": np.full(n, now - SECOND), "leave_time": np.full(n, now), "cell": cell,
+        "sector": np.zeros(n, np.int8), "latitude": latitude, "longitude": longitude,
+        "position_std": np.ones(n, np.float32), "yaw": np.zeros(n, np.float32), "speed": np.full(n, 12.0, np.float32),
+        "mu_utilised": np.full(n, 0.15 if ice else 0.2, np.float32),
+        "log_likelihood": np.tile(mugrid.encode_log_likelihood(shape), (n, 1)),
+    }  # fmt: skip
+    return Batch(Kind.OBSERVATION, vehicle, 1 + sum(vehicle.encode()), int(grid.region_of(cell[0])), seq, seq, columns)
+
+
+def publish(session: zenoh.Session, one: Batch) -> None:
+    """Put a batch on its vehicle's key."""
+    session.put(keys.observation_key(one.region, one.vehicle), wire.encode(one), encoding=wire.ENCODING[one.kind])
+
+
+def load(endpoint: str) -> None:
+    """Send RATE observations a second of unexcited visits to CELLS cells until this process is ended."""
+    rng, seq, began, sent = np.random.default_rng(0), 0, time.monotonic(), 0
+    session = open_session(ZenohSettings(connect=[endpoint]))
+    assert session is not None
+    while True:
+        seq += 1
+        for vehicle in range(VEHICLES):
+            at = rng.integers(0, 40, ROWS), rng.integers(0, 25, ROWS)
+            publish(session, batch(f"load-{vehicle:04d}", seq, *at, False))
+            sent += ROWS
+            time.sleep(max(began + sent / RATE - time.monotonic(), 0.0))
+
+
+def bare(endpoint: str, payload: str) -> None:
+    """Answer with a file's bytes and nothing else until this process is ended."""
+    session, data = open_session(ZenohSettings(connect=[endpoint])), Path(payload).read_bytes()
+    assert session is not None
+
+    def reply(asked: zenoh.Query) -> None:
+        with asked:
+            asked.reply(BARE, data)
+
+    session.declare_queryable(BARE, reply, complete=True)
+    sys.stdin.read()
+
+
+@contextmanager
+def process(*words: str) -> Iterator[None]:
+    """A command that runs as long as the block."""
+    running = subprocess.Popen([sys.executable, *words], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
+    try:
+        yield
+    finally:
+        running.terminate()
+        running.wait()
+
+
+def ask(session: zenoh.Session, selector: str) -> bytes:
+    """The one reply to a query; empty without one."""
+    return b"".join(reply.ok.payload.to_bytes() for reply in session.get(selector) if reply.ok)
+
+
+def until(something: Callable[[], object]) -> None:
+    """Ask again until there is something."""
+    deadline = time.monotonic() + 120.0
+    while not something():
+        if time.monotonic() > deadline:
+            raise TimeoutError("the service does not answer")
+        time.sleep(0.05)
+
+
+def durations_ms(*works: Callable[[], object]) -> list[list[float]]:
+    """Of QUERIES rounds of all works in turn."""
+    out: list[list[float]] = [[] for _ in works]
+    for _ in range(QUERIES):
+        for work, times in zip(works, out, strict=True):
+            began = time.perf_counter()
+            work()
+            times.append(1e3 * (time.perf_counter() - began))
+    return out
+
+
+def alert_delays_ms(session: zenoh.Session) -> list[float]:
+    """From the second vehicle's publish to the alert at a subscriber, each on a cell that nobody spoke of."""
+    heard: SimpleQueue[float] = SimpleQueue()
+    session.declare_subscriber(f"{keys.ROOT}/alert/**", lambda _: heard.put(time.perf_counter()))
+    out = []
+    for k in range(ALERTS):
+        at = np.array([60 + k % 60]), np.array([40 + k // 60])
+        publish(session, batch("ice-0", k + 1, *at, True))
+        time.sleep(0.05)
+        began = time.perf_counter()
+        publish(session, batch("ice-1", k + 1, *at, True))
+        out.append(1e3 * (heard.get(timeout=30.0) - began))
+    return out
+
+
+def service() -> list[Figure]:
+    """Queries and alerts under 20 000 observations/s, beside a queryable that does nothing."""
+    tile = keys.map_key(_TILE)
+    west, south, east, north = (
+        float(v[0]) for v in grid.bounds(grid.interleave(np.array([_X]), np.array([_Y])))
+    )  # the first cell: the box goes over 40 columns and 25 rows from it
+    box = f"{west},{north - 25 * (north - south)},{west + 40 * (east - west)},{north}"
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        router, (endpoint, *_) = open_router(listen="tcp/127.0.0.1:0")
+        stack.enter_context(router)
+        config, payload = folder / "service.json", folder / "tile.arrow"
+        config.write_text(f'{{"zenoh": {{"connect": ["{endpoint}"]}}}}')
+        words = ("-m", "fleet_service.cli", "run", "--archive", str(folder / "archive"), "--config", str(config))
+        stack.enter_context(process(*words))
+        client = open_session(ZenohSettings(connect=[endpoint]))
+        assert client is not None
+        stack.enter_context(client)
+        stack.enter_context(process("-c", f"from tests.benchmarks.service import load; load({endpoint!r})"))
+        until(lambda: len(ask(client, f"{keys.ROOT}/map/**")))
+        time.sleep(10.0)  # the window fills
+        payload.write_bytes(ask(client, tile))
+        nothing = f"from tests.benchmarks.service import bare; bare({endpoint!r}, {str(payload)!r})"
+        stack.enter_context(process("-c", nothing))
+        until(lambda: len(ask(client, BARE)))
+        ours, boxed, least = durations_ms(
+            lambda: ask(client, tile), lambda: ask(client, f"{tile}?bbox={box}"), lambda: ask(client, BARE)
+        )
+        alerts = alert_delays_ms(client)
+    limit = statistics.median(least)
+    return [
+        Figure("bench.query.tile_vs_bare", statistics.median(ours) / limit, f"of {limit:.1f} ms", 2),
+        Figure("bench.query.bbox_vs_bare", statistics.median(boxed) / limit, "1 000 cells", 2),
+        Figure("bench.query.p99_ms", float(np.quantile(ours + boxed, 0.99)), "ms, under 20 000 observations/s", 25),
+        Figure("bench.alert.p50_ms", statistics.median(alerts), "ms, publish to subscriber, under load", 50),
+        Figure("bench.alert.p99_ms", float(np.quantile(alerts, 0.99)), "ms", 250),
+    ]

@@ -1,0 +1,121 @@
+"""A step of a six-state filter over four tyres against C, and against what people would write or take instead."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import numpy as np
+
+from edge_agent.banks import bank_of
+from edge_agent.dynamics.parameters import parameter_table
+from edge_agent.estimators import TUNED, Estimates
+from edge_agent.simulation import simulate_manoeuvre
+from edge_agent.tuning.tuned import shipped
+from schemas.figures import Figure
+from schemas.numeric import FloatArray
+from schemas.signals import CHANNELS, S
+from tests.benchmarks.limit import Limit
+from tests.benchmarks.measure import SEED, median_s, paired
+from tests.benchmarks.peers import PEERS, PYTHON_STEPS, Problem
+
+NAME = "paper-aco-fckf"
+SAMPLES = 100_000
+THREADS = 2
+AGREE = 1e-6  # how far C and Python may be apart in v_x, v_y and yaw rate over a drive
+
+
+class Drive:
+    """A recorded manoeuvre, end to end over and over, as signals and as the C kernel's readings."""
+
+    def __init__(self) -> None:
+        log, self.vehicle = simulate_manoeuvre("double-lane-change", seed=SEED)
+        table = np.stack([log[name].to_numpy(zero_copy_only=False) for name in CHANNELS], axis=-1)
+        t = log["t"].to_numpy()
+        self.gone = float(t[1] - t[0])
+        self.signals, self.t = np.ascontiguousarray(table), np.arange(len(t)) * self.gone
+        self.readings = np.ascontiguousarray(
+            table[:, [S.AX, S.AY, S.YAW_RATE, *range(S.DELTA, S.DELTA + 4), *range(S.OMEGA, S.OMEGA + 4)]]
+        )
+
+    def repeated(self, samples: int, vehicles: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """t (T, N), signals (T, N, 18) and readings (T, N, 11)."""
+        index = np.arange(samples) % len(self.t)
+        t = np.repeat((np.arange(samples) * self.gone)[:, None], vehicles, axis=1)
+        return t, np.repeat(self.signals[index, None], vehicles, 1), np.repeat(self.readings[index, None], vehicles, 1)
+
+
+def limit(drive: Drive, vehicles: int, speed: float) -> Limit:
+    """The C filters at the first sample."""
+    made = Limit(
+        parameter_table([drive.vehicle] * vehicles), np.repeat(drive.readings[:1], vehicles, 0), shipped(TUNED[NAME])
+    )
+    made.begin(np.full(vehicles, speed))
+    return made
+
+
+def same_filter(drive: Drive) -> float:
+    """Speed at the first sample [m/s], after checking that C and Python do the same.
+
+    Raises:
+        ArithmeticError: they do not.
+    """
+    t, signals, readings = drive.repeated(len(drive.t), 1)
+    said: Estimates = bank_of(NAME, [drive.vehicle]).advance(t, signals)
+    speed = float(said.vx[0, 0])
+    means = limit(drive, 1, speed).drive(readings[1:], drive.gone)[:, 0]
+    ours = np.stack([said.vx, said.vy, said.yaw_rate], axis=-1)[1:, 0]
+    apart = float(np.abs(ours - means[:, [0, 1, 4]]).max())
+    if not apart < AGREE:
+        raise ArithmeticError(f"the C kernel and {NAME} are {apart:g} apart: not the same filter")
+    return speed
+
+
+def step() -> list[Figure]:
+    """One filter step: against C, against filter libraries, and the price of a call."""
+    drive = Drive()
+    speed = same_filter(drive)
+    t, signals, readings = drive.repeated(SAMPLES, 1)
+    ours, scalar = paired(
+        lambda: bank_of(NAME, [drive.vehicle]).advance(t, signals),
+        lambda: limit(drive, 1, speed).drive(readings, drive.gone),
+    )
+    bank = bank_of(NAME, [drive.vehicle])
+    single = iter(range(SAMPLES))
+
+    def calls() -> None:
+        for _ in range(1000):
+            k = next(single)
+            bank.advance(t[k : k + 1], signals[k : k + 1])
+
+    per_call, per_step = median_s(calls) / 1000, ours / SAMPLES
+    found = [
+        Figure("bench.step.us", per_step * 1e6, "us, N = 1, 100 000 samples in a call"),
+        Figure("bench.step.vs_c", ours / scalar, "times scalar C", 1.5),
+        Figure("bench.step.call_overhead_us", (per_call - per_step) * 1e6, "us", 2),
+    ]
+    problem = Problem(parameter_table([drive.vehicle])[0], drive.readings, drive.gone, speed)
+    for name, peer in PEERS.items():
+        if find_spec(name) is None:
+            print(f"  {name} is not installed: pip install '.[bench]'", flush=True)
+            continue
+        seconds = median_s(lambda peer=peer: peer.drive(problem), 3) / PYTHON_STEPS  # type: ignore[misc]
+        found.append(Figure(f"bench.step.vs_{name}", seconds / per_step, "times as fast", peer.bar, "more"))
+    return found
+
+
+def bank() -> list[Figure]:
+    """Many vehicles on two threads, against C on as many, and what more of them do to the cost of one."""
+    drive = Drive()
+    speed = same_filter(drive)
+    found, cost = [], {}
+    for vehicles, samples in ((100, 1000), (1000, 200), (100_000, 4)):
+        t, signals, readings = drive.repeated(samples, vehicles)
+        fleet = [drive.vehicle] * vehicles
+        ours, threaded = paired(
+            lambda: bank_of(NAME, fleet).advance(t, signals, threads=THREADS),  # noqa: B023 called at once
+            lambda: limit(drive, vehicles, speed).drive(readings, drive.gone),  # noqa: B023
+        )
+        cost[vehicles] = ours / (vehicles * samples)
+        if vehicles > 100:
+            found.append(Figure(f"bench.bank.vs_c_openmp.{vehicles}", ours / threaded, "times C on two threads", 1.5))
+    return [*found, Figure("bench.bank.flatness", cost[100_000] / cost[100], "N = 100 000 over N = 100", 1.2)]

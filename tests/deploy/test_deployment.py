@@ -1,0 +1,186 @@
+"""The shipped units, compose file and configurations: checked by their own tools, and started as they are written.
+
+Only folders and ports are others than in a deployment: the files' text is taken as it is but for these.
+"""
+
+from __future__ import annotations
+
+import configparser
+import json
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from ruamel.yaml import YAML
+
+from fleet_service.client import ask
+from fleet_service.enrolment.fleet import Enrolment
+from schemas.config import AgentConfig, ServiceConfig, load
+from schemas.transport import configuration
+from tests.schemas.test_monitor import fetch
+from tests.waiting import until
+
+ROOT = Path(__file__).resolve().parents[2]
+DEPLOY = ROOT / "deploy"
+UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
+BIN = Path(sys.executable).parent
+PORTS = ("7447", "7448", "9464")
+INSTANCES = {"gripmap-router@": ["router-a", "router-b"], "gripmap-service": [""], "gripmap-agent@": ["car-001"]}
+START_S = 300.0  # the first start compiles the kernels, on a busy machine
+
+
+def free_ports(count: int) -> list[str]:
+    with ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
+        for one in sockets:
+            one.bind(("127.0.0.1", 0))
+        return [str(one.getsockname()[1]) for one in sockets]
+
+
+class Site:
+    """The folders of a deployment below another root, with other ports."""
+
+    def __init__(self, root: Path) -> None:
+        self.root, self._ports = root, free_ports(len(PORTS))
+        for name in ("etc", "lib", "cache"):
+            (root / name).mkdir()
+        for file in (DEPLOY / "secure").glob("*.json"):
+            (root / "etc" / file.name).write_text(self.placed(file.read_text()))
+
+    def placed(self, text: str) -> str:
+        """A text with the folders and ports of this site."""
+        places = {"/etc/gripmap": "etc", "/var/lib/gripmap": "lib", "/var/cache/gripmap": "cache"}
+        for place, folder in places.items():
+            text = text.replace(place, str(self.root / folder))
+        text = text.replace("%S/gripmap", str(self.root / "lib")).replace("%C/gripmap", str(self.root / "cache"))
+        for port, other in zip(PORTS, self._ports, strict=True):
+            text = text.replace(port, other)
+        return text.replace("/opt/gripmap/bin", str(BIN))
+
+    def unit(self, unit: Path, instance: str) -> configparser.SectionProxy:
+        """The service section of a unit."""
+        parser = configparser.ConfigParser(strict=False, interpolation=None)
+        parser.optionxform = str  # type: ignore[assignment,method-assign]
+        parser.read_string(self.placed(unit.read_text()).replace("%i", instance))
+        return parser["Service"]
+
+    @property
+    def address(self) -> str:
+        return f"http://127.0.0.1:{self._ports[2]}"
+
+
+def instances() -> Iterator[tuple[Path, str]]:
+    for unit in UNITS:
+        for instance in INSTANCES[unit.stem]:
+            yield unit, instance
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Site:
+    return Site(tmp_path)
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd on this machine")
+def test_systemd_accepts_the_units(site: Site, tmp_path: Path) -> None:
+    folder = tmp_path / "units"
+    folder.mkdir()
+    for unit in UNITS:
+        (folder / unit.name).write_text(site.placed(unit.read_text()))
+    names = [str(folder / unit.name.replace("@.", f"@{instance}.")) for unit, instance in instances()]
+    done = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", "--generators=no", "--recursive-errors=no", *names],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    ours = [line for line in done.stderr.splitlines() if "gripmap" in line]
+    assert not ours, done.stderr
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_compose_file_is_one_and_starts_what_the_units_start() -> None:
+    file = DEPLOY / "compose.yaml"
+    subprocess.run([BIN / "check-jsonschema", "--builtin-schema", "vendor.compose-spec", file], check=True)
+    services = YAML(typ="safe").load(file)["services"]
+    started = sorted(part["command"] for name, part in services.items() if name != "certs")
+    plain = configparser.ConfigParser(strict=False, interpolation=None)
+    commands = []
+    for unit, instance in instances():
+        plain.read_string(unit.read_text().replace("%i", instance))
+        program, *rest = shlex.split(plain["Service"]["ExecStart"])
+        commands.append([Path(program).name, *rest])
+    assert started == sorted(commands)
+    for part in services.values():
+        for volume in part["volumes"]:
+            source = volume.split(":")[0]
+            assert not source.startswith(".") or (file.parent / source).is_file(), source
+
+
+def test_the_image_copies_only_what_there_is() -> None:
+    words = [line.split() for line in (DEPLOY / "Dockerfile").read_text().splitlines() if line.startswith("COPY ")]
+    sources = [source for line in words for source in line[1:-1]]
+    assert sources
+    assert [source for source in sources if not (ROOT / source).exists()] == []
+
+
+def test_every_configuration_is_for_a_name_on_the_list() -> None:
+    secure = DEPLOY / "secure"
+    fleet = load(secure / "fleet.json", Enrolment)
+    service = load(secure / "service.json", ServiceConfig)
+    endpoints = [router.endpoint for router in fleet.routers.values()]
+    assert service.name in fleet.services
+    for config in (service, load(secure / "agent.json", AgentConfig), load(secure / "reader.json", ServiceConfig)):
+        assert config.zenoh.connect == endpoints
+    assert f"certs/{fleet.readers[0]}.pem" in json.dumps(load(secure / "reader.json", ServiceConfig).zenoh.config)
+
+
+@pytest.mark.timeout(400)
+def test_what_the_units_start_works_together_and_leaves_in_time(site: Site) -> None:
+    """Certificates, two routers, service, agent, reader; then each is stopped as systemd would."""
+    etc = site.root / "etc"
+    enrol = [BIN / "fleet-service", "certs", "--fleet", etc / "fleet.json", "--out", etc / "certs"]
+    subprocess.run(enrol, check=True, stdout=subprocess.DEVNULL)
+    running: list[subprocess.Popen[bytes]] = []
+    with ExitStack() as stack:
+        for unit, instance in sorted(instances(), key=lambda one: list(INSTANCES).index(one[0].stem)):
+            section = site.unit(unit, instance)
+            Path(section["WorkingDirectory"]).mkdir(parents=True)
+            log = stack.enter_context((site.root / f"{unit.stem}{instance}.log").open("wb"))
+            process = subprocess.Popen(
+                shlex.split(section["ExecStart"]), cwd=section["WorkingDirectory"], stdout=log, stderr=log
+            )
+            running.append(stack.enter_context(process))
+            stack.callback(process.kill)
+
+        def rows() -> float:
+            lines = fetch(f"{site.address}/metrics")[2].splitlines() if listening() else []
+            return sum(float(line.split()[-1]) for line in lines if line.startswith("gripmap_rows_total"))
+
+        def listening() -> bool:
+            assert all(process.poll() is None for process in running), "a part ended before its time"
+            with socket.socket() as probe:
+                return probe.connect_ex(("127.0.0.1", int(site.address.rsplit(":", 1)[1]))) == 0
+
+        until(rows, START_S)
+        assert fetch(f"{site.address}/healthz")[0] == 200
+        until(lambda: ask(load(etc / "reader.json", ServiceConfig).zenoh, {"format": "arrow"}).table.num_rows, START_S)
+        for process in reversed(running):
+            began = time.monotonic()
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(timeout=10.0) == 0, f"{process.args} after {time.monotonic() - began:.1f} s"
+    said = [json.loads(line) for line in (site.root / "gripmap-service.log").read_text().splitlines()]
+    assert said[0]["event"] == "ready"
+    assert said[-1]["event"] == "status"
+    assert said[-1]["service"] == "shard-0"
+
+
+def test_a_deployment_without_its_certificates_says_which_is_missing(site: Site) -> None:
+    config = load(site.root / "etc" / "agent.json", AgentConfig)
+    with pytest.raises(ValueError, match=r"there is no file .*trust.pem; make it with `fleet-service certs`"):
+        configuration(config.zenoh, "car-001")

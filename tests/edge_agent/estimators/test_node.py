@@ -1,0 +1,80 @@
+"""The pieces of a node against textbooks: its factor, its update row by row, its tyre curve."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edge_agent.dynamics.tyres import magic_formula
+from edge_agent.estimators.friction_mixture.constants import ACTIVE, NODES, STATES, C, constant_row
+from edge_agent.estimators.friction_mixture.curve import curve_tables, ratio_at, theta_at
+from edge_agent.estimators.friction_mixture.node import factorize, new_room, take_rows
+from edge_agent.estimators.friction_mixture.nodes import node_table, projected, side_table
+from edge_agent.estimators.friction_mixture.residuals import ROWS
+
+SEEDS = (0, 1, 2)
+
+
+def covariance(seed: int) -> np.ndarray:
+    factor = np.random.default_rng(seed).normal(size=(STATES, STATES))
+    return np.asarray(factor @ factor.T + 0.1 * np.eye(STATES))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_covariance_is_its_factor_times_itself_turned(seed: int) -> None:
+    root = np.zeros((STATES, STATES))
+    factorize(covariance(seed), root)
+    assert root @ root.T == pytest.approx(covariance(seed), abs=1e-10)
+    assert root == pytest.approx(np.linalg.cholesky(covariance(seed)), abs=1e-10)
+
+
+@pytest.mark.parametrize("missing", [(), (1,), (0, 4)])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_rows_taken_in_one_by_one_are_the_textbook_s_update(seed: int, missing: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(seed)
+    before, mean, room = np.linalg.cholesky(covariance(seed)), rng.normal(size=STATES), new_room()
+    # deviations that only the first ACTIVE axes of the factor see: rows = H*x with H = A*L^-1
+    room.deviation[:] = rng.normal(size=(ROWS, ACTIVE))
+    room.base[:], room.noise[:] = rng.normal(size=ROWS), rng.uniform(0.1, 1.0, ROWS)
+    a, v, r = (np.delete(value, missing, axis=0) for value in (room.deviation, room.base, room.noise))
+    room.base[list(missing)] = np.nan
+    spread = a @ a.T + np.diag(r)
+    cross = before[:, :ACTIVE] @ a.T
+    expected = mean + cross @ np.linalg.solve(spread, v)
+    left = before @ before.T - cross @ np.linalg.solve(spread, cross.T)
+    root = before.copy()
+    loss, used = take_rows(constant_row(axle_price=0.0), mean, root, room)
+    assert used == ROWS - len(missing)
+    assert mean == pytest.approx(expected, abs=1e-9)
+    assert root @ root.T == pytest.approx(left, abs=1e-9)
+    assert loss == pytest.approx(0.5 * v @ np.linalg.solve(spread, v), abs=1e-9)
+
+
+def test_the_tables_are_the_magic_formula_and_its_inverse() -> None:
+    row = constant_row()
+    c, e = float(row[C.SHAPE]), float(row[C.CURVATURE])
+    curve = curve_tables(c, e)
+    for theta in (0.01, 0.3, 1.0, 1.7, 4.0, 30.0, 900.0):
+        assert ratio_at(curve, theta) * theta == pytest.approx(magic_formula(theta, c, e), abs=5e-4)
+    for force in (0.05, 0.5, 0.9, 0.99):
+        assert magic_formula(theta_at(curve, force), c, e) == pytest.approx(force, abs=1e-4)
+    assert np.isinf(theta_at(curve, 1.0))
+
+
+def test_far_beyond_the_table_a_spinning_wheel_still_has_the_force_of_sliding() -> None:
+    curve = curve_tables(1.45, -0.1)
+    assert ratio_at(curve, 1e4) * 1e4 == pytest.approx(magic_formula(1e4, 1.45, -0.1), abs=2e-3)
+
+
+def test_unlike_sides_come_either_way_round_and_their_cells_share_out_all_they_have() -> None:
+    mu, prior = node_table(NODES)
+    sides = side_table(mu, prior, 0.05)
+    assert sides.prior.sum() == pytest.approx(1.0)
+    assert sides.prior[NODES:].sum() == pytest.approx(0.05)
+    assert sides.share.sum(axis=2) == pytest.approx(1.0)
+    pairs = {tuple(pair) for pair in sides.pair[NODES:].round(6)}
+    assert pairs == {(right, left) for left, right in pairs}
+    out = np.empty(NODES)
+    for share in sides.share:
+        projected(sides.prior, share, out)
+        assert out.sum() == pytest.approx(1.0)

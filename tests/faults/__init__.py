@@ -1,0 +1,1 @@
+"""Fault campaigns: what `make faults` runs. See `frame.py` for how one is added."""

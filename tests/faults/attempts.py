@@ -1,0 +1,386 @@
+"""The attacks: each a function of the ground that says whether it got through. None may."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from deploy.router import open_router
+from fleet_service.enrolment import authority as ca
+from fleet_service.enrolment.enrol import Registry, Terms
+from fleet_service.enrolment.fleet import Enrolment
+from schemas import keys, wire
+from schemas.config import ZenohSettings
+from schemas.errors import InputError
+from schemas.transport import configuration
+from tests.faults.ground import HONEST, ROGUE, Ears, Ground
+from tests.fleet_service.examples import REGION, TILE, batch, key
+from tests.secured import FREE, READER, ROUTERS, SERVICE, WEATHER, enrolment, registry, settings
+from tests.waiting import until
+
+Attempt = Callable[[Ground], bool]
+ATTEMPTS: dict[str, Attempt] = {}
+SECRET = b"what only the service may hear"
+ALL_OBSERVATIONS = f"{keys.ROOT}/obs/**"
+
+
+def attempt(function: Attempt) -> Attempt:
+    """Enter an attack in the table under its name."""
+    ATTEMPTS[function.__name__] = function
+    return function
+
+
+def opens(ground: Ground, name: str, router: str = ROUTERS[1], **changed: object) -> bool:
+    """Whether a session opens."""
+    try:
+        with ground.network.session(name, router, **changed):
+            return True
+    except zenoh.ZError:
+        return False
+
+
+def issued(ground: Ground, name: str, folder: Path, *, days_ago: float = 0.0, days: float = 5.0) -> dict[str, object]:
+    """TLS entries with a certificate that the fleet's own authority issued at some time."""
+    authority = ca.read(ground.folder / "authority" / "ca")
+    assert authority is not None
+    folder.mkdir(exist_ok=True)
+    ca.issue(authority, name, [], days, datetime.now(UTC) - timedelta(days=days_ago)).write(folder / "it")
+    return {"connect_certificate": str(folder / "it.pem"), "connect_private_key": str(folder / "it.key")}
+
+
+def stranger(ground: Ground) -> Path:
+    """Folder of another authority that knows the same names."""
+    folder = ground.folder / "stranger"
+    registry(folder).enrol(enrolment())
+    return folder
+
+
+@attempt
+def certificate_of_another_authority(ground: Ground) -> bool:
+    folder = stranger(ground)
+    own = {"connect_certificate": str(folder / "shard-0.pem"), "connect_private_key": str(folder / "shard-0.key")}
+    return opens(ground, SERVICE, **own)
+
+
+@attempt
+def no_certificate(ground: Ground) -> bool:
+    return opens(ground, ROGUE, connect_certificate=None, connect_private_key=None, enable_mtls=False)
+
+
+@attempt
+def expired_certificate(ground: Ground) -> bool:
+    return opens(ground, ROGUE, **issued(ground, ROGUE, ground.folder / "expired", days_ago=10.0))
+
+
+@attempt
+def certificate_that_is_not_good_yet(ground: Ground) -> bool:
+    return opens(ground, ROGUE, **issued(ground, ROGUE, ground.folder / "early", days_ago=-1.0))
+
+
+@attempt
+def certificate_without_its_key(ground: Ground) -> bool:
+    return opens(ground, ROGUE, connect_certificate=str(ground.folder / f"{HONEST}.pem"))
+
+
+@attempt
+def plain_tcp(ground: Ground) -> bool:
+    endpoint = ground.network.endpoints[ROUTERS[0]].replace("tls/", "tcp/")
+    try:
+        with zenoh.open(configuration(ZenohSettings(connect=[endpoint]))):
+            return True
+    except zenoh.ZError:
+        return False
+
+
+def lures(ground: Ground, folder: Path, name: str) -> bool:
+    """Whether an honest vehicle opens a session at a router that shows this certificate."""
+    tls = {
+        "root_ca_certificate": str(folder / "trust.pem"),
+        "listen_certificate": str(folder / f"{name}.pem"),
+        "listen_private_key": str(folder / f"{name}.key"),
+    }
+    file = ground.folder / "false-router.json5"
+    file.write_text(json.dumps({"mode": "router", "scouting": {"delay": 0, "multicast": {"enabled": False}},
+                                "transport": {"link": {"tls": tls}}}))  # fmt: skip
+    router, endpoints = open_router(file, FREE)
+    with router:
+        try:
+            with zenoh.open(configuration(settings(endpoints[0], ground.folder), HONEST)):
+                return True
+        except zenoh.ZError:
+            return False
+
+
+@attempt
+def false_router_of_another_authority(ground: Ground) -> bool:
+    return lures(ground, stranger(ground), ROUTERS[0])
+
+
+@attempt
+def false_router_with_the_certificate_of_a_vehicle(ground: Ground) -> bool:
+    return lures(ground, ground.folder, ROGUE)
+
+
+def put_by(ground: Ground, session: zenoh.Session, *expressions: str) -> bool:
+    """Whether anybody hears what is put there."""
+    for expression in expressions:
+        session.put(expression, SECRET + expression.encode())
+    ground.passed(session)
+    return any(ears.has(SECRET) for ears in (ground.monitor, ground.reader, ground.honest))
+
+
+def spoofed(name: str) -> list[str]:
+    """Keys that do not belong to a vehicle of this name."""
+    other = HONEST if name != HONEST else ROGUE
+    return [
+        key(other), keys.state_key(REGION, other), keys.ack_key(other), keys.ack_key(name), keys.map_key(TILE),
+        keys.alert_key(TILE), keys.weather_key(REGION), keys.alive_key(name), keys.shard_key(name),
+        f"{keys.ROOT}/obs/**", f"{keys.ROOT}/obs/*/*/*/*", f"{keys.ROOT}/*/*/*/*/{name}", f"{keys.ROOT}/**/{name}",
+        f"{keys.ROOT}/obs/0/{name}", f"{keys.ROOT}/obs/0/1/2/3/{name}", f"{keys.ROOT}/obs/0123/012/012/sim$*",
+        f"{keys.ROOT}/obs/0123/012/012/{name}/{name}", "gripmap/v2/obs/0123/012/012/" + name,
+    ]  # fmt: skip
+
+
+@attempt
+def vehicle_puts_where_it_may_not(ground: Ground) -> bool:
+    return put_by(ground, ground.open(ROGUE, ROUTERS[1]), *spoofed(ROGUE))
+
+
+@attempt
+def reader_puts(ground: Ground) -> bool:
+    return put_by(ground, ground.open(READER, ROUTERS[1]), *spoofed(HONEST), key(READER), keys.ack_key(READER))
+
+
+@attempt
+def sender_of_weather_puts_something_else(ground: Ground) -> bool:
+    session = ground.open(WEATHER, ROUTERS[1])
+    session.put(keys.weather_key(REGION), b"rain")
+    others = [place for place in spoofed(HONEST) if place != keys.weather_key(REGION)]
+    through = put_by(ground, session, *others, key(HONEST))
+    return through or not ground.monitor.has(b"rain")
+
+
+@attempt
+def declared_publisher_on_another_key(ground: Ground) -> bool:
+    session = ground.open(ROGUE, ROUTERS[1])
+    for place in (key(HONEST), keys.map_key(TILE), f"{keys.ROOT}/obs/**"):
+        session.declare_publisher(place).put(SECRET)
+    ground.passed(session)
+    return ground.monitor.has(SECRET)
+
+
+@attempt
+def wildcard_put_on_ones_own_name(ground: Ground) -> bool:
+    session = ground.open(ROGUE, ROUTERS[1])
+    before, refused = ground.admitted, ground.service.engine.counts["refused.key"]
+    payload = wire.encode(batch(ROGUE, 1, 0, [0.1]))
+    session.put(f"{keys.ROOT}/obs/*/*/*/{ROGUE}", payload, encoding=wire.ENCODING[wire.Kind.OBSERVATION])
+    ground.drive(session, ROGUE)
+    return ground.admitted != before + 1 or ground.service.engine.counts["refused.key"] != refused + 1
+
+
+@attempt
+def another_name_within_ones_own_key(ground: Ground) -> bool:
+    session = ground.open(ROGUE, ROUTERS[1])
+    before = ground.admitted
+    payload = wire.encode(batch(HONEST, 10**6, 0, [0.1]))
+    session.put(key(ROGUE), payload, encoding=wire.ENCODING[wire.Kind.OBSERVATION])
+    ground.drive(session, ROGUE)
+    return ground.admitted != before + 1
+
+
+@attempt
+def delete(ground: Ground) -> bool:
+    session = ground.open(ROGUE, ROUTERS[1])
+    for place in (key(HONEST), key(ROGUE), keys.map_key(TILE), f"{keys.ROOT}/**", keys.ack_key(HONEST)):
+        session.delete(place)
+    ground.passed(session)
+    return not all(put for ears in (ground.monitor, ground.reader, ground.honest) for _, put, _ in list(ears.heard))
+
+
+@attempt
+def spoofed_reply(ground: Ground) -> bool:
+    session = ground.open(ROGUE, ROUTERS[1])
+
+    def lie(query: zenoh.Query) -> None:
+        with query:
+            query.reply(keys.map_key(TILE), SECRET)
+
+    places = (f"{keys.ROOT}/map/**", keys.map_key(TILE))
+    lying = [session.declare_queryable(place, lie, complete=True) for place in places]
+    ground.passed(session)
+    asked: Any = ground.reader.session.get(
+        f"{keys.ROOT}/map/**", target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE
+    )
+    through = any(reply.ok is not None and reply.ok.payload.to_bytes() == SECRET for reply in asked)
+    for queryable in lying:
+        queryable.undeclare()
+    return through
+
+
+def overhears(ground: Ground, session: zenoh.Session) -> bool:
+    """Whether a session hears another vehicle's observations or acknowledgements."""
+    ears = Ears(session, (
+        f"{keys.ROOT}/map/**", ALL_OBSERVATIONS, f"{keys.ROOT}/state/**", keys.ack_key(HONEST), f"{keys.ROOT}/ack/*",
+        key(HONEST), "**", "gripmap/**", f"{keys.ROOT}/*/**",
+    ))  # fmt: skip
+    ground.passed(session)
+    ground.drive()
+    ground.passed(session, ears)
+    return not all(name.startswith(f"{keys.ROOT}/map/") for name, _, _ in ears.heard)
+
+
+@attempt
+def vehicle_overhears(ground: Ground) -> bool:
+    return overhears(ground, ground.open(ROGUE, ROUTERS[1]))
+
+
+@attempt
+def reader_overhears(ground: Ground) -> bool:
+    return overhears(ground, ground.open(READER, ROUTERS[1]))
+
+
+@attempt
+def foreign_liveliness_token(ground: Ground) -> bool:
+    session = ground.open(ROGUE, ROUTERS[1])
+    places = (keys.alive_key(HONEST), keys.shard_key(ROGUE), f"{keys.ROOT}/alive/{ROGUE}/more", keys.alive_key(ROGUE))
+    tokens = [session.liveliness().declare_token(place) for place in places]
+
+    def found() -> list[str]:
+        replies = ground.monitor.session.liveliness().get(f"{keys.ROOT}/**")
+        return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok)
+
+    until(lambda: keys.alive_key(ROGUE) in found())  # its own comes last
+    through = found()
+    for token in tokens:
+        token.undeclare()
+    return through != [keys.alive_key(ROGUE), keys.shard_key(SERVICE)]
+
+
+@attempt
+def who_is_alive_is_told_to_a_vehicle(ground: Ground) -> bool:
+    token = ground.honest.session.liveliness().declare_token(keys.alive_key(HONEST))
+    asked = f"{keys.ROOT}/alive/*"
+    until(lambda: any(reply.ok for reply in ground.monitor.session.liveliness().get(asked)))
+    told = any(reply.ok for reply in ground.open(ROGUE, ROUTERS[1]).liveliness().get(asked))
+    token.undeclare()
+    return told
+
+
+def as_router(ground: Ground, mode: str) -> bool:
+    """A vehicle that plays router or peer, so that others' traffic might pass through it."""
+    given = settings(ground.network.endpoints[ROUTERS[1]], ground.folder)
+    given = given.model_copy(update={"config": {**given.config, "mode": mode, "listen/endpoints": []}})
+    told = {
+        "settings": given.model_dump(),
+        "name": ROGUE,
+        "hear": [f"{keys.ROOT}/map/**", ALL_OBSERVATIONS, f"{keys.ROOT}/ack/**"],
+        "put": spoofed(ROGUE),
+        "payload": SECRET.decode(),
+    }
+    command = [sys.executable, "-m", "tests.faults.rogue"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdin
+        assert process.stdout
+        print(json.dumps(told), file=process.stdin, flush=True)
+        assert process.stdout.readline(), "the rogue does not open a session"
+        ground.drive()
+        print("look", file=process.stdin, flush=True)
+        heard = json.loads(process.stdout.readline())
+    ground.passed(ground.honest.session)
+    own = set(told["put"])  # what it puts itself, it hears
+    overheard = [name for name in heard if not name.startswith(f"{keys.ROOT}/map/") and name not in own]
+    return bool(overheard) or heard.count(key(HONEST)) > 1 or ground.monitor.has(SECRET) or ground.reader.has(SECRET)
+
+
+@attempt
+def vehicle_that_plays_router(ground: Ground) -> bool:
+    return as_router(ground, "router")
+
+
+@attempt
+def vehicle_that_plays_peer(ground: Ground) -> bool:
+    return as_router(ground, "peer")
+
+
+@attempt
+def certificates_with_a_wildcard_or_a_tile_for_a_name(ground: Ground) -> bool:
+    through = False
+    for name in ("*", "**", "0123", "sim-*", "role/services"):
+        with ground.network.session(name, ROUTERS[1], **issued(ground, name, ground.folder / "odd")) as session:
+            places = (key(HONEST), f"{keys.ROOT}/obs/1202/310/232/0123", keys.map_key(TILE), "gripmap/v1/ack/*")
+            for place in places:
+                session.put(place, SECRET + name.encode())
+            ears = Ears(session, (f"{keys.ROOT}/**",))
+            list(session.get(f"{keys.ROOT}/map/**"))
+            ground.drive()
+            through |= bool(ears.heard)
+    ground.passed(ground.reader.session)
+    return through or ground.monitor.has(SECRET)
+
+
+@attempt
+def names_that_look_like_a_tile_or_a_path_are_enrolled(ground: Ground) -> bool:
+    through = False
+    for name in ("0123", "*", "**", "$*", "a/b", "../sim", "sim-000\n", "Sim-000", "", "@admin", "role/services"):
+        with suppress(ValueError):
+            through |= bool(Enrolment.model_validate({"routers": {"router-a": {}}, "vehicles": [name]}))
+    return through
+
+
+@attempt
+def one_name_with_two_roles(ground: Ground) -> bool:
+    with suppress(ValueError):
+        return bool(enrolment(vehicles=[SERVICE]))
+    return False
+
+
+@attempt
+def batch_that_is_too_large_travels(ground: Ground) -> bool:
+    session = ground.open(ROGUE, ROUTERS[1])
+    session.put(key(ROGUE), SECRET + bytes(wire.MAX_BYTES))
+    ground.passed(session)
+    return ground.monitor.has(SECRET)
+
+
+@attempt
+def administration_of_the_routers(ground: Ground) -> bool:
+    session = ground.open(ROGUE, ROUTERS[1])
+    for router in session.info.routers_zid():
+        session.put(f"@/{router}/router/config/access_control/enabled", "false")
+    replies = session.get("@/*/router/**")
+    return any(reply.ok for reply in replies) or put_by(ground, session, keys.ack_key(HONEST))
+
+
+@attempt
+def revoked_vehicle(ground: Ground) -> bool:
+    """After the routers were started with a list without it."""
+    network = ground.network
+    lost = {f"connect_{part}": str(ground.folder / f"lost.{end}") for part, end in
+            (("certificate", "pem"), ("private_key", "key"))}  # fmt: skip
+    for end in ("pem", "key"):
+        (ground.folder / f"lost.{end}").write_bytes((ground.folder / f"{ROGUE}.{end}").read_bytes())
+    (ground.folder / "lost.pem").rename(ground.folder / "lost.crt")
+    lost["connect_certificate"] = str(ground.folder / "lost.crt")
+    again = Registry(ground.folder, Terms(), datetime.now(UTC))
+    again.enrol(enrolment(vehicles=[HONEST]))
+    for router in ROUTERS[::-1]:
+        network.stop(router)
+        network.start(router)
+    session = ground.open(ROGUE, ROUTERS[1], **lost)
+    session.put(key(ROGUE), SECRET)
+    ears = Ears(session, (f"{keys.ROOT}/**",))
+    list(session.get(f"{keys.ROOT}/map/**"))
+    ground.drive()
+    ground.drive()
+    with suppress(InputError):
+        return bool(again.enrol(enrolment()))
+    return ground.monitor.has(SECRET) or bool(ears.heard)

@@ -1,0 +1,45 @@
+"""Names, units and bars of the figures that the fault campaigns owe."""
+
+from __future__ import annotations
+
+from typing import Final, Literal, NamedTuple
+
+from schemas.figures import Figure
+
+
+class Bar(NamedTuple):
+    """What a figure is held against."""
+
+    unit: str
+    bar: float
+    better: Literal["less", "more"] = "less"
+
+
+BARS: Final = {
+    "faults.kill.acknowledged_lost": Bar("batches", 0),
+    "faults.kill.doubled": Bar("rows", 0),
+    "faults.kill.unacknowledged_lost_at_end": Bar("batches", 0),
+    "faults.compaction.incomplete_reads": Bar("reads", 0),
+    "faults.crash_model.violations": Bar("histories", 0),
+    "faults.truncation.lost_rows": Bar("rows", 0),
+    "faults.router_down.lost": Bar("batches", 0),
+    "faults.router_down.recovery_s": Bar("s", 10),
+    "faults.frozen.lost": Bar("batches", 0),
+    "faults.frozen.agent_deadline_misses": Bar("blocks", 0),
+    "faults.disk_full.false_acks": Bar("batches", 0),
+    "faults.disk_full.recovered": Bar("times", 1, "more"),
+    "faults.fuzz.crashes": Bar("crashes", 0),
+    "faults.fuzz.admitted_out_of_range": Bar("rows", 0),
+    "faults.fuzz.honest_lost": Bar("batches", 0),
+    "faults.security.breaches": Bar("breaches", 0),
+    "faults.flood.honest_delay_s": Bar("s", 2),
+    "faults.flood.map_difference": Bar("-", 0.01),
+    "soak.memory_slope_mb_per_10min": Bar("MB per 10 min", 1),
+    "soak.handles_growth": Bar("handles", 0),
+}
+
+
+def figure(name: str, value: float) -> Figure:
+    """A figure of the table above; KeyError if it is not in it."""
+    unit, bar, better = BARS[name]
+    return Figure(name, value, unit, bar, better)

@@ -1,0 +1,25 @@
+"""The campaigns, in the order in which they run."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from tests.faults import compaction, crash_model, flood, fuzz, kill, outages, security, truncation
+from tests.faults.frame import Campaign
+
+CAMPAIGNS: Final = (
+    Campaign("crash-model", crash_model.run, ("faults.crash_model.violations",)),
+    Campaign("compaction", compaction.run, ("faults.compaction.incomplete_reads",)),
+    Campaign("truncation", truncation.run, ("faults.truncation.lost_rows",)),
+    Campaign(
+        "kill",
+        kill.run,
+        ("faults.kill.acknowledged_lost", "faults.kill.doubled", "faults.kill.unacknowledged_lost_at_end"),
+    ),
+    Campaign("router-down", outages.router_down, ("faults.router_down.lost", "faults.router_down.recovery_s")),
+    Campaign("frozen", outages.frozen, ("faults.frozen.lost", "faults.frozen.agent_deadline_misses")),
+    Campaign("disk-full", outages.disk_full, ("faults.disk_full.false_acks", "faults.disk_full.recovered")),
+    Campaign("security", security.run, ("faults.security.breaches",)),
+    Campaign("fuzz", fuzz.run, ("faults.fuzz.crashes", "faults.fuzz.admitted_out_of_range", "faults.fuzz.honest_lost")),
+    Campaign("flood", flood.run, ("faults.flood.honest_delay_s", "faults.flood.map_difference")),
+)

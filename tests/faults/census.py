@@ -1,0 +1,97 @@
+"""What the generators know to be safe against what the archive holds."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import pyarrow as pa
+
+from fleet_service.archive import reading
+from fleet_service.archive.pseudonyms import Pseudonyms
+from schemas.wire import Kind
+
+HOUR_NS = 3_600_000_000_000
+Name = tuple[str, int, int, int]  # vehicle, boot, region, seq
+
+
+@dataclass(frozen=True)
+class Census:
+    """Counts after everything came to rest.
+
+    Attributes:
+        stored: batches that were committed to a spool.
+        settled: of those, batches that an acknowledgement settled.
+        acknowledged_lost: settled batches of which a row is missing in the archive.
+        lost: stored batches of which a row is missing, settled or not.
+        doubled: rows that are there more than once.
+        rows: in the archive.
+        observations: in the stored batches.
+    """
+
+    stored: int
+    settled: int
+    acknowledged_lost: int
+    lost: int
+    doubled: int
+    rows: int
+    observations: int
+
+
+class Told(NamedTuple):
+    """What the journals say: records and time [s] of every stored batch, time of every settled one."""
+
+    stored: dict[Name, tuple[int, float]]
+    settled: dict[Name, float]
+
+    def longest_wait(self, since: float) -> float:
+        """Seconds from `since` until the last batch stored before it was settled; infinite if one never was."""
+        waits = [self.settled.get(name, float("inf")) - since for name, (_, at) in self.stored.items() if at <= since]
+        return max(waits, default=0.0)
+
+
+def told(journals: Iterable[Path]) -> Told:
+    """Read the journals of all generators."""
+    out = Told({}, {})
+    for journal in journals:
+        for line in journal.read_text().splitlines():
+            if line[:2] not in ("+ ", "- "):
+                continue  # something else that the generator said
+            sign, vehicle, boot, _, region, seq, records, at = line.split()
+            name = (vehicle, int(boot), int(region), int(seq))
+            if sign == "+":
+                out.stored[name] = (int(records), float(at))
+            else:
+                out.settled.setdefault(name, float(at))
+    return out
+
+
+def take(journals: Iterable[Path], archive: Path) -> Census:
+    """Compare the journals with the whole archive."""
+    stored, settled = told(journals)
+    held, doubled, rows = _archived(archive, {name[0] for name in stored})
+    missing = {name for name, (records, _) in stored.items() if held.get(name, 0) < records}
+    return Census(
+        len(stored), len(settled.keys() & stored.keys()), len(missing & settled.keys()), len(missing), doubled, rows,
+        sum(records for records, _ in stored.values()),
+    )  # fmt: skip
+
+
+def _archived(archive: Path, vehicles: set[str]) -> tuple[dict[Name, int], int, int]:
+    """Distinct rows of every archived batch; rows that are there again; all rows."""
+    columns = ["vehicle", "boot", "region", "seq", "row"]
+    tables = list(reading.read(archive, Kind.OBSERVATION, columns))
+    if not tables:
+        return {}, 0, 0
+    whole = pa.concat_tables(tables)
+    found = whole.group_by(columns[:-1]).aggregate([("row", "count_distinct")]).to_pydict()
+    pseudonyms, now = Pseudonyms(archive / "keys"), time.time_ns()
+    name_of = {pseudonyms.of(vehicle, now - ago): vehicle for vehicle in vehicles for ago in (0, HOUR_NS)}
+    names = zip(
+        (name_of.get(p, p) for p in found["vehicle"]), found["boot"], found["region"], found["seq"], strict=True
+    )
+    held = dict(zip(names, found["row_count_distinct"], strict=True))
+    return held, whole.num_rows - sum(held.values()), whole.num_rows

@@ -1,0 +1,125 @@
+"""kill -9 during compaction, again and again, while a log is written to and a reader reads.
+
+`python -m tests.faults.compaction ARCHIVE` compacts for ever, in small rounds; the campaign kills it at random moments.
+"""
+
+from __future__ import annotations
+
+import random
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterable
+from contextlib import closing
+from pathlib import Path
+from typing import Final
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from fleet_service.archive import layout, reading
+from fleet_service.archive.compaction import compact
+from fleet_service.archive.log import Log
+from schemas.figures import Figure
+from schemas.wire import Kind
+from tests.faults.bars import figure
+from tests.faults.crash_model import ROWS, Batch, rows_of
+from tests.faults.frame import Site
+from tests.faults.processes import Part
+
+BATCHES: Final = 50  # to a segment
+PAUSE_S: Final = 0.05  # between two segments
+ROUND_ROWS: Final = 1000
+UNTIL_KILL_S: Final = (0.0, 0.6)  # since it began: a round takes a tenth of a second
+
+
+class Writing:
+    """A log that grows in a thread until closed; every seq up to `acknowledged` is durable."""
+
+    def __init__(self, root: Path) -> None:
+        self.acknowledged = 0
+        self._log: Log[Batch] = Log(root, "shard")
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._write)
+        self._thread.start()
+
+    def _write(self) -> None:
+        while not self._stop.wait(PAUSE_S):
+            first = self.acknowledged + 1
+            batches = [Batch(Kind.OBSERVATION, seq) for seq in range(first, first + BATCHES)]
+            self._log.add(Kind.OBSERVATION, rows_of(batches), batches)
+            self.acknowledged += len(self._log.flush())
+
+    def close(self) -> None:
+        """Stop writing."""
+        self._stop.set()
+        self._thread.join()
+
+
+class Reading:
+    """A reader in a thread until closed; counts its reads and those that were not each row once."""
+
+    def __init__(self, root: Path, writing: Writing) -> None:
+        self.reads = self.incomplete = 0
+        self._root, self._writing = root, writing
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._read)
+        self._thread.start()
+
+    def _read(self) -> None:
+        while not self._stop.is_set():
+            owed = self._writing.acknowledged
+            whole = reading.read(self._root, Kind.OBSERVATION, ["seq", "row"])
+            self.incomplete += not complete(whole, owed)
+            self.incomplete += not complete(outside(self._root), 0)
+            self.reads += 2
+
+    def close(self) -> None:
+        """Stop reading."""
+        self._stop.set()
+        self._thread.join()
+
+
+def outside(root: Path) -> Iterable[pa.Table]:
+    """What a tool that knows nothing of us reads: the compacted files alone, as they are listed at one moment."""
+    for path in list(layout.compacted(root, Kind.OBSERVATION)):
+        yield pq.read_table(path, columns=["seq", "row"], partitioning=None)
+
+
+def complete(tables: Iterable[pa.Table], owed: int) -> bool:
+    """Whether the rows of batches 1 … `owed` are there, and none twice."""
+    rows = Counter(p for t in tables for p in zip(t["seq"].to_pylist(), t["row"].to_pylist(), strict=True))
+    there = all((seq, row) in rows for seq in range(1, owed + 1) for row in range(ROWS))
+    return there and (not rows or max(rows.values()) == 1)
+
+
+def run(site: Site) -> list[Figure]:
+    """50 kills; in a quick run, five."""
+    root, random_ = site.folder / "archive", random.Random(site.seed)
+    part = Part("compaction", [sys.executable, "-m", "tests.faults.compaction", str(root)], site.folder)
+    with closing(Writing(root)) as writing, closing(Reading(root, writing)) as reader:
+        for _ in range(site.of(50, 5)):
+            part.start()
+            part.line_with("compacting")
+            time.sleep(random_.uniform(*UNTIL_KILL_S))
+            part.kill()
+    compact(root)
+    incomplete = reader.incomplete + (not complete(outside(root), writing.acknowledged))
+    site.say(f"{part.starts} kills, {reader.reads} reads, {writing.acknowledged} batches")
+    return [
+        figure("faults.compaction.incomplete_reads", incomplete),
+        Figure("faults.compaction.kills", part.starts, "kills"),
+        Figure("faults.compaction.reads", reader.reads, "reads"),
+    ]
+
+
+def main() -> None:
+    """Compact for ever."""
+    print("compacting", flush=True)
+    while True:
+        compact(Path(sys.argv[1]), ROUND_ROWS)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,209 @@
+"""A disk that forgets: while it is in use, power can go at any operation of the code under test.
+
+The files are real and lie in a folder; what the code does with them goes through here (`os.fsync`, `os.rename`,
+`os.unlink`, `os.mkdir`, `os.open`, `Path.open`). After power loss only what was synced is sure: the bytes of a file at
+its last fsync, and the names in a folder at its own. Of everything later any part may have reached the disk: of the
+bytes a prefix, with or without rubbish behind, and of the changes of names any that keep the order of each name.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import random
+import stat
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from unittest import mock
+
+FOLDER = -1  # instead of the number of a file
+
+
+class PowerLoss(BaseException):
+    """Nothing is executed after it; no handler of the code under test may catch it."""
+
+
+class CrashDisk:
+    """What is durable of a folder.
+
+    Args:
+        live: the folder; empty, or an image that `image` made.
+        random_: chooses what survives.
+        power: operations until power is lost; None: it stays.
+        full: operations that find the disk full, by number.
+    """
+
+    def __init__(self, live: Path, random_: random.Random, power: int | None, full: range) -> None:
+        self.live, self._random, self._power, self._full = live, random_, power, full
+        self.operations = 0
+        self._number: dict[
+            int, int
+        ] = {}  # of the files that there are now, by inode; inodes come again, numbers do not
+        self._numbers = 0
+        self._synced: dict[int, bytes] = {}
+        self._written: dict[int, bytes] = {}  # of files that have no name any more
+        self._names: dict[str, dict[str, int]] = {}
+        self._later: dict[str, list[tuple[str, int | None]]] = defaultdict(list)
+        for folder, folders, files in os.walk(live):
+            self._names[folder] = dict.fromkeys(folders, FOLDER)
+            for name in files:
+                self._names[folder][name] = number = self._new(Path(folder) / name)
+                self._synced[number] = (Path(folder) / name).read_bytes()
+
+    def _operate(self, *, needs_room: bool) -> None:
+        self.operations += 1
+        if self._power is not None and self.operations > self._power:
+            raise PowerLoss
+        if needs_room and self.operations in self._full:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def _new(self, path: Path) -> int:
+        """Number of a file that has just been made."""
+        self._numbers += 1
+        self._number[path.stat().st_ino] = self._numbers
+        return self._numbers
+
+    def _gone(self, path: Path) -> None:
+        """The file is about to lose its name."""
+        if path.exists():
+            self._written[self._number[path.stat().st_ino]] = path.read_bytes()
+
+    def _ours(self, path: object) -> bool:
+        return isinstance(path, (str, os.PathLike)) and Path(path).is_relative_to(self.live)
+
+    def _changed(self, path: str | os.PathLike[str], number: int | None) -> None:
+        self._later[str(Path(path).parent)].append((Path(path).name, number))
+
+    @contextmanager
+    def mounted(self) -> Iterator[None]:
+        """All operations on the folder go through here inside the block."""
+        calls = {"fsync": self._fsync, "rename": self._rename, "replace": self._rename, "open": self._open}
+        calls |= {"unlink": self._unlink, "remove": self._unlink, "mkdir": self._mkdir}
+        patches = [mock.patch.object(os, name, call(getattr(os, name))) for name, call in calls.items()]
+        patches.append(mock.patch.object(Path, "open", self._path_open(Path.open)))
+        for patch in patches:
+            patch.start()
+        try:
+            yield
+        finally:
+            for patch in patches:
+                patch.stop()
+
+    def _fsync(self, real: Callable[[int], None]) -> Callable[[int], None]:
+        def fsync(handle: int) -> None:
+            path, found = Path(f"/proc/self/fd/{handle}").resolve(), os.fstat(handle)
+            if self._ours(path):
+                self._operate(needs_room=not stat.S_ISDIR(found.st_mode))
+                if stat.S_ISDIR(found.st_mode):
+                    for name, number in self._later.pop(str(path), []):
+                        _apply(self._names.setdefault(str(path), {}), name, number)
+                else:
+                    self._synced[self._number[found.st_ino]] = path.read_bytes()
+
+        return fsync
+
+    def _rename(self, real: Callable[..., None]) -> Callable[..., None]:
+        def rename(source: Path, target: Path) -> None:
+            if self._ours(source):
+                self._operate(needs_room=False)
+                self._gone(Path(target))
+                self._changed(source, None)
+                self._changed(target, self._number[Path(source).stat().st_ino])
+            real(source, target)
+
+        return rename
+
+    def _unlink(self, real: Callable[..., None]) -> Callable[..., None]:
+        def unlink(path: Path, **more: object) -> None:
+            if self._ours(path):
+                self._operate(needs_room=False)
+                self._gone(Path(path))
+                real(path, **more)
+                self._changed(path, None)
+            else:
+                real(path, **more)
+
+        return unlink
+
+    def _mkdir(self, real: Callable[..., None]) -> Callable[..., None]:
+        def mkdir(path: Path, *more: object, **named: object) -> None:
+            if self._ours(path):
+                self._operate(needs_room=True)
+                real(path, *more, **named)
+                self._changed(path, FOLDER)
+            else:
+                real(path, *more, **named)
+
+        return mkdir
+
+    def _open(self, real: Callable[..., int]) -> Callable[..., int]:
+        def open_(path: Path, flags: int, *more: object, **named: object) -> int:
+            new = bool(flags & os.O_CREAT) and self._ours(path) and not Path(path).exists()
+            if new:
+                self._operate(needs_room=True)
+            handle = real(path, flags, *more, **named)
+            if new:
+                self._changed(path, self._new(Path(path)))
+            return handle
+
+        return open_
+
+    def _path_open(self, real: Callable[..., object]) -> Callable[..., object]:
+        disk = self
+
+        class Raw(io.FileIO):
+            def write(self, data: bytes) -> int:
+                disk._operate(needs_room=True)
+                return super().write(data)
+
+        def open_(path: Path, mode: str = "r", *more: object, **named: object) -> object:
+            if not disk._ours(path) or "w" not in mode:
+                return real(path, mode, *more, **named)
+            new = not path.exists()
+            disk._operate(needs_room=new)
+            raw = Raw(path, "w")
+            if new:
+                disk._changed(path, disk._new(path))
+            file = io.BufferedWriter(raw)
+            return file if "b" in mode else io.TextIOWrapper(file, encoding="utf-8")
+
+        return open_
+
+    def image(self, target: Path) -> None:
+        """What a machine finds after power loss at this moment, as a folder."""
+        there = [Path(folder) / name for folder, _, files in os.walk(self.live) for name in files]
+        numbered = {self._number.get(path.stat().st_ino): path for path in there}
+        written = {number: path.read_bytes() for number, path in numbered.items() if number is not None}
+        self._image(str(self.live), target, {**self._written, **written})
+
+    def _image(self, folder: str, target: Path, written: dict[int, bytes]) -> None:
+        target.mkdir()
+        names = dict(self._names.get(folder, {}))
+        dropped: set[str] = set()
+        for name, number in self._later.get(folder, []):
+            if name not in dropped and self._random.random() < 0.5:
+                _apply(names, name, number)
+            else:
+                dropped.add(name)  # a later change of the same name cannot overtake this one
+        for name, number in names.items():
+            if number == FOLDER:
+                self._image(f"{folder}/{name}", target / name, written)
+            else:
+                (target / name).write_bytes(self._survives(self._synced.get(number), written[number]))
+
+    def _survives(self, synced: bytes | None, written: bytes) -> bytes:
+        """Bytes of a file: the synced ones, or a prefix of what was written since, and rubbish."""
+        if written == synced:
+            return synced
+        kept = written[: self._random.randint(0, len(written))]
+        return kept + self._random.randbytes(len(written) - len(kept)) * self._random.randint(0, 1)
+
+
+def _apply(names: dict[str, int], name: str, number: int | None) -> None:
+    if number is None:
+        names.pop(name, None)
+    else:
+        names[name] = number

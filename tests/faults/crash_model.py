@@ -1,0 +1,187 @@
+"""Histories of a log on a disk that forgets: power lost at any operation, torn writes, a full disk, compaction.
+
+A history is a few lives of one archive. In each, batches are let in, segments written, compacted; then the power goes
+at a random operation, and the next life finds what the disk kept. What was acknowledged must be there, each row once,
+and a batch may only count as held if it is. In the last life everything that was not acknowledged is sent again.
+"""
+
+from __future__ import annotations
+
+import logging
+import random
+import shutil
+import tempfile
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_service.archive import layout, reading, segments
+from fleet_service.archive.compaction import compact
+from fleet_service.archive.log import Log
+from fleet_service.archive.rebuild import restore_streams
+from fleet_service.archive.segments import Rows
+from fleet_service.streams import Streams
+from schemas import grid
+from schemas.figures import Figure
+from schemas.wire import Kind
+from tests.faults.bars import figure
+from tests.faults.crash_disk import CrashDisk, PowerLoss
+from tests.faults.crash_spool import spool_history
+from tests.faults.frame import Site
+
+VEHICLE: Final = 7
+LIVES: Final = 3
+STEPS: Final = 7
+ROWS: Final = 2  # of a batch: in two zones, so that compaction has partitions to get wrong
+START: Final = 1_728_000_000_000_000_000
+CELLS: Final = grid.cell_of(np.array([57.7, 57.7]), np.array([11.97, 15.97]))
+
+
+class Batch(NamedTuple):
+    """One batch of the history."""
+
+    kind: Kind
+    seq: int
+
+
+def rows_of(batches: list[Batch]) -> Rows:
+    """Rows of batches of one kind as the log takes them."""
+    kind, n = batches[0].kind, ROWS * len(batches)
+    rows: Rows = {"told": np.ones(n, bool), "log_likelihood": np.zeros((n, 32), np.uint8)}
+    for f in segments.SCHEMAS[kind]:
+        if f.name not in rows:
+            rows[f.name] = np.full(n, "") if f.type == pa.string() else np.zeros(n, np.int64)
+    seq, row = np.repeat([batch.seq for batch in batches], ROWS), np.tile(np.arange(ROWS), len(batches))
+    rows |= {"seq": seq, "row": row, "boot": seq * 0 + 1, "region": seq * 0 + 1, "first_held": seq * 0 + 1}
+    rows["vehicle"], rows["late"] = np.full(n, VEHICLE.to_bytes(8).hex()), np.zeros(n, bool)
+    rows["cell"], rows[layout.TIME[kind]] = CELLS[row], START + seq
+    return rows
+
+
+class History:
+    """One history by its number."""
+
+    def __init__(self, number: int, folder: Path) -> None:
+        self.random, self.folder = random.Random(number), folder
+        self.acknowledged: set[Batch] = set()
+        self.sent: list[Batch] = []
+
+    def violations(self) -> list[str]:
+        """What was wrong in it."""
+        live = self.folder / "life-0"
+        live.mkdir()
+        found: list[str] = []
+        for life in range(LIVES):
+            last = life == LIVES - 1
+            start = self.random.randint(0, 60)
+            full = range(start, start + self.random.choice((0, 0, 3, 10)))
+            disk = CrashDisk(
+                live, self.random, None if last else self.random.randint(0, 80), range(0) if last else full
+            )
+            with disk.mounted(), suppress(PowerLoss):
+                self._live(live, last)
+            if not last:
+                live = self.folder / f"life-{life + 1}"
+                disk.image(live)
+            found += [f"life {life}: {problem}" for problem in self._problems(live, last)]
+        return found
+
+    def _live(self, root: Path, last: bool) -> None:
+        with suppress(OSError):  # a service that finds the disk full at its start says so and ends
+            log: Log[Batch] = Log(root, "shard")
+            streams = Streams()
+            restore_streams(root, streams)
+            for _ in range(STEPS):
+                self._step(root, log, streams)
+            if last:
+                self._let_in(log, streams, self.sent)
+                self.acknowledged.update(log.flush())
+
+    def _step(self, root: Path, log: Log[Batch], streams: Streams) -> None:
+        chance = self.random.random()
+        if chance < 0.45:
+            new = [self._batch() for _ in range(self.random.randint(1, 3))]
+            again = self.random.sample(self.sent, min(2, len(self.sent)))
+            self._let_in(log, streams, new + again)
+        elif chance < 0.8:
+            with suppress(OSError):
+                self.acknowledged.update(log.flush())
+        else:
+            with suppress(OSError):
+                compact(root, round_rows=self.random.choice((1, 5, 1000)))
+
+    def _batch(self) -> Batch:
+        kind = Kind.STATE if self.random.random() < 0.2 else Kind.OBSERVATION
+        self.sent.append(Batch(kind, 1 + sum(batch.kind is kind for batch in self.sent)))
+        return self.sent[-1]
+
+    def _let_in(self, log: Log[Batch], streams: Streams, batches: list[Batch]) -> None:
+        for kind in Kind:
+            stream = streams[VEHICLE, 1, kind, 1]
+            new = [b for b in dict.fromkeys(batches) if b.kind is kind and not stream.admitted(b.seq)]
+            if new:
+                for batch in new:
+                    stream.admit(batch.seq)
+                log.add(kind, rows_of(new), new)
+
+    def _problems(self, root: Path, last: bool) -> list[str]:
+        """Of the archive as the next life finds it."""
+        streams = Streams()
+        with suppress(FileNotFoundError):
+            restore_streams(root, streams)
+        found: list[str] = []
+        for kind in Kind:
+            tables = list(reading.read(root, kind, ["seq", "row"]))
+            rows = Counter(
+                pair for t in tables for pair in zip(t["seq"].to_pylist(), t["row"].to_pylist(), strict=True)
+            )
+            found += [f"{kind} {pair} is there {count} times" for pair, count in rows.items() if count > 1]
+            owed = {b.seq for b in (self.sent if last else self.acknowledged) if b.kind is kind}
+            held = {seq for seq, _ in rows}
+            found += [f"{kind} {seq} is lost" for seq in sorted(owed) for row in range(ROWS) if not rows[seq, row]]
+            stream = streams[VEHICLE, 1, kind, 1]
+            found += [f"{kind} {b.seq} only counts as held" for b in self.sent
+                      if b.kind is kind and stream.admitted(b.seq) and b.seq not in held]  # fmt: skip
+        return found
+
+
+def history(number: int) -> list[str]:
+    """Violations of one history of the log."""
+    folder = Path(tempfile.mkdtemp(prefix="crash-", dir=_memory()))
+    try:
+        return History(number, folder).violations()
+    finally:
+        shutil.rmtree(folder)
+
+
+def _memory() -> str | None:
+    """A folder in memory, where there is one: the disk that forgets is ours, not the machine's."""
+    return "/dev/shm" if Path("/dev/shm").is_dir() else None
+
+
+def run(site: Site) -> list[Figure]:
+    """5 000 histories of the log and 500 of the spool; in a quick run, a hundred and ten."""
+    logs, spools = site.of(5000, 100), site.of(500, 10)
+    first, bad = site.seed * 1_000_000, 0
+    with ProcessPoolExecutor(mp_context=get_context("spawn"), initializer=_quiet) as pool:
+        for kind, one, count in (("log", history, logs), ("spool", spool_history, spools)):
+            for number, found in enumerate(pool.map(one, range(first, first + count), chunksize=10)):
+                bad += bool(found)
+                for problem in found[:3]:
+                    site.say(f"{kind} history {first + number}: {problem}")
+                if (number + 1) % 500 == 0:
+                    site.say(f"{number + 1} histories of the {kind}, {bad} with a violation so far")
+    return [
+        figure("faults.crash_model.violations", bad),
+        Figure("faults.crash_model.histories", logs + spools, "histories"),
+    ]
+
+
+def _quiet() -> None:
+    logging.getLogger(reading.__name__).setLevel(logging.ERROR)  # torn files are set aside all the time

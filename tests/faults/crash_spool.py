@@ -1,0 +1,90 @@
+"""Histories of the agent's spool: power lost at any byte that SQLite had not yet synced.
+
+SQLite writes by itself, so its files are looked at from outside: before and after each commit. When a commit has
+returned its bytes are synced; what power loss leaves in the middle of the next one is the old files with a part of the
+new log, or, when the log was folded into the database, any mixture of old and new pages beside the old log.
+"""
+
+from __future__ import annotations
+
+import random
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from edge_agent.spool import Draft, Spool, Stream
+from schemas.wire import Kind
+
+PAGE: Final = 4096
+COMMITS: Final = 6
+CAPACITY: Final = 10**9
+
+
+class Files(NamedTuple):
+    """Bytes of the database and of its log."""
+
+    database: bytes
+    log: bytes
+
+    @staticmethod
+    def of(path: Path) -> Files:
+        log = Path(f"{path}-wal")
+        return Files(path.read_bytes(), log.read_bytes() if log.exists() else b"")
+
+
+def spool_history(number: int) -> list[str]:
+    """Violations of one history."""
+    random_, folder = random.Random(number), Path(tempfile.mkdtemp(prefix="spool-"))
+    try:
+        return _history(random_, folder)
+    finally:
+        shutil.rmtree(folder)
+
+
+def _history(random_: random.Random, folder: Path) -> list[str]:
+    path, boot = folder / "spool.sqlite", 5
+    spool = Spool(path, boot=boot, capacity_bytes=CAPACITY)
+    stream, held, found = Stream("car-a", boot, Kind.OBSERVATION, 1), {0: b""}, []
+    held.clear()
+    for _ in range(COMMITS):
+        before, sure = Files.of(path), set(held)
+        settled = {seq for seq in held if random_.random() < 0.3}
+        spool.settle(stream, [(seq, seq) for seq in settled])
+        payload = random_.randbytes(random_.choice((50, 3000, 400_000)))
+        batches = spool.store([Draft("car-a", Kind.OBSERVATION, 1, 1, lambda s, f, p=payload: p)] * 2, 0.0)  # type: ignore[misc]
+        held.update({batch.seq: batch.payload for batch in batches})
+        after = Files.of(path)
+        for image in (after, _torn(random_, before, after)):
+            owed = sure - settled if image is not after else set(held) - settled
+            found += _problems(folder / "image.sqlite", image, owed, held)
+        for seq in settled:
+            del held[seq]
+    spool.close()
+    return found
+
+
+def _torn(random_: random.Random, before: Files, after: Files) -> Files:
+    """What power loss during the commit may leave."""
+    if before.database != after.database and random_.random() < 0.5:
+        pages = range(0, max(len(before.database), len(after.database)), PAGE)
+        chosen = (random_.choice((before, after)).database[at : at + PAGE].ljust(PAGE, b"\0") for at in pages)
+        return Files(b"".join(chosen), before.log)
+    cut = random_.randint(0, len(after.log))
+    database = before.database if before.database == after.database else after.database
+    rubbish = random_.randbytes(random_.choice((0, 7, PAGE)))
+    rest = before.log[cut:] if cut < len(before.log) else rubbish
+    return Files(database, after.log[:cut] + rest)
+
+
+def _problems(path: Path, image: Files, owed: set[int], known: dict[int, bytes]) -> list[str]:
+    path.write_bytes(image.database)
+    Path(f"{path}-wal").write_bytes(image.log)
+    Path(f"{path}-shm").unlink(missing_ok=True)
+    again = Spool(path, boot=6, capacity_bytes=CAPACITY)
+    there = {batch.seq: batch.payload for batch in again.due(0.0, 10**6)}
+    again.close()
+    found = [f"batch {seq} is lost" for seq in owed - there.keys()]
+    return found + [
+        f"batch {seq} is not what was stored" for seq, payload in there.items() if known.get(seq) != payload
+    ]

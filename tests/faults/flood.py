@@ -1,0 +1,228 @@
+"""One vehicle sends as fast as it can, and the others go on: how long they wait, and what it does to the map.
+
+What it sends is true, so that it should count as one vehicle that sent it once a second. The map with the flood is held
+against one that an engine without a network makes of the same honest batches and that.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pyarrow as pa
+import zenoh
+
+from fleet_service.engine import Engine
+from fleet_service.ingest import Message
+from schemas import grid, keys, query, wire
+from schemas.config import ServiceConfig
+from schemas.figures import Figure
+from schemas.tiles import decode_tile
+from schemas.wire import Batch, Kind
+from tests.faults.bars import figure
+from tests.faults.frame import Site
+from tests.fleet_service.examples import LATITUDE, LONGITUDE, SECOND, batch, key
+from tests.secured import READER, ROUTERS, SERVICE, Network, enrolment, network, settings
+from tests.waiting import until
+
+HONEST: Final = tuple(f"car-{number:03}" for number in range(10))
+FLOODER: Final = "flood-001"
+CELLS: Final = 20
+FLOODED_MU: Final = 0.8
+EVERY_S: Final = 0.5  # of each honest vehicle
+RESEND_S: Final = 2.0  # as a spool does
+START_S: Final = 300.0  # the first start compiles the kernels
+_ASKED: Final = "gripmap/v1/map/**"
+
+
+def places() -> list[tuple[int, float, float]]:
+    """The road: cell, latitude and longitude."""
+    longitudes = [LONGITUDE + 2e-4 * place for place in range(CELLS)]
+    return [(int(grid.cell_of(LATITUDE, one)), LATITUDE, one) for one in longitudes]
+
+
+def visit(name: str, seq: int, now: int) -> Batch:
+    """One visit of a vehicle; it goes round the road."""
+    cell, latitude, longitude = places()[(seq + hash_of(name)) % CELLS]
+    mu = FLOODED_MU if name == FLOODER else 0.75 + 0.01 * (hash_of(name) % 10)
+    return batch(name, seq, now, [mu], cell=[cell], latitude=[latitude], longitude=[longitude])
+
+
+def hash_of(name: str) -> int:
+    """A number of a name, the same in every run."""
+    return sum(name.encode())
+
+
+@dataclass
+class Honest:
+    """An honest vehicle: sends, sends again what is not settled, and notes how long each took."""
+
+    session: zenoh.Session
+    name: str
+    sent: dict[int, tuple[Batch, float]] = field(default_factory=dict)
+    delays: dict[int, float] = field(default_factory=dict)
+    resent: int = 0
+
+    def __post_init__(self) -> None:
+        self._last: dict[int, float] = {}  # when each unsettled one was put last [s]
+        self._acks = self.session.declare_subscriber(keys.ack_key(self.name), self._hear)
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        now = time.monotonic()
+        for stream in wire.decode_ack(sample.payload.to_bytes())[1]:
+            for first, last in stream.durable:
+                for seq in range(first, last + 1):
+                    self.delays.setdefault(seq, now - self.sent[seq][1])
+
+    def _put(self, one: Batch) -> None:
+        self.session.put(
+            key(self.name), wire.encode(one), encoding=wire.ENCODING[Kind.OBSERVATION],
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )  # fmt: skip
+
+    def drive(self) -> None:
+        """Send the next one."""
+        seq = len(self.sent) + 1
+        one = visit(self.name, seq, time.time_ns())
+        self._last[seq] = time.monotonic()
+        self.sent[seq] = (one, self._last[seq])
+        self._put(one)
+
+    def resend(self) -> None:
+        """Send again what waits for longer than a spool waits."""
+        now = time.monotonic()
+        for seq in [seq for seq in self._last if seq in self.delays]:
+            del self._last[seq]
+        for seq, at in self._last.items():
+            if now - at > RESEND_S:
+                self._last[seq] = now
+                self.resent += 1
+                self._put(self.sent[seq][0])
+
+
+def run(site: Site) -> list[Figure]:
+    """Half a minute of flood, or three seconds."""
+    seconds = site.of(30, 3)
+    fleet = enrolment(vehicles=[*HONEST, FLOODER])
+    with network(site.folder / "certificates", fleet=fleet) as running:
+        service = _service(site.folder, running)
+        try:
+            honest = [Honest(running.session(name, ROUTERS[k % 2]), name) for k, name in enumerate(HONEST)]
+            _drive(honest, 4 * EVERY_S)
+            _settle(honest)
+            before = max(delay for one in honest for delay in one.delays.values())
+            site.say(f"without a flood the longest delay is {before:.2f} s")
+            first = {one.name: len(one.sent) for one in honest}
+            put = _flood(running, honest, seconds)
+            _settle(honest)
+            delays = np.array([d for one in honest for seq, d in one.delays.items() if seq > first[one.name]])
+            table = _map(running)
+            with_flood = time.time_ns()
+            for one in honest:
+                one.session.close()
+        finally:
+            service.terminate()
+            service.wait(20.0)
+    expected = _without(site.folder / "calm", honest, seconds, with_flood)
+    site.say(f"{put / seconds:.0f} messages/s of flood; honest delays p50 {np.median(delays):.2f} s")
+    return [
+        figure("faults.flood.honest_delay_s", float(delays.max())),
+        figure("faults.flood.map_difference", _difference(table, expected, honest)),
+        Figure("faults.flood.rate", put / seconds, "messages/s"),
+        Figure("faults.flood.honest_delay_p50_s", float(np.median(delays)), "s"),
+        Figure("faults.flood.calm_delay_s", before, "s"),
+        Figure("faults.flood.honest_resent", sum(one.resent for one in honest), "batches"),
+    ]
+
+
+def _service(folder: Path, running: Network) -> subprocess.Popen[bytes]:
+    """The service as a process; returns when it listens."""
+    config = ServiceConfig(zenoh=settings(running.endpoints[ROUTERS[0]], running.folder), name=SERVICE)
+    file, log = folder / "service.json", folder / "service.log"
+    file.write_text(config.model_dump_json())
+    command = [
+        Path(sys.executable).with_name("fleet-service"),
+        "run",
+        "--config",
+        file,
+        "--archive",
+        folder / "archive",
+    ]
+    with log.open("wb") as out:
+        process = subprocess.Popen(command, stdout=out, stderr=out)
+    until(lambda: "ready" in log.read_text() or process.poll() is not None, START_S)
+    return process
+
+
+def _drive(honest: Sequence[Honest], seconds: float) -> None:
+    end, pause = time.monotonic() + seconds, threading.Event()
+    while time.monotonic() < end:
+        for one in honest:
+            one.drive()
+            one.resend()
+            pause.wait(EVERY_S / len(honest))
+
+
+def _settle(honest: Sequence[Honest]) -> None:
+    def settled() -> bool:
+        for one in honest:
+            one.resend()
+        return all(len(one.delays) == len(one.sent) for one in honest)
+
+    until(settled, 60.0)
+
+
+def _flood(running: Network, honest: Sequence[Honest], seconds: float) -> int:
+    """Let them drive while the flood runs; returns how many messages it put."""
+    told = {
+        "settings": settings(running.endpoints[ROUTERS[0]], running.folder).model_dump(),
+        "name": FLOODER,
+        "cells": places(),
+        "mu": FLOODED_MU,
+        "seconds": seconds,
+    }
+    command = [sys.executable, "-m", "tests.faults.flooder"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdin
+        assert process.stdout
+        print(json.dumps(told), file=process.stdin, flush=True)
+        assert process.stdout.readline(), "the flooder does not open a session"
+        _drive(honest, seconds)
+        return int(process.stdout.readline())
+
+
+def _map(running: Network) -> pa.Table:
+    with running.session(READER) as session:
+        replies = [reply.ok.payload.to_bytes() for reply in session.get(_ASKED) if reply.ok]
+    return pa.concat_tables([decode_tile(payload) for payload in replies])
+
+
+def _without(folder: Path, honest: Sequence[Honest], seconds: float, now: int) -> pa.Table:
+    """The map of the same honest visits, and of the flooder at one visit a second, round the road once at least."""
+    sent = [one for vehicle in honest for one, _ in vehicle.sent.values()]
+    began = min(int(one.columns["leave_time"][0]) for one in sent)
+    rounds = max(int(seconds), CELLS)
+    sent += [visit(FLOODER, 1 + k, began + k * int(seconds) * SECOND // rounds) for k in range(rounds)]
+    engine = Engine(ServiceConfig(), folder)
+    for one in sorted(sent, key=lambda one: int(one.columns["leave_time"][0])):
+        engine.take([Message(one.kind, key(one.vehicle), wire.encode(one), wire.ENCODING[one.kind])], now)
+    tiles = engine.answer(query.parse({}), lambda _: True, now)
+    engine.close()
+    return pa.concat_tables([decode_tile(payload) for _, payload in tiles])
+
+
+def _difference(found: pa.Table, expected: pa.Table, honest: Sequence[Honest]) -> float:
+    """The largest difference of mu over the cells of the honest vehicles; NaN if one is missing."""
+    driven = {int(sent.columns["cell"][0]) for one in honest for sent, _ in one.sent.values()}
+    mu = [dict(zip(table["cell"].to_pylist(), table["mu"].to_pylist(), strict=True)) for table in (found, expected)]
+    if not driven <= mu[0].keys() & mu[1].keys():
+        return float("nan")
+    return max(abs(mu[0][cell] - mu[1][cell]) for cell in driven)

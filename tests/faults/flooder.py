@@ -1,0 +1,54 @@
+"""`python -m tests.faults.flooder`: one enrolled vehicle that sends good observations as fast as it can.
+
+Reads one line of JSON: settings, name, cells (cell, latitude, longitude), mu, seconds. Prints how many messages it put.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+
+import zenoh
+
+from schemas import wire
+from schemas.config import ZenohSettings
+from schemas.proto import gripmap_pb2 as pb
+from schemas.transport import configuration
+from schemas.wire import Kind
+from tests.fleet_service.examples import SECOND, batch, key
+
+ROWS = (1, 1, 1, 50)  # the smallest messages cost most for their size, the largest most at all
+
+
+def main() -> None:
+    """Send until the time is over."""
+    told = json.loads(sys.stdin.readline())
+    name, cells = told["name"], told["cells"]
+    messages = [
+        pb.ObservationBatch.FromString(wire.encode(batch(
+            name, 1, time.time_ns(), [told["mu"]] * rows, cell=[cell] * rows, latitude=[latitude] * rows,
+            longitude=[longitude] * rows,
+        )))
+        for cell, latitude, longitude in cells
+        for rows in ROWS
+    ]  # fmt: skip
+    session = zenoh.open(configuration(ZenohSettings.model_validate(told["settings"]), name))
+    place, encoding, block = key(name), wire.ENCODING[Kind.OBSERVATION], zenoh.CongestionControl.BLOCK
+    print("ready", flush=True)
+    end, sent = time.monotonic() + told["seconds"], 0
+    while time.monotonic() < end:
+        message = messages[sent % len(messages)]
+        sent += 1
+        now = time.time_ns()
+        message.seq = sent
+        message.leave_time[:] = [now] * len(message.leave_time)
+        message.enter_time[:] = [now - SECOND] * len(message.leave_time)
+        session.put(place, message.SerializeToString(), encoding=encoding, congestion_control=block)
+    print(sent, flush=True)
+    os._exit(0)  # a session that is still being read out would hold the process
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,82 @@
+"""The frame of the fault campaigns: a plain list of them, run one after the other, each in a folder of its own.
+
+A campaign is a function from a `Site` to figures. One with a bar is made by `bars.figure(name, value)`; what only tells
+how hard it was (kills, rates) is a `Figure` without a bar. To add one: write `tests/faults/NAME.py` with
+`def run(site: Site) -> list[Figure]`, and name it in `campaigns.py` with the figures that it owes.
+
+`quick` is for `make check`: seconds, the same mechanism, smaller numbers. A figure that is owed and not given fails.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from schemas import figures
+from schemas.figures import Figure
+from tests.faults.bars import figure
+
+
+@dataclass(frozen=True)
+class Site:
+    """Where and how a campaign runs.
+
+    Attributes:
+        folder: empty, its own; kept for inspection when a bar does not hold.
+        quick: seconds instead of minutes.
+        seed: of everything random.
+        say: takes a line of progress.
+    """
+
+    folder: Path
+    quick: bool
+    seed: int
+    say: Callable[[str], None]
+
+    def of(self, full: int, quick: int) -> int:
+        """One of two numbers, by how long it may take."""
+        return quick if self.quick else full
+
+
+class Campaign(NamedTuple):
+    """A campaign by name, and the figures that it owes; in a quick run it may be left out."""
+
+    name: str
+    run: Callable[[Site], list[Figure]]
+    owes: tuple[str, ...]
+    in_quick: bool = True
+
+
+def conduct(campaigns: Sequence[Campaign], out: Path, title: str, quick: bool, seed: int) -> list[Figure]:
+    """Run them, with progress on stderr; writes `out/figures.json` and `out/figures.md`, returns all figures."""
+    found: list[Figure] = []
+    out.mkdir(parents=True, exist_ok=True)
+    for campaign in campaigns:
+        found += _one(campaign, out, quick, seed)
+        figures.write(out / "figures.json", title, [seed], found)
+        (out / "figures.md").write_text(figures.markdown(found) + "\n")
+    return found
+
+
+def _one(campaign: Campaign, out: Path, quick: bool, seed: int) -> list[Figure]:
+    folder, began = out / campaign.name, time.monotonic()
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+
+    def say(line: str) -> None:
+        print(f"{time.monotonic() - began:7.1f} s  {campaign.name}: {line}", file=sys.stderr, flush=True)
+
+    say("begins")
+    found = campaign.run(Site(folder, quick, seed, say))
+    missing = [name for name in campaign.owes if name not in {one.name for one in found}]
+    found += [figure(name, float("nan")) for name in missing]
+    failed = [one.name for one in found if not one.holds]
+    say(f"DOES NOT HOLD: {', '.join(failed)}; see {folder}" if failed else "holds")
+    if not failed:
+        shutil.rmtree(folder)
+    return found

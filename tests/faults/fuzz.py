@@ -1,0 +1,172 @@
+"""Malformed messages and queries among honest ones, through the whole engine: admission, fusion, archive, answers.
+
+The oracle knows nothing of the service's own rules: it looks at the archive, where every value must be finite or absent
+and within what the units allow, and where every honest row must lie once.
+"""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.dataset as ds
+
+from fleet_service.engine import Engine
+from fleet_service.ingest import Message
+from schemas import grid, query, wire
+from schemas.config import ServiceConfig
+from schemas.errors import InputError, WireError
+from schemas.figures import Figure
+from schemas.tiles import decode_tile
+from schemas.wire import Kind
+from tests.faults.bars import figure
+from tests.faults.frame import Site
+from tests.faults.mutants import Mutants
+from tests.fleet_service.examples import SECOND, batch, key
+
+TURN: Final = 500  # malformed messages between two turns of the service
+HONEST: Final = ("honest-0", "honest-1", "honest-2")
+ASKED_EVERY: Final = 10  # a query for so many messages
+# What a row of the archive may hold, by its column: bounds that hold for any car on any road.
+POSSIBLE: Final = {
+    "latitude": (-85.06, 85.06), "longitude": (-180.0, 180.0), "mu": (0.0, 2.0), "mu_lower": (0.0, 2.0),
+    "mu_upper": (0.0, 2.0), "mu_utilised": (0.0, 2.0), "speed": (0.0, 100.0), "sector": (0, 3), "tyre_season": (0, 3),
+    "abs_active": (-1, 1), "air_temperature": (-90.0, 80.0), "position_std": (0.0, 100.0), "vx": (-100.0, 100.0),
+    "vy": (-100.0, 100.0), "yaw_rate": (-20.0, 20.0), "sideslip": (-4.0, 4.0), "yaw": (-1000.0, 1000.0),
+    "yaw_std": (0.0, 10.0), "health": (0, 2**31 - 1), "boot": (0, 2**63 - 1), "seq": (1, 2**63 - 1),
+    "row": (0, 49), "first_held": (1, 2**63 - 1), "weight": (0.0, 1.0),
+}  # fmt: skip
+METRES_PER_DEGREE: Final = 111_195.0
+DAY: Final = 86_400 * SECOND
+TWO_CELLS_M: Final = 45.0
+NEEDED: Final = {"latitude", "longitude"}
+
+
+def run(site: Site) -> list[Figure]:
+    """A million of them, or some thousands."""
+    count = site.of(1_000_000, 10_000)
+    began, crashes, answers = time.time_ns(), 0, 0
+    mutants = Mutants(site.seed, began)
+    engine = Engine(ServiceConfig(), site.folder / "archive")
+    honest = 0
+    for turn in range(count // TURN):
+        messages, queries = [], []
+        now = mutants.now = began + turn * SECOND
+        for place in range(TURN):
+            if place % ASKED_EVERY:
+                messages.append(mutants.message())
+            else:
+                queries.append(mutants.query())
+        honest += 1
+        messages[len(messages) // 2 : len(messages) // 2] = list(_honest(honest, now))
+        crashes += _turn(site, engine, messages, now)
+        for asked in queries:
+            failed, answered = _ask(site, engine, asked, now)
+            crashes, answers = crashes + failed, answers + answered
+        if not turn % 200:
+            site.say(f"{turn * TURN} malformed, {crashes} crashes, {engine.counts[Kind.OBSERVATION]} rows admitted")
+    counts = dict(engine.counts)
+    engine.close()
+    tiles, broken = _tiles(site, engine, now)
+    rows, impossible, found = _archived(site.folder / "archive", began, now)
+    return [
+        figure("faults.fuzz.crashes", crashes + broken),
+        figure("faults.fuzz.admitted_out_of_range", impossible),
+        figure("faults.fuzz.honest_lost", abs(honest * len(HONEST) - found)),
+        Figure("faults.fuzz.malformed", count + tiles, "messages, queries and tiles"),
+        Figure("faults.fuzz.refused", sum(n for name, n in counts.items() if name.startswith("refused.")), "messages"),
+        Figure("faults.fuzz.admitted", rows, "rows"),
+        Figure("faults.fuzz.answered", answers, "queries"),
+    ]
+
+
+def _honest(seq: int, now: int) -> Iterator[Message]:
+    for name in HONEST:
+        sent = batch(name, seq, now, [0.8])
+        yield Message(Kind.OBSERVATION, key(name), wire.encode(sent), wire.ENCODING[Kind.OBSERVATION])
+
+
+def _turn(site: Site, engine: Engine, messages: list[Message], now: int) -> int:
+    """One turn of the service's worker; 1 if anything but a refusal came of it."""
+    try:
+        engine.take(messages, now)
+        for _, ack in engine.flush():
+            wire.decode_ack(ack)
+        engine.tiles(now)
+        engine.fading(now)
+    except Exception:  # noqa: BLE001 whatever it is, it is a crash
+        site.say(traceback.format_exc())
+        return 1
+    return 0
+
+
+def _ask(site: Site, engine: Engine, asked: dict[str, str], now: int) -> tuple[int, int]:
+    """Whether a query crashed, and whether it was answered."""
+    try:
+        wanted = query.parse(asked)
+        if wanted.at is None:  # a past is a replay of the archive, minutes by now
+            engine.answer(wanted, lambda _: True, now)
+    except InputError:
+        return 0, 0
+    except Exception:  # noqa: BLE001
+        site.say(f"{asked}\n{traceback.format_exc()}")
+        return 1, 0
+    return 0, 1
+
+
+def _tiles(site: Site, engine: Engine, now: int) -> tuple[int, int]:
+    """Damaged tiles as a client reads them: how many, and how many crashes."""
+    r, crashes, count = np.random.default_rng(site.seed), 0, site.of(50_000, 1_000)
+    (_, good), *_ = engine.answer(query.parse({"bbox": "11.9,57.6,12.0,57.8"}), lambda _: True, now)
+    for _ in range(count):
+        damaged = bytearray(good)
+        for place in r.integers(0, len(damaged), r.integers(1, 9)).tolist():
+            damaged[place] = int(r.integers(256))
+        try:
+            decode_tile(bytes(damaged[: int(r.integers(len(damaged)))] if r.random() < 0.2 else damaged))
+        except WireError:
+            continue
+        except Exception:  # noqa: BLE001
+            site.say(traceback.format_exc())
+            crashes += 1
+    return count, crashes
+
+
+def _archived(root: Path, began: int, now: int) -> tuple[int, int, int]:
+    """Rows, impossible rows, and rows of the honest vehicles, in everything that was written."""
+    rows = impossible = found = 0
+    honest = _pseudonyms(root, began) | _pseudonyms(root, now)
+    for file in sorted(root.rglob("*.parquet")):
+        table = ds.dataset(file, partitioning=None).to_table()
+        bad = np.zeros(table.num_rows, bool)
+        columns = {name: table[name] for name in table.schema.names}
+        for name, (least, most) in POSSIBLE.items():
+            if name in columns:
+                values = columns[name].to_numpy()
+                absent = (
+                    np.isnan(values) if values.dtype.kind == "f" and name not in NEEDED else np.zeros(len(values), bool)
+                )
+                bad |= ~(((values >= least) & (values <= most)) | absent)
+        for name in columns.keys() & {"enter_time", "leave_time", "time"}:
+            times = columns[name].cast(pa.timestamp("ns", tz="UTC")).cast(pa.int64()).to_numpy()
+            bad |= (times < began - 31 * DAY) | (times > now + 30 * SECOND)
+        cell, latitude = columns["cell"].to_numpy(), columns["latitude"].to_numpy()
+        middle, across = grid.centre(cell)
+        north = (middle - latitude) * METRES_PER_DEGREE
+        east = (across - columns["longitude"].to_numpy()) * METRES_PER_DEGREE * np.cos(np.radians(latitude))
+        bad |= (grid.region_of(cell) != columns["region"].to_numpy()) | (np.hypot(north, east) > TWO_CELLS_M)
+        rows, impossible = rows + table.num_rows, impossible + int(bad.sum())
+        found += sum(vehicle in honest for vehicle in columns["vehicle"].to_pylist())
+    return rows, impossible, found
+
+
+def _pseudonyms(root: Path, now: int) -> set[str]:
+    from fleet_service.archive.pseudonyms import Pseudonyms
+
+    known = Pseudonyms(root / "keys")
+    return {known.of(name, now) for name in HONEST}

@@ -1,0 +1,120 @@
+"""The ground of the attacks: two routers with TLS and access list, a running service, honest parties, and ears.
+
+Nothing is waited for by sleeping. Samples of one priority keep their order on each way, so that a marker which is put
+after an attack has gone through, and is heard, shows that nothing of the attack is still to come.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import zenoh
+
+from fleet_service.service import Service
+from schemas import keys, wire
+from schemas.config import ServiceConfig
+from tests.fleet_service.examples import SECOND, TILE, batch, key
+from tests.secured import READER, ROUTERS, SERVICE, VEHICLES, Network, settings
+from tests.waiting import until
+
+HONEST, ROGUE = VEHICLES
+RESEND_S = 0.5  # after a restart of the routers
+MARKER = f"{keys.ROOT}/map/0000/000/000/0000"
+
+
+@dataclass
+class Ears:
+    """A session and all that it hears on some key expressions."""
+
+    session: zenoh.Session
+    expressions: tuple[str, ...]
+    heard: list[tuple[str, bool, bytes]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._subscribers = [self.session.declare_subscriber(one, self._hear) for one in self.expressions]
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        put = sample.kind == zenoh.SampleKind.PUT
+        self.heard.append((str(sample.key_expr), put, sample.payload.to_bytes()))
+
+    def has(self, payload: bytes) -> bool:
+        """Whether it heard this payload."""
+        return any(payload in told for _, _, told in list(self.heard))
+
+
+class Ground:
+    """What an attack finds; the rogue is enrolled as a vehicle and sits at the second router."""
+
+    def __init__(self, network: Network, service: Service, stack: ExitStack) -> None:
+        self.network, self.service, self._stack = network, service, stack
+        self.folder = network.folder
+        self.monitor = Ears(self.open(SERVICE), ("gripmap/**",))
+        self.reader = Ears(self.open(READER, ROUTERS[1]), (f"{keys.ROOT}/map/**", f"{keys.ROOT}/alert/**"))
+        self.honest = Ears(self.open(HONEST), (keys.ack_key(HONEST),))
+        self._probe = self.open(SERVICE)
+        self._marks = self._seq = 0
+
+    def open(self, name: str, router: str = ROUTERS[0], **changed: object) -> zenoh.Session:
+        """A session that is closed at the end."""
+        return self._stack.enter_context(self.network.session(name, router, **changed))
+
+    @property
+    def admitted(self) -> int:
+        """Observations that the service took in."""
+        return self.service.engine.counts[wire.Kind.OBSERVATION]
+
+    def drive(self, session: zenoh.Session | None = None, name: str = HONEST) -> None:
+        """Put a good batch of one observation until the service has it on disk, as a spool does."""
+        before, self._seq = self.monitor_acks(name), self._seq + 1
+        sent = batch(name, self._seq, time.time_ns() - SECOND, [0.8])
+        session = session or self.honest.session
+
+        def settled() -> bool:
+            session.put(key(name), wire.encode(sent), encoding=wire.ENCODING[sent.kind])
+            with suppress(TimeoutError):
+                until(lambda: self.monitor_acks(name) > before, RESEND_S)
+            return self.monitor_acks(name) > before
+
+        until(settled)
+
+    def monitor_acks(self, name: str) -> int:
+        """Acknowledgements for a vehicle so far."""
+        return sum(told == keys.ack_key(name) for told, _, _ in list(self.monitor.heard))
+
+    def passed(self, session: zenoh.Session, *ears: Ears) -> None:
+        """Return when everything that `session` did has gone through and the ears heard what it brought."""
+        list(session.get(f"{keys.ROOT}/map/**"))
+        self._marks += 1
+        mark = f"mark {self._marks}".encode()
+        self._probe.put(MARKER, mark)
+        for one in (self.monitor, self.reader, *ears):
+            until(lambda one=one: one.has(mark))  # type: ignore[misc]
+
+
+@contextmanager
+def ground(network: Network) -> Iterator[Ground]:
+    """A service behind the network, and the honest parties, connected and heard."""
+    config = ServiceConfig(
+        zenoh=settings(network.endpoints[ROUTERS[0]], network.folder), name=SERVICE, put_s=0.1, segment_s=0.05
+    )
+    lines: list[str] = []
+    service, stop = Service(config, Path(network.folder, "archive"), lines.append), threading.Event()
+    thread = threading.Thread(target=service.run, args=(stop,))
+    thread.start()
+    try:
+        until(lambda: any(line.startswith("ready") for line in lines))
+        with ExitStack() as stack:
+            found = Ground(network, service, stack)
+            # only a service is told who answers; the second router is the one further away
+            querier = found.open(SERVICE, ROUTERS[1]).declare_querier(keys.map_key(TILE))
+            until(lambda: querier.matching_status.matching)
+            querier.undeclare()
+            yield found
+    finally:
+        stop.set()
+        thread.join()

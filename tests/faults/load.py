@@ -1,0 +1,132 @@
+"""Load: observations of made-up visits through the agent's real publisher and spool, with a journal of what is safe.
+
+`python -m tests.faults.load FILE` with a JSON file of the fields of `Plan`. The journal is its standard output:
+one line per batch that was committed to the spool, and one per batch that an acknowledgement settled; unbuffered, so
+that it survives kill -9. SIGUSR1: offer nothing more, leave when everything is settled. SIGTERM: leave as an agent
+does. At the end, one line of JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from edge_agent.agent import STOPPED_DRAIN_S
+from edge_agent.observer import Records
+from edge_agent.publisher import Publisher
+from edge_agent.spool import Draft, Held, Spool, Stream
+from schemas import grid, mugrid
+from schemas.config import AgentConfig, ZenohSettings
+from schemas.wire import Columns, Kind, column_types
+
+BLOCK_S = 0.1
+PLACE = (57.70, 11.97)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What one generator does; `rate` is observations per second and vehicle."""
+
+    endpoint: str
+    names: list[str]
+    rate: float
+    spool: str
+    seed: int = 0
+    flush_s: float = 0.5
+    capacity_mb: float = 256.0
+    cells_across: int = 64  # of the square that the vehicles drive in
+
+
+def note(sign: str, events: Iterable[tuple[Stream, int, int]]) -> None:
+    """Tell `+ vehicle boot kind region seq records time` of what is on disk, `- …` of what is settled."""
+    at = f"{time.time():.3f}"
+    for stream, seq, records in events:
+        os.write(sys.stdout.fileno(), f"{sign} {' '.join(map(str, stream))} {seq} {records} {at}\n".encode())
+
+
+class WatchedSpool(Spool):
+    """The agent's spool, with a journal."""
+
+    def store(self, drafts: Sequence[Draft], now: float) -> list[Held]:
+        held = super().store(drafts, now)
+        note("+", ((batch.stream, batch.seq, batch.records) for batch in held))
+        return held
+
+    def settle(self, stream: Stream, ranges: Iterable[tuple[int, int]]) -> int:
+        told = list(ranges)
+        note("-", ((stream, seq, 0) for first, last in told for seq in range(first, last + 1)))
+        return super().settle(stream, told)
+
+
+def visits(rng: np.random.Generator, vehicle: np.ndarray, now: int, cells_across: int) -> Records:  # type: ignore[type-arg]
+    """One made-up visit per element of `vehicle` (n,), all just left; now [ns]."""
+    n = len(vehicle)
+    columns: Columns = {}
+    for name, dtype in column_types(Kind.OBSERVATION).items():
+        columns[name] = np.zeros(n, dtype) if dtype.kind != "f" else rng.uniform(0.3, 0.9, n).astype(dtype)
+    span = cells_across * 360.0 / 2**grid.CELL_ZOOM
+    columns["latitude"], columns["longitude"] = (centre + span * rng.random(n) for centre in PLACE)
+    columns["cell"] = grid.cell_of(columns["latitude"], columns["longitude"])
+    columns["sector"] = grid.sector_of(columns["yaw"]).astype(np.int8)
+    columns["mu_lower"], columns["mu_upper"] = columns["mu"] - np.float32(0.1), columns["mu"] + np.float32(0.1)
+    columns["leave_time"] = np.full(n, now, np.int64)
+    columns["enter_time"] = columns["leave_time"] - rng.integers(300_000_000, 900_000_000, n)
+    seen = -0.5 * np.square((mugrid.CENTRES - columns["mu"][:, None]) / 0.1)
+    columns["log_likelihood"] = mugrid.encode_log_likelihood(seen)
+    return Records(Kind.OBSERVATION, columns, vehicle, np.zeros(n, bool))
+
+
+def drive(plan: Plan, publisher: Publisher, quiet: threading.Event) -> tuple[int, float]:
+    """Offer a block each BLOCK_S until `quiet`; returns the blocks that were late by one, and the longest lag [s]."""
+    rng = np.random.default_rng(plan.seed)
+    per_block, owed, late, longest = plan.rate * BLOCK_S * len(plan.names), 0.0, 0, 0.0
+    due = time.monotonic()
+    while not quiet.is_set():
+        owed += per_block
+        n = int(owed)
+        owed -= n
+        first = rng.integers(0, len(plan.names))
+        vehicles = np.sort((first + np.arange(n)) % len(plan.names)).astype(np.int64)
+        publisher.offer(visits(rng, vehicles, time.time_ns(), plan.cells_across))
+        due += BLOCK_S
+        lag = time.monotonic() - due
+        late += lag > 0.0
+        longest = max(longest, lag)
+        quiet.wait(max(0.0, -lag))
+    return late, longest
+
+
+def main(path: str) -> int:
+    """Run one generator."""
+    plan = Plan(**json.loads(Path(path).read_text()))
+    quiet, leave = threading.Event(), threading.Event()
+    signal.signal(signal.SIGUSR1, lambda *_: quiet.set())
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: (leave.set(), quiet.set()))
+    spool = WatchedSpool(Path(plan.spool), capacity_bytes=round(plan.capacity_mb * 1e6))
+    config = AgentConfig(zenoh=ZenohSettings(connect=[plan.endpoint]), flush_s=plan.flush_s)
+    publisher = Publisher(plan.names, spool, config, "load")
+    publisher.start()
+    print("ready: load", flush=True)
+    late, longest = drive(plan, publisher, quiet)
+    while publisher.unsettled() and not leave.wait(BLOCK_S):
+        pass
+    clean = publisher.close(STOPPED_DRAIN_S)
+    told = {"late_blocks": late, "longest_lag_s": round(longest, 3), "unsettled": publisher.unsettled()}
+    print(json.dumps({**told, "dropped": publisher.dropped, "resent": publisher.counts.resent_batches}), flush=True)
+    if not clean:
+        os._exit(0)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))

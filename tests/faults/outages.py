@@ -1,0 +1,113 @@
+"""Outages: the router gone for a minute, router and service frozen, disks full. Nothing is lost, nobody waits."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from typing import Final
+
+from schemas.figures import Figure
+from tests.faults.bars import figure
+from tests.faults.census import Census, take, told
+from tests.faults.frame import Site
+from tests.faults.processes import Part, Stage, stage
+
+AGENTS_PER_PROCESS: Final = 10
+RATE: Final = 10.0  # observations/s of each agent
+DRAIN_S: Final = 60.0
+
+
+def router_down(site: Site) -> list[Figure]:
+    """The router killed, gone for a minute, back: everything of that minute is settled soon."""
+    down_s = site.of(60, 4)
+    with stage(site.folder) as there:
+        _agents(there, site.of(5, 2))
+        time.sleep(site.of(3, 1))
+        there.router.kill()
+        time.sleep(down_s)
+        there.router.start()
+        there.router.line_with("router: ")
+        back = time.time()
+        census = _at_rest(there)
+        recovery = told(there.journals).longest_wait(back)
+    site.say(f"{census}")
+    return [
+        figure("faults.router_down.lost", census.lost),
+        figure("faults.router_down.recovery_s", recovery),
+        Figure("faults.router_down.seconds", down_s, "s without a router"),
+    ]
+
+
+def frozen(site: Site) -> list[Figure]:
+    """Router, then service, stopped and continued: agents keep their pace meanwhile, and lose nothing."""
+    frozen_s = site.of(20, 3)
+    with stage(site.folder) as there:
+        _agents(there, site.of(3, 1))
+        for part in (there.router, there.service):
+            time.sleep(site.of(3, 1))
+            part.send(signal.SIGSTOP)
+            time.sleep(frozen_s)
+            part.send(signal.SIGCONT)
+        census = _at_rest(there)
+        ends = [json.loads(next(line for line in part.lines() if line.startswith("{"))) for part in there.loads]
+    site.say(f"{census}; {ends}")
+    return [
+        figure("faults.frozen.lost", census.lost),
+        figure("faults.frozen.agent_deadline_misses", sum(end["late_blocks"] for end in ends)),
+        Figure("faults.frozen.longest_lag_s", max(end["longest_lag_s"] for end in ends), "s"),
+        Figure("faults.frozen.seconds", frozen_s, "s frozen, each"),
+    ]
+
+
+def disk_full(site: Site) -> list[Figure]:
+    """No file of the service may grow, then none of the agents: nothing false is acknowledged, and all of it later."""
+    full_s = site.of(10, 2)
+    false_acks = recovered = 0
+    with stage(site.folder) as there:
+        _agents(there, 2)
+        for parts in ([there.service], there.loads, there.parts[1:]):
+            time.sleep(site.of(3, 1))
+            for part in parts:
+                part.limit_files(0)
+            time.sleep(full_s)
+            false_acks += take(there.journals, there.archive).acknowledged_lost
+            for part in parts:
+                part.limit_files(-1)
+            recovered += _settles(there)
+        census = _at_rest(there)
+    site.say(f"{census}")
+    return [
+        figure("faults.disk_full.false_acks", false_acks + census.acknowledged_lost),
+        figure("faults.disk_full.recovered", recovered if not census.lost else 0),
+        Figure("faults.disk_full.seconds", full_s, "s full, each"),
+    ]
+
+
+def _agents(there: Stage, processes: int) -> None:
+    for number in range(processes):
+        names = [f"sim-{number}{place:02}" for place in range(AGENTS_PER_PROCESS)]
+        there.load(names, RATE, seed=number, flush_s=1.0).start()
+    for part in there.loads:
+        part.line_with("ready: ")
+
+
+def _settles(there: Stage) -> bool:
+    """Whether everything that is stored by now gets settled in time."""
+    since, deadline = time.time(), time.monotonic() + DRAIN_S
+    while time.monotonic() < deadline:
+        if told(there.journals).longest_wait(since) < float("inf"):
+            return True
+        time.sleep(0.2)
+    return False
+
+
+def _at_rest(there: Stage) -> Census:
+    there.drain(DRAIN_S)
+    _clean(there.service)
+    return take(there.journals, there.archive)
+
+
+def _clean(part: Part) -> None:
+    code = part.stop()
+    assert code == 0, f"{part.name} ended with {code}; see {part.log}"

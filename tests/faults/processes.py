@@ -1,0 +1,164 @@
+"""Router, service and load as processes of their own: started, killed, frozen and stopped by a campaign.
+
+What they print goes through a pipe to `folder/NAME.log`, one file over all starts: what a process printed before it was
+killed is there, and a limit on its files does not limit its log. A router keeps its port over restarts.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from tests.waiting import until
+
+START_S = 120.0  # the first start compiles the kernels
+STOP_S = 30.0  # a stopped part is gone after 3 s, on a machine that has time for it
+
+
+class Part:
+    """One process under test, by its command; `start` it as often as you like."""
+
+    def __init__(self, name: str, command: Sequence[str], folder: Path) -> None:
+        self.name, self.command, self.log = name, list(command), folder / f"{name}.log"
+        self.starts = 0
+        self._since = 0
+        self._process: subprocess.Popen[bytes] | None = None
+        self._writer: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        """Start it, once its last start has ended; does not wait until it is ready."""
+        if self._process is not None:
+            self.wait(STOP_S)
+        self._since = self.log.stat().st_size if self.log.exists() else 0
+        with self.log.open("ab") as log:
+            self._writer = subprocess.Popen(["cat"], stdin=subprocess.PIPE, stdout=log)
+        assert self._writer.stdin is not None
+        with self._writer.stdin as pipe:
+            self._process = subprocess.Popen(self.command, stdout=pipe, stderr=subprocess.STDOUT)
+        self.starts += 1
+
+    @property
+    def pid(self) -> int:
+        """Process id of the present start."""
+        assert self._process is not None, f"{self.name} was never started"
+        return self._process.pid
+
+    @property
+    def alive(self) -> bool:
+        """Whether it runs."""
+        return self._process is not None and self._process.poll() is None
+
+    def lines(self) -> list[str]:
+        """What it has printed since the present start."""
+        return self.log.read_bytes()[self._since :].decode(errors="replace").splitlines()
+
+    def line_with(self, start: str) -> str:
+        """The first line that begins with `start`; waits for it."""
+
+        def found() -> list[str]:
+            there = [line for line in self.lines() if line.startswith(start)]
+            assert there or self.alive, f"{self.name} ended before it said {start!r}; see {self.log}"
+            return there
+
+        until(found, START_S)
+        return found()[0]
+
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal; one that is gone does not mind."""
+        if self.alive:
+            os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        """kill -9, and wait until it is gone."""
+        self.send(signal.SIGKILL)
+        if self._process is not None:
+            self.wait(STOP_S)
+
+    def wait(self, patience_s: float) -> int:
+        """Exit code, once it is gone and its log whole; subprocess.TimeoutExpired if it is not in time."""
+        assert self._process is not None
+        assert self._writer is not None
+        code = self._process.wait(patience_s)
+        self._writer.wait(patience_s)
+        return code
+
+    def stop(self) -> int:
+        """SIGTERM; returns the exit code."""
+        self.send(signal.SIGTERM)
+        return self.wait(STOP_S)
+
+    def limit_files(self, size: int) -> None:
+        """No file of the process may grow beyond `size` bytes, as on a full disk; -1 gives the room back."""
+        _, hard = resource.prlimit(self.pid, resource.RLIMIT_FSIZE)
+        resource.prlimit(self.pid, resource.RLIMIT_FSIZE, (hard if size < 0 else size, hard))
+
+
+class Stage:
+    """A router and a service, and the load that is added to them."""
+
+    def __init__(self, folder: Path, **service: object) -> None:
+        self.folder, self.archive = folder, folder / "archive"
+        folder.mkdir(parents=True, exist_ok=True)
+        self.router = Part("router", self._router("tcp/127.0.0.1:0"), folder)
+        self.router.start()
+        self.endpoint = self.router.line_with("router: ").split()[1]
+        self.router.command = self._router(self.endpoint)
+        config = folder / "service.json"
+        config.write_text(json.dumps({"zenoh": {"connect": [self.endpoint]}, **service}))
+        words = ["run", "--config", str(config), "--archive", str(self.archive)]
+        self.service = Part("service", [sys.executable, "-m", "fleet_service.cli", *words], folder)
+        self.service.start()
+        self.loads: list[Part] = []
+
+    @staticmethod
+    def _router(endpoint: str) -> list[str]:
+        return [sys.executable, "-m", "deploy.router", "--listen", endpoint]
+
+    def load(self, names: Sequence[str], rate: float, **more: object) -> Part:
+        """A generator of observations for these vehicles, `rate` per second each; not yet started."""
+        name = f"load-{len(self.loads):02}"
+        config = self.folder / f"{name}.json"
+        spool = str(self.folder / f"{name}.sqlite")
+        config.write_text(
+            json.dumps({"endpoint": self.endpoint, "names": list(names), "rate": rate, "spool": spool, **more})
+        )
+        self.loads.append(Part(name, [sys.executable, "-m", "tests.faults.load", str(config)], self.folder))
+        return self.loads[-1]
+
+    @property
+    def parts(self) -> list[Part]:
+        """Everything that can be killed."""
+        return [self.router, self.service, *self.loads]
+
+    @property
+    def journals(self) -> list[Path]:
+        """What the generators know to be on disk and settled."""
+        return [part.log for part in self.loads]
+
+    def drain(self, patience_s: float) -> None:
+        """No new observations; wait until every generator has all of its batches settled, or patience ends."""
+        for part in self.loads:
+            part.line_with("ready: ")  # before, the signal would end it
+            part.send(signal.SIGUSR1)
+        with suppress(TimeoutError):  # what is left in a spool then is missing in the archive, and counted there
+            until(lambda: not any(part.alive for part in self.loads), patience_s)
+
+
+@contextmanager
+def stage(folder: Path, **service: object) -> Iterator[Stage]:
+    """A stage whose service is ready; every process of it is gone after the block."""
+    there = Stage(folder, **service)
+    try:
+        there.service.line_with("ready: ")
+        yield there
+    finally:
+        for part in there.parts:
+            part.send(signal.SIGCONT)
+            part.kill()

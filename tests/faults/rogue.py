@@ -1,0 +1,39 @@
+"""`python -m tests.faults.rogue`: a session of any mode in a process of its own, for attacks that may break its sender.
+
+Reads one line of JSON: settings, name, what to hear, what to put where. Prints a line when that has gone out; at the
+next line it asks for the map, so that what it was to hear has come, and prints the keys that it heard. It ends without
+closing: a Zenoh session that plays router may abort its own process when it closes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+
+import zenoh
+
+from schemas import keys
+from schemas.config import ZenohSettings
+from schemas.transport import configuration
+
+
+def main() -> None:
+    """Do as told."""
+    told = json.loads(sys.stdin.readline())
+    heard: list[str] = []
+    session = zenoh.open(configuration(ZenohSettings.model_validate(told["settings"]), told["name"]))
+    hearing = [session.declare_subscriber(one, lambda s: heard.append(str(s.key_expr))) for one in told["hear"]]
+    list(session.get(f"{keys.ROOT}/map/**"))
+    for place in told["put"]:
+        session.put(place, told["payload"])
+    list(session.get(f"{keys.ROOT}/map/**"))
+    print(len(hearing), flush=True)
+    sys.stdin.readline()
+    list(session.get(f"{keys.ROOT}/map/**"))
+    print(json.dumps(heard), flush=True)
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,24 @@
+"""Attacks on a fleet with TLS and access list, each by the means of a vehicle, a reader or a stranger."""
+
+from __future__ import annotations
+
+from schemas.figures import Figure
+from tests.faults.attempts import ATTEMPTS
+from tests.faults.bars import figure
+from tests.faults.frame import Site
+from tests.faults.ground import ground
+from tests.secured import network
+
+
+def run(site: Site) -> list[Figure]:
+    """Every attack on one ground; the last revokes the attacker."""
+    breaches = []
+    with network(site.folder / "certificates") as running, ground(running) as found:
+        for name, attempt in ATTEMPTS.items():
+            if attempt(found):
+                breaches.append(name)
+                site.say(f"BREACH: {name}")
+    return [
+        figure("faults.security.breaches", len(breaches)),
+        Figure("faults.security.attempts", len(ATTEMPTS), "attacks"),
+    ]

@@ -1,0 +1,100 @@
+"""`python -m tests.faults.soak [--minutes 30] [--out DIR]`: a steady load for half an hour; does anything grow?"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from schemas import figures
+from schemas.figures import Figure
+from schemas.numeric import FloatArray
+from tests.faults.bars import figure
+from tests.faults.census import take
+from tests.faults.frame import Campaign, Site, conduct
+from tests.faults.processes import Part, stage
+
+PROCESSES, VEHICLES, RATE = 2, 20, 50.0  # 2 000 observations/s
+CELLS_ACROSS: Final = 12  # few, so that every vehicle has soon been everywhere: a map that grows is no leak
+EVERY_S: Final = 5.0
+SETTLED: Final = 1 / 3  # of the time, until buffers, windows and the cells of the map have been filled
+OWES: Final = ("soak.memory_slope_mb_per_10min", "soak.handles_growth")
+
+
+def memory_mb(part: Part) -> float:
+    """Resident memory of a process."""
+    lines = Path(f"/proc/{part.pid}/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:")) / 1024
+
+
+def handles(part: Part) -> int:
+    """Open files and sockets of a process."""
+    return sum(1 for _ in Path(f"/proc/{part.pid}/fd").iterdir())
+
+
+def slope(times: FloatArray, megabytes: FloatArray) -> float:
+    """Growth of what a process never gives back [MB per 10 min]: a line through the least of each minute.
+
+    Within a minute it takes and gives back: a segment, a compaction, a query.
+    """
+    minute = (times // 60.0).astype(int)
+    least = np.array([megabytes[minute == m].min() for m in np.unique(minute)])
+    return 10 * float(np.polyfit(np.unique(minute), least, 1)[0]) if len(least) > 1 else float("nan")
+
+
+def run(site: Site, minutes: float) -> list[Figure]:
+    """The steepest slope of memory, and the largest growth of handles, of any process."""
+    times: list[float] = []
+    seen: dict[str, list[tuple[float, int]]] = {}
+    with stage(site.folder, compact_s=300.0) as there:
+        for number in range(PROCESSES):
+            names = [f"sim-{number}{place:02}" for place in range(VEHICLES)]
+            there.load(names, RATE, seed=number, cells_across=CELLS_ACROSS).start()
+        began = time.monotonic()
+        while (now := time.monotonic() - began) < minutes * 60:
+            times.append(now)
+            for part in there.parts:
+                seen.setdefault(part.name, []).append((memory_mb(part), handles(part)))
+            if len(times) % 24 == 0:
+                site.say(", ".join(f"{name} {rows[-1][0]:.0f} MB {rows[-1][1]}" for name, rows in seen.items()))
+            time.sleep(EVERY_S)
+        there.drain(60.0)
+        there.service.stop()
+        census = take(there.journals, there.archive)
+    first = int(len(times) * SETTLED)
+    slopes, grown = {}, {}
+    for name, rows in seen.items():
+        kept = np.array(rows[first:])
+        slopes[name] = slope(np.array(times[first:]), kept[:, 0])
+        third = max(len(kept) // 3, 1)
+        grown[name] = float(np.median(kept[-third:, 1]) - np.median(kept[:third, 1]))
+    site.say(f"{slopes}; {grown}; {census}")
+    return [
+        figure("soak.memory_slope_mb_per_10min", max(slopes.values())),
+        figure("soak.handles_growth", max(grown.values())),
+        *(Figure(f"soak.{name}_slope", slope, "MB per 10 min") for name, slope in slopes.items()),
+        Figure("soak.minutes", minutes, "minutes"),
+        Figure("soak.observations_per_s", census.observations / (minutes * 60), "observations/s"),
+        Figure("soak.lost", census.lost + census.doubled, "batches or rows", 0),
+    ]
+
+
+def main() -> int:
+    """Run; 0 if every bar holds."""
+    parser = argparse.ArgumentParser(prog="tests.faults.soak", description="A steady load; does anything grow?")
+    parser.add_argument("--minutes", type=float, default=30.0, help="how long (default 30)")
+    parser.add_argument("--out", type=Path, default=Path(".faults/soak"), help="figures go there")
+    args = parser.parse_args()
+    campaign = Campaign("soak", partial(run, minutes=args.minutes), OWES)
+    found = conduct([campaign], args.out, "soak", quick=False, seed=0)
+    print(figures.markdown(found))
+    return 0 if all(one.holds for one in found) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

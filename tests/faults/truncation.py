@@ -1,0 +1,112 @@
+"""The newest segment cut, and any of its bytes changed, at every place: what is acknowledged and what is held agree.
+
+The newest segment is one that was written and not yet acknowledged when the power went: its rows may go, those of the
+older segments may not. A batch that is not held must be new to the service when its vehicle sends it again.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from fleet_service.archive import reading, segments
+from fleet_service.archive.pseudonyms import Pseudonyms, number
+from fleet_service.archive.rebuild import restore_streams
+from fleet_service.engine import Engine
+from fleet_service.ingest import Message
+from fleet_service.streams import Streams
+from schemas import wire
+from schemas.config import ServiceConfig
+from schemas.figures import Figure
+from schemas.wire import Batch, Kind
+from tests.faults.bars import figure
+from tests.faults.frame import Site
+from tests.fleet_service.examples import SECOND, batch, key
+
+SEGMENTS: Final = 2
+BATCHES: Final = 2  # to a segment
+WHOLE_WAY: Final = 200  # every so many damages a service is started on the archive and everything is sent again
+
+
+def run(site: Site) -> list[Figure]:
+    """Cut at every byte, changed at every fifth; in a quick run, some hundred."""
+    logging.getLogger(reading.__name__).setLevel(logging.ERROR)  # thousands of files are set aside
+    batches, newest = _archive(site.folder)
+    whole, rng = newest.read_bytes(), np.random.default_rng(site.seed)
+    lost = tried = 0
+    for damaged in _damages(whole, rng, site.of(1, 97)):
+        newest.write_bytes(damaged)
+        lost += _lost(site.folder, batches)
+        if tried % WHOLE_WAY == 0:
+            lost += _after_all_is_sent_again(site.folder, batches)
+        for left in newest.parent.glob("*.parquet*"):
+            if left.name.removesuffix(reading.BAD) >= newest.name:
+                left.unlink()
+        tried += 1
+        if tried % 2000 == 0:
+            site.say(f"{tried} damages, {lost} rows lost or doubled")
+    return [
+        figure("faults.truncation.lost_rows", lost),
+        Figure("faults.truncation.damages", tried, "segments cut or changed"),
+    ]
+
+
+def _archive(root: Path) -> tuple[list[Batch], Path]:
+    """Batches in the order of their segments, and the newest segment."""
+    now = time.time_ns() - SECOND
+    batches = [batch("sim-001", seq, now, [0.8, 0.7]) for seq in range(1, SEGMENTS * BATCHES + 1)]
+    with closing(Engine(ServiceConfig(), root)) as engine:
+        for first in range(0, len(batches), BATCHES):
+            engine.take(_messages(batches[first : first + BATCHES]), time.time_ns())
+            engine.flush()
+    return batches, segments.paths(root, Kind.OBSERVATION)[-1]
+
+
+def _damages(whole: bytes, rng: np.random.Generator, stride: int) -> Iterator[bytes]:
+    for place in range(0, len(whole), stride):
+        yield whole[:place]
+    for place in range(0, len(whole), 5 * stride):
+        changed = bytearray(whole)
+        changed[place] ^= int(rng.integers(1, 256))
+        yield bytes(changed)
+
+
+def _messages(batches: Sequence[Batch]) -> list[Message]:
+    return [Message(b.kind, key(b.vehicle), wire.encode(b), wire.ENCODING[b.kind]) for b in batches]
+
+
+def _rows(root: Path) -> list[tuple[int, int, float]]:
+    tables = reading.read(root, Kind.OBSERVATION, ["seq", "row", "mu"])
+    return [row for table in tables for row in zip(*(table[n].to_pylist() for n in ("seq", "row", "mu")), strict=True)]
+
+
+def _expected(batches: Sequence[Batch]) -> set[tuple[int, int, float]]:
+    return {(b.seq, row, round(float(mu), 3)) for b in batches for row, mu in enumerate(b.columns["mu"])}
+
+
+def _lost(root: Path, batches: Sequence[Batch]) -> int:
+    """Rows of older segments that are missing, and of the newest that count as held and are not, or are wrong."""
+    held = {(seq, row, round(mu, 3)) for seq, row, mu in _rows(root)}
+    streams = Streams()
+    restore_streams(root, streams)
+    vehicle = number(Pseudonyms(root / "keys").of("sim-001", int(batches[0].columns["enter_time"][0])))
+    stream = streams[vehicle, batches[0].boot, Kind.OBSERVATION, batches[0].region]
+    owed = [b for place, b in enumerate(batches) if place < len(batches) - BATCHES or stream.admitted(b.seq)]
+    return len(_expected(owed) - held) + len(held - _expected(batches))
+
+
+def _after_all_is_sent_again(root: Path, batches: Sequence[Batch]) -> int:
+    """Rows that are missing or doubled once a service has been sent everything again, and acknowledged it."""
+    with closing(Engine(ServiceConfig(), root)) as engine:
+        engine.take(_messages(batches), time.time_ns())
+        ((_, ack),) = engine.flush()
+    (stream,) = wire.decode_ack(ack)[1]
+    assert stream.durable == ((1, len(batches)),)
+    rows = [(seq, row, round(mu, 3)) for seq, row, mu in _rows(root)]
+    return len(set(rows) ^ _expected(batches)) + len(rows) - len(set(rows))

@@ -1,0 +1,30 @@
+"""Whether two engines answer alike: the same rows, floats within the stated error."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_service.analytics.output import ordered
+from fleet_service.analytics.questions import Question
+
+# Sums are added in another order. Everything else (percentiles, counts, times) is exact in both.
+RELATIVE, ABSOLUTE = 1e-9, 1e-9
+
+
+def differs(one: pa.Table, other: pa.Table, question: Question) -> str | None:
+    """What differs, or None."""
+    if one.schema.names != other.schema.names or one.num_rows != other.num_rows:
+        return f"{one.num_rows} rows of {one.schema.names}, {other.num_rows} of {other.schema.names}"
+    keys = ["day", "cell", "sector", "onset", "vehicle", "period", "basis", "age_h", "temperature", "frame"]
+    by = [(name, "ascending") for name in keys if name in one.schema.names]
+    one, other = (ordered(table, question).sort_by(by) for table in (one, other))
+    for name in one.schema.names:
+        a, b = one[name].to_pylist(), other[name].to_pylist()
+        if pa.types.is_floating(one[name].type):
+            x, y = (np.array([np.nan if v is None else float(v) for v in column]) for column in (a, b))
+            if not np.allclose(x, y, RELATIVE, ABSOLUTE, equal_nan=True):
+                return f"{name}: by up to {np.nanmax(np.abs(x - y)):.3g}"
+        elif a != b:
+            return f"{name}: {next((x, y) for x, y in zip(a, b, strict=True) if x != y)}"
+    return None

@@ -1,0 +1,88 @@
+"""A small synthetic archive, and its rows as pandas has them: the oracle of the questions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.csv as pacsv
+import pytest
+
+from fleet_service.analytics import synthetic
+from fleet_service.analytics.engines import Engine
+from fleet_service.analytics.options import Options
+from fleet_service.analytics.questions import QUESTIONS
+from fleet_service.analytics.synthetic import DAY_S, START_NS, World
+from fleet_service.archive import reading, rollup, snapshots
+from fleet_service.archive.compaction import compact
+from fleet_service.archive.export import Part
+from fleet_service.archive.rebuild import Since, replay
+from fleet_service.fusion import Fusion
+from fleet_service.map_state import cell_table
+from schemas.numeric import IntArray
+from schemas.wire import Kind
+
+WORLD = World(rows=24_000, days=2, vehicles=40, roads=8, length=60, icy=4)
+PART = Part(START_NS, START_NS + WORLD.days * DAY_S * 10**9)
+HOUR_NS = 3600 * 10**9
+
+
+def visited(fusion: Fusion) -> IntArray:
+    """Slots that somebody visited."""
+    return np.flatnonzero(fusion.live.vehicles[: fusion.size] > 0)
+
+
+@pytest.fixture(scope="session")
+def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Compacted, with a snapshot of the map every twelve hours."""
+    root = tmp_path_factory.mktemp("analytics") / "archive"
+    synthetic.write(root, WORLD, 4000)
+    compact(root)
+    rollup.complete(root)
+    for hour in range(12, 48, 12):
+        now = START_NS + hour * HOUR_NS
+        fusion = Fusion(120.0)
+        for _ in replay(root, fusion, Since(until=now)):
+            pass
+        snapshots.write(root, cell_table(fusion, visited(fusion), now), now)
+    return root
+
+
+@pytest.fixture(scope="session")
+def rows(archive: Path) -> pd.DataFrame:
+    """All rows; `time` in whole seconds, `value`: whether mu was told, as the contract says it."""
+    frame = pa.concat_tables(reading.read(archive, Kind.OBSERVATION)).drop_columns(["log_likelihood"]).to_pandas()
+    frame["time"] = frame["leave_time"].astype("datetime64[us, UTC]").astype("int64") // 10**6
+    frame["value"] = frame["mu_utilised"].astype(float) >= 0.6 * frame["mu"].astype(float) - 1e-6
+    frame["mu"] = frame["mu"].astype(float)
+    return frame
+
+
+@pytest.fixture(scope="session")
+def stations(archive: Path) -> Path:
+    """Hourly readings of two stations."""
+    hours = np.arange(WORLD.days * 24)
+    table = pa.table({
+        "station": np.repeat(["inland", "coast"], len(hours)),
+        "time": (np.tile(hours, 2) * 3600 + START_NS // 10**9).astype("datetime64[s]"),
+        "latitude": np.repeat([57.70, 57.71], len(hours)), "longitude": np.repeat([11.99, 13.9], len(hours)),
+        "temperature": np.concatenate([5.0 - 8.0 * synthetic.night(hours * 3600.0), np.full(len(hours), 40.0)]),
+    })  # fmt: skip
+    path = archive.parent / "stations.csv"
+    pacsv.write_csv(table, path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def asked(archive: Path) -> Callable[..., pa.Table]:
+    """Ask a question: `asked("grip", at=...)`."""
+
+    def ask(name: str, engine: str = "duckdb", part: Part = PART, **options: object) -> pa.Table:
+        said: list[str] = []
+        found = QUESTIONS[name].ask(Engine(engine, archive, part), Options(say=said.append, **options))  # type: ignore[arg-type]
+        return found.replace_schema_metadata({"said": "\n".join(said)})
+
+    return ask

@@ -1,0 +1,23 @@
+"""The example as its page says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from fleet_service.analytics import example
+
+
+def test_the_example_draws_its_figures(tmp_path: Path, archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert example.main(["--archive", str(archive), "--out", str(tmp_path)]) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "grip.html", "worst.html", "spells.png", "before-after.png", "vehicles.png",
+    }  # fmt: skip
+    assert "worst: the worst stretches" in capsys.readouterr().out
+
+
+def test_without_an_archive_it_makes_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(example, "WORLD", example.synthetic.World(2000, 1, 10, 4, 40, 4))
+    assert example.main(["--out", str(tmp_path)]) == 0
+    assert list((tmp_path / "archive" / "observations").rglob("*.parquet"))

@@ -1,0 +1,30 @@
+"""`make spark-test`: Spark reads the archive, and answers every question as DuckDB does. Takes a Java and a minute."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+
+from fleet_service.analytics.questions import QUESTIONS
+from tests.fleet_service.analytics.agreement import differs
+from tests.fleet_service.analytics.conftest import HOUR_NS
+from tests.fleet_service.archive.readers import by_duckdb, by_spark
+
+pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("ignore")]
+pytest.importorskip("pyspark", reason="pip install 'gripmap[spark]'")
+
+
+def test_spark_reads_the_archive(archive: Path) -> None:
+    seen = by_duckdb(archive)
+    assert by_spark(archive) == seen._replace(mu=pytest.approx(seen.mu))
+
+
+@pytest.mark.parametrize("name", [name for name in QUESTIONS if name != "replay"])  # which asks no engine
+def test_engines_agree(asked: Callable[..., pa.Table], stations: Path, name: str) -> None:
+    from fleet_service.analytics.synthetic import START_NS
+
+    options = {"before-after": {"at": START_NS + 24 * HOUR_NS}, "weather": {"stations": stations}}.get(name, {})
+    assert differs(asked(name, **options), asked(name, "spark", **options), QUESTIONS[name]) is None

@@ -1,0 +1,141 @@
+"""Checkpoints: a restart from one is a restart from the whole log, and costs only what came since."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleet_service.archive import checkpoints, rebuild
+from fleet_service.archive.compaction import compact
+from fleet_service.engine import Engine
+from fleet_service.ingest import Message
+from schemas import wire
+from schemas.config import ServiceConfig
+from schemas.numeric import FloatArray
+from schemas.wire import Kind
+from tests.fleet_service.examples import SECOND, batch, key
+from tests.waiting import until
+
+
+def icy(vehicle: int, seq: int, mu: float) -> Message:
+    one = batch(f"sim-{vehicle:03}", seq, time.time_ns() - SECOND, [mu])
+    return Message(Kind.OBSERVATION, key(one.vehicle), wire.encode(one), wire.ENCODING[Kind.OBSERVATION])
+
+
+def keep(engine: Engine, root: Path) -> Path:
+    """Take a checkpoint as the service does: asked by one thread, taken by the worker."""
+    taken: list[object] = []
+    stop = threading.Event()
+    thread = threading.Thread(target=lambda: taken.append(engine.checkpoint(stop)))
+    thread.start()
+
+    def settled() -> bool:
+        engine.flush()
+        return bool(taken)
+
+    try:
+        until(settled)
+    finally:
+        stop.set()
+        thread.join()
+    return checkpoints.save(root, *taken[0])  # type: ignore[misc]
+
+
+def beliefs(engine: Engine, at: int) -> FloatArray:
+    slots = np.arange(engine.fusion.size)
+    return engine.fusion.beliefs(slots[np.lexsort((engine.fusion.sector[slots], engine.fusion.cell[slots]))], at)
+
+
+@pytest.fixture
+def folded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Rows of each call of a replay's reading."""
+    rows: list[int] = []
+    read: Callable[..., object] = rebuild.reading.read
+
+    def counted(root: Path, kind: Kind, columns: list[str], *more: object) -> list[object]:
+        found = list(read(root, kind, columns, *more))  # type: ignore[call-overload]
+        if "log_likelihood" in columns:
+            rows.append(sum(table.num_rows for table in found))
+        return found
+
+    monkeypatch.setattr(rebuild.reading, "read", counted)
+    return rows
+
+
+def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(tmp_path: Path, folded: list[int]) -> None:
+    sent = [icy(k % 6, 1 + k // 6, 0.2 if k % 5 else 0.8) for k in range(60)]
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        for k in range(0, 40, 4):
+            engine.take(sent[k : k + 4], time.time_ns())
+            engine.flush()
+        compact(tmp_path)
+        path = keep(engine, tmp_path)
+        engine.take(sent[40:], time.time_ns())
+        engine.flush()
+        at, alerts = time.time_ns(), engine.alerts
+        running = beliefs(engine, at)
+    folded.clear()
+    with closing(Engine(ServiceConfig(), tmp_path)) as again:
+        from_checkpoint = beliefs(again, at)
+        assert folded == [20]
+        assert again.alerts == alerts > 0
+        assert again.counts["checkpoints_refused"] == 0
+        again.take(sent, time.time_ns())
+        assert again.counts["duplicates"] == 60
+    assert path.name < f"{at:020d}"
+    checkpoints.remove_all(tmp_path)
+    with closing(Engine(ServiceConfig(), tmp_path)) as whole:
+        np.testing.assert_allclose(from_checkpoint, beliefs(whole, at), atol=1e-6)
+    np.testing.assert_allclose(from_checkpoint, running, atol=1e-6)
+    assert folded == [20, 60]
+
+
+def test_what_is_in_a_checkpoint_is_on_disk(tmp_path: Path) -> None:
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        engine.take([icy(k, 1, 0.5) for k in range(4)], time.time_ns())
+        keep(engine, tmp_path)
+        engine.take([icy(k, 2, 0.5) for k in range(4)], time.time_ns())  # dies before its segment
+    with closing(Engine(ServiceConfig(), tmp_path)) as again:
+        assert again.fusion.live.visits[0] == 4
+        again.take([icy(k, seq, 0.5) for k in range(4) for seq in (1, 2)], time.time_ns())
+        assert (again.counts["duplicates"], again.fusion.live.visits[0]) == (4, 8)
+
+
+@pytest.mark.parametrize("harm", ["truncate", "remove"])
+def test_a_damaged_checkpoint_gives_way_to_the_one_before_and_to_the_log(tmp_path: Path, harm: str) -> None:
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        for seq in (1, 2, 3):
+            engine.take([icy(k, seq, 0.3) for k in range(4)], time.time_ns())
+            keep(engine, tmp_path)
+        at = time.time_ns()
+        running = beliefs(engine, at)
+    assert len(checkpoints.newest(tmp_path)) == checkpoints.KEPT
+    for refused, path in enumerate(checkpoints.newest(tmp_path), 1):
+        file = path / "cells.arrow"
+        if harm == "truncate":
+            file.write_bytes(file.read_bytes()[:100])
+        else:
+            file.unlink()
+        with closing(Engine(ServiceConfig(), tmp_path)) as again:
+            assert again.counts["checkpoints_refused"] == refused
+            np.testing.assert_allclose(beliefs(again, at), running, atol=1e-6)
+
+
+def test_a_checkpoint_half_written_is_none(tmp_path: Path) -> None:
+    (tmp_path / "checkpoints" / ".draft").mkdir(parents=True)
+    assert checkpoints.newest(tmp_path) == []
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        assert engine.checkpoint(_set()) is None  # the service stops meanwhile
+        assert keep(engine, tmp_path).exists()
+
+
+def _set() -> threading.Event:
+    event = threading.Event()
+    event.set()
+    return event

@@ -1,0 +1,230 @@
+"""Compaction: nothing lost and nothing doubled, whenever it dies and whoever reads."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from time import time_ns
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from fleet_service.archive import compaction, files, layout, reading, segments
+from fleet_service.archive.compaction import compact, compacting
+from fleet_service.archive.segments import Writer
+from fleet_service.engine import Engine
+from schemas import grid, tables
+from schemas.config import ServiceConfig
+from schemas.errors import InputError
+from schemas.wire import Kind
+from tests.fleet_service.archive.rows import fill, identities, rows_of
+from tests.fleet_service.archive.test_archive import sent, settled
+
+SEGMENTS, ROWS = 4, 50
+
+
+class DiedError(BaseException):
+    """The process is gone: nothing catches this."""
+
+
+def public(root: Path, kind: Kind) -> list[tuple[int, int]]:
+    """(boot, seq) of what another tool sees in the compacted files."""
+    paths = list((root / layout.TABLES[kind]).rglob("*.parquet"))
+    found = [pq.read_table(path, columns=["boot", "seq"], partitioning=None) for path in paths]
+    return sorted((row["boot"], row["seq"]) for table in found for row in table.to_pylist())
+
+
+def test_compacted_rows_are_the_rows_of_the_inbox(tmp_path: Path) -> None:
+    fill(tmp_path, SEGMENTS, ROWS)
+    by = [("boot", "ascending"), ("seq", "ascending")]
+    before = {kind: pa.concat_tables(reading.read(tmp_path, kind)).sort_by(by) for kind in Kind}
+    done = compact(tmp_path)
+    assert done == (2 * SEGMENTS * ROWS, 2 * SEGMENTS, 2 * 2 * 2)
+    for kind in Kind:
+        assert not segments.paths(tmp_path, kind)
+        assert pa.concat_tables(reading.read(tmp_path, kind)).sort_by(by).equals(before[kind])
+    assert compact(tmp_path) == (0, 0, 0)
+
+
+def test_files_lie_by_date_and_zone_and_are_sorted_by_cell_and_time(tmp_path: Path) -> None:
+    fill(tmp_path, SEGMENTS, ROWS)
+    compact(tmp_path)
+    found = sorted((tmp_path / "observations").rglob("*.parquet"))
+    folders = {path.parent.relative_to(tmp_path).as_posix() for path in found}
+    zones = [
+        f"q{grid.quadkey(int(grid.zone_of(cell)), 7)}"
+        for cell in grid.cell_of(*np.array([[57.7, 48.1], [11.97, 11.6]]))
+    ]
+    assert folders == {f"observations/date={layout.date_of(20_000 + k)}/zone={zone}" for k in (0, 1) for zone in zones}
+    for path in found:
+        file = pq.ParquetFile(path)
+        assert file.schema_arrow.equals(tables.OBSERVATION_ARCHIVE)
+        assert file.schema_arrow.field("speed").metadata[b"unit"] == b"m/s"
+        table = file.read()
+        order = list(zip(table["cell"].to_pylist(), table["leave_time"].to_pylist(), strict=True))
+        assert order == sorted(order)
+        time = segments.nanoseconds(table["leave_time"])
+        day, zone = (np.unique(values).tolist() for values in layout.partitions_of(time, table["cell"].to_numpy()))
+        assert ([layout.partition_of(path).day], [layout.partition_of(path).zone]) == (day, zone)
+        column = file.metadata.row_group(0).column(table.schema.names.index("cell"))
+        assert (column.compression, column.has_column_index, column.is_stats_set) == ("ZSTD", True, True)
+
+
+def operations(monkeypatch: pytest.MonkeyPatch, die_at: int) -> list[str]:
+    """Count changes of the disk; die before the one with this number."""
+    seen: list[str] = []
+
+    def counted(name: str, real: Callable[..., object]) -> Callable[..., object]:
+        def call(*args: object, **kwargs: object) -> object:
+            seen.append(name)
+            if len(seen) == die_at:
+                raise DiedError
+            return real(*args, **kwargs)
+
+        return call
+
+    for name in ("rename", "unlink", "mkdir"):
+        monkeypatch.setattr(Path, name, counted(name, getattr(Path, name)))
+    monkeypatch.setattr(os, "fsync", counted("fsync", lambda _: None))  # a dead process needs no disk that syncs
+    monkeypatch.setattr(files, "write_synced", counted("write", files.write_synced))
+    monkeypatch.setattr(compaction, "write_synced", counted("write", compaction.write_synced))
+    return seen
+
+
+def test_it_may_die_before_any_change_of_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fill(tmp_path / "0", 2, 16)
+    whole = {kind: identities(tmp_path / "0", kind) for kind in Kind}
+    later = {kind: [(7, k) for k in range(1, 17)] for kind in Kind}
+    monkeypatch.setattr(os, "fsync", lambda _: None)
+    instant, died = 0, True
+    while died:
+        instant += 1
+        root = shutil.copytree(tmp_path / "0", tmp_path / str(instant))
+        with pytest.MonkeyPatch.context() as patch:
+            operations(patch, instant)
+            try:
+                compact(root, round_rows=16)
+                died = False
+            except DiedError:
+                pass
+        for kind in Kind:
+            assert identities(root, kind) == whole[kind], instant
+            assert len(set(public(root, kind))) == len(public(root, kind)), instant
+        fill(root, 1, 16, seed=7)  # the service goes on
+        compact(root)
+        for kind in Kind:
+            assert public(root, kind) == whole[kind] + later[kind], instant
+    assert instant > 40
+
+
+def test_what_it_left_half_done_is_not_done_twice(tmp_path: Path) -> None:
+    fill(tmp_path, 2, ROWS)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Path, "unlink", lambda *_: (_ for _ in ()).throw(DiedError))
+        with pytest.raises(DiedError):
+            compact(tmp_path)
+    assert len(segments.paths(tmp_path, Kind.OBSERVATION)) == 2
+    assert compact(tmp_path).rows == 2 * ROWS  # of states; the observations are only removed from the inbox
+    assert len(public(tmp_path, Kind.OBSERVATION)) == 2 * ROWS
+
+
+def test_readers_see_every_row_once_while_it_runs(tmp_path: Path) -> None:
+    fill(tmp_path, 30, 5)
+    whole = identities(tmp_path, Kind.OBSERVATION)
+    over, wrong, reads = threading.Event(), [], 0
+
+    def watch() -> None:
+        nonlocal reads
+        while not over.is_set():
+            if identities(tmp_path, Kind.OBSERVATION) != whole:
+                wrong.append(reads)
+            seen = public(tmp_path, Kind.OBSERVATION)
+            if len(seen) != len(set(seen)):
+                wrong.append(reads)
+            reads += 1
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    compact(tmp_path, round_rows=5)
+    over.set()
+    watcher.join()
+    assert not wrong
+    assert reads
+    assert public(tmp_path, Kind.OBSERVATION) == whole
+
+
+def test_a_reader_that_is_overtaken_begins_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fill(tmp_path, 3, ROWS)
+    whole = identities(tmp_path, Kind.OBSERVATION)
+    load, loaded = reading.load, []
+
+    def overtaken(path: Path, *args: object) -> pa.Table | None:
+        loaded.append(path)
+        if len(loaded) == 2:
+            monkeypatch.setattr(reading, "load", load)
+            compact(tmp_path)
+        return load(path, *args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(reading, "load", overtaken)
+    assert identities(tmp_path, Kind.OBSERVATION) == whole
+
+
+def test_only_one_compacts_at_a_time(tmp_path: Path) -> None:
+    with compacting(tmp_path), pytest.raises(InputError, match="^archive: .* is being compacted; "):
+        compact(tmp_path)
+    with pytest.raises(InputError, match="^archive: .* is no folder; "):
+        compact(tmp_path / "nowhere")
+
+
+def test_a_damaged_segment_is_set_aside_and_the_rest_compacted(tmp_path: Path) -> None:
+    fill(tmp_path, 3, ROWS)
+    damaged = segments.paths(tmp_path, Kind.OBSERVATION)[1]
+    damaged.write_bytes(damaged.read_bytes()[:-30])
+    compact(tmp_path)
+    assert [path.name for path in (tmp_path / "inbox").glob("*.bad")] == [damaged.name + ".bad"]
+    assert {boot for boot, _ in public(tmp_path, Kind.OBSERVATION)} == {0, 2}
+
+
+def test_a_stop_ends_it_after_the_round_that_runs(tmp_path: Path) -> None:
+    fill(tmp_path, 3, ROWS)
+    stop = threading.Event()
+    stop.set()
+    assert compact(tmp_path, stop=stop) == (0, 0, 0)
+    assert len(segments.paths(tmp_path, Kind.OBSERVATION)) == 3
+
+
+def test_names_of_compacted_segments_are_not_used_again_even_if_the_clock_went_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fill(tmp_path, 1, ROWS)
+    compact(tmp_path)
+    monkeypatch.setattr(segments.time, "time", lambda: 1.0)
+    Writer(tmp_path, "shard-0").write(Kind.OBSERVATION, rows_of(Kind.OBSERVATION, ROWS, 1))
+    assert len(identities(tmp_path, Kind.OBSERVATION)) == 2 * ROWS
+    compact(tmp_path)
+    assert len(public(tmp_path, Kind.OBSERVATION)) == 2 * ROWS
+
+
+def test_a_service_on_a_compacted_archive_has_the_same_map_and_knows_what_it_holds(tmp_path: Path) -> None:
+    messages = [sent(f"sim-{k % 5:03}", 1 + k // 5) for k in range(20)]
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        for k in range(0, 20, 4):
+            engine.take(messages[k : k + 4], time_ns())
+            engine.flush()
+            if k == 8:
+                compact(tmp_path)  # while the service runs
+        at = int(engine.fusion.live.time.max())
+        before = engine.fusion.beliefs(np.arange(engine.fusion.size), at)
+    for _ in range(2):
+        with closing(Engine(ServiceConfig(), tmp_path)) as again:
+            np.testing.assert_allclose(again.fusion.beliefs(np.arange(again.fusion.size), at), before, atol=1e-6)
+            again.take(messages, time_ns())
+            assert again.counts["duplicates"] == 20
+            assert settled(again.flush()).keys() == {f"sim-{k:03}" for k in range(5)}
+        compact(tmp_path)

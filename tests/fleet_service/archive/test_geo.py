@@ -1,0 +1,97 @@
+"""GeoParquet as an independent validator and GeoPandas see it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import geopandas
+import geoparquet_validator
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from fleet_service.archive import export, geo, snapshots
+from fleet_service.archive.files import MAP, write_table
+from fleet_service.fusion import Fusion
+from fleet_service.map_state import cell_table
+from schemas import grid, tables
+from tests.fleet_service.examples import CELL, START, observations, value
+
+
+def a_map(cells: int = 300) -> pa.Table:
+    """Cells side by side, as the service knows them."""
+    rng = np.random.default_rng(2)
+    cell = CELL + rng.permutation(cells)
+    fusion = Fusion(120.0)
+    fusion.fold(
+        observations(np.arange(cells), np.arange(cells) % 7, value(rng.uniform(0.2, 0.9, cells)), cell.tolist())
+    )
+    return cell_table(fusion, np.arange(fusion.size), START + 10**12)
+
+
+def failures(path: Path) -> list[str]:
+    """Identities of the abstract tests that a file fails; those that must apply are seen to apply."""
+    report = geoparquet_validator.check(str(path))
+    passed = [outcome["id"] for outcome in report["outcomes"] if outcome["status"] == "pass"]
+    assert len([name for name in passed if "/core/" in name]) > 8
+    return list(geoparquet_validator.failed(report))
+
+
+def test_a_snapshot_is_geoparquet_that_an_independent_validator_accepts(tmp_path: Path) -> None:
+    table = a_map()
+    path = snapshots.write(tmp_path, table, START)
+    assert path == tmp_path / "map/date=2023-11-14/20231114T221320Z.parquet"
+    assert failures(path) == []
+    assert snapshots.newest(tmp_path, START) == path
+    assert snapshots.newest(tmp_path, START - 10**9) is None
+    assert snapshots.time_of(path) == START
+    kept = pq.read_table(path, partitioning=None)
+    assert kept.schema.names == [*tables.MAP_ARCHIVE.names, "geometry", "bbox"]
+    assert kept["cell"].to_pylist() == sorted(table["cell"].to_pylist())
+    assert kept.schema.field("mu").metadata == tables.MAP_SCHEMA.field("mu").metadata
+
+
+def test_geopandas_reads_the_polygons_of_the_cells_and_a_box_of_them(tmp_path: Path) -> None:
+    path = snapshots.write(tmp_path, a_map(), START)
+    frame = geopandas.read_parquet(path)
+    assert frame.crs == "OGC:CRS84"
+    assert frame.geometry.is_valid.all()
+    west, south, east, north = grid.bounds(frame["cell"].to_numpy())
+    np.testing.assert_array_equal(frame.geometry.bounds.to_numpy(), np.stack([west, south, east, north], axis=1))
+    middle = frame.geometry.iloc[7].centroid
+    box = (middle.x - 1e-7, middle.y - 1e-7, middle.x + 1e-7, middle.y + 1e-7)
+    assert geopandas.read_parquet(path, bbox=box)["cell"].tolist() == [frame["cell"].iloc[7]]
+
+
+@pytest.mark.parametrize("rows", [0, 1, 5])
+def test_points_are_geoparquet_too_and_so_is_nothing(tmp_path: Path, rows: int) -> None:
+    x, y = np.linspace(11.0, 12.0, rows), np.linspace(57.0, 58.0, rows)
+    write_table(geo.with_points(pa.table({"n": np.arange(rows)}), x, y), tmp_path / "points.parquet", MAP)
+    report = geoparquet_validator.check(str(tmp_path / "points.parquet"))
+    assert geoparquet_validator.failed(report, "core") == []
+    frame = geopandas.read_parquet(tmp_path / "points.parquet")
+    np.testing.assert_array_equal(frame.geometry.x, x)
+    np.testing.assert_array_equal(frame.geometry.y, y)
+
+
+def test_the_validator_refuses_a_file_whose_geometry_is_broken(tmp_path: Path) -> None:
+    table = geo.with_cells(a_map(3))
+    broken = table.set_column(
+        table.schema.get_field_index("geometry"), "geometry", pa.array([b"\x01\x03"] * 3, pa.binary())
+    )
+    write_table(broken, tmp_path / "broken.parquet", MAP)
+    assert geoparquet_validator.failed(geoparquet_validator.check(str(tmp_path / "broken.parquet")), "core")
+
+
+def test_geojson_and_csv_say_what_the_map_says(tmp_path: Path) -> None:
+    table = geo.with_cells(a_map(3))
+    for ending in (".geojson", ".csv"):
+        export.write(table, tmp_path / f"map{ending}")
+    frame = geopandas.read_file(tmp_path / "map.geojson")
+    assert frame["cell"].tolist() == table["cell"].to_pylist()
+    np.testing.assert_allclose(frame["mu"], table["mu"].to_numpy(), atol=1e-6)
+    np.testing.assert_allclose(frame.geometry.bounds["minx"], grid.bounds(table["cell"].to_numpy())[0])
+    header, *lines = (tmp_path / "map.csv").read_text().splitlines()
+    assert header.startswith('"cell","sector","mu"')
+    assert len(lines) == 3

@@ -1,0 +1,44 @@
+"""The archive as it stands, opened with other people's tools."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from fleet_service.archive import reading, readme
+from fleet_service.archive.compaction import compact
+from schemas.wire import Kind
+from tests.fleet_service.archive.readers import READERS, Seen
+from tests.fleet_service.archive.rows import fill
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Seen]:
+    """A compacted archive, and what every tool must see."""
+    root = tmp_path_factory.mktemp("archive")
+    fill(root, 3, 100)
+    compact(root)
+    table = pa.concat_tables(reading.read(root, Kind.OBSERVATION))
+    told = table.num_rows - table["log_likelihood"].null_count
+    return root, Seen(table.num_rows, float(np.mean(table["mu"].to_numpy())), told, 2)
+
+
+def test_at_least_these_tools_are_here() -> None:
+    assert READERS.keys() >= {"pyarrow", "pandas", "polars", "duckdb"}
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_a_tool_reads_the_observations(archive: tuple[Path, Seen], name: str) -> None:
+    root, expected = archive
+    seen = READERS[name](root)
+    assert seen == expected._replace(mu=pytest.approx(expected.mu, rel=1e-5))
+
+
+def test_the_page_in_an_archive_names_every_column_with_its_unit(archive: tuple[Path, Seen]) -> None:
+    page = (archive[0] / "README.md").read_text()
+    assert page == readme.text()
+    assert "| `speed` | float | m/s | mean speed over the visit; multiples of 0.015625 |" in page
+    assert "| `vehicle_bits` | int64 | 64 bits | or; distinct vehicles" in page

@@ -1,0 +1,147 @@
+"""What goes: old raw rows, keys, one vehicle's rows; and what stays."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from datetime import timedelta
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from fleet_service.archive import export, layout, mirror, reading, retention, rollup, segments
+from fleet_service.archive.compaction import compact
+from fleet_service.archive.pseudonyms import Pseudonyms
+from fleet_service.archive.segments import Writer
+from fleet_service.cli import main
+from fleet_service.engine import Engine
+from schemas.config import ServiceConfig
+from schemas.errors import InputError
+from schemas.wire import Kind
+from tests.fleet_service.archive.rows import START, fill, identities, rows_of
+
+DATE = layout.date_of(20_000)
+MONTH = f"{DATE:%Y-%m}"
+
+
+def vehicles_in(root: Path, kind: Kind) -> list[str]:
+    return sorted(v for table in reading.read(root, kind, ["vehicle"]) for v in table["vehicle"].to_pylist())
+
+
+def test_old_raw_rows_go_and_their_roll_ups_stay(tmp_path: Path) -> None:
+    fill(tmp_path, 2, 100)
+    compact(tmp_path)
+    assert retention.retire(tmp_path, 31, DATE + timedelta(days=31)) == (0, 0)
+    days = {kind: [path.name for path in layout.days(tmp_path, layout.TABLES[kind])] for kind in Kind}
+    assert days == {kind: [f"date={DATE}", f"date={DATE + timedelta(days=1)}"] for kind in Kind}
+    whole = len(identities(tmp_path, Kind.OBSERVATION))
+    done = retention.retire(tmp_path, 31, DATE + timedelta(days=32))
+    assert done == (2, 4)  # a day of observations and one of states, two zones each
+    left = len(identities(tmp_path, Kind.OBSERVATION))
+    assert 0 < left < whole
+    rolled = [pq.read_table(p, partitioning=None) for p in (tmp_path / rollup.TABLE).rglob("*.parquet")]
+    assert sum(sum(table["observations"].to_pylist()) for table in rolled) == whole - left
+    assert rollup.complete(tmp_path) == 2  # those of the day that stayed
+
+
+def test_too_few_days_are_refused_since_a_batch_may_come_again(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="^raw-days: 7 are too few "):
+        retention.retire(tmp_path, 7, DATE)
+
+
+def test_one_vehicle_is_forgotten_and_the_others_are_not_touched(tmp_path: Path) -> None:
+    pseudonyms = Pseudonyms(tmp_path / "keys")
+    names = np.array([pseudonyms.of(f"sim-{k:03}", START) for k in range(5)])
+    writer = Writer(tmp_path, "shard-0")
+    for seed in range(3):
+        for kind in Kind:
+            rows = rows_of(kind, 60, seed)
+            rows["vehicle"] = names[np.arange(60) % 5]
+            writer.write(kind, rows)
+            if seed == 1:
+                compact(tmp_path)
+    assert main(["forget", "--archive", str(tmp_path), "--vehicle", "sim-003", "--period", MONTH]) == 0
+    for kind in Kind:
+        assert vehicles_in(tmp_path, kind) == sorted(names[[0, 1, 2, 4]].tolist() * 36)
+    rolled = [pq.read_table(p, partitioning=None) for p in (tmp_path / rollup.TABLE).rglob("*.parquet")]
+    assert sum(sum(table["observations"].to_pylist()) for table in rolled) == 144
+    assert compact(tmp_path) == (0, 0, 0)
+    assert retention.forget_vehicle(tmp_path, "sim-003", MONTH) == 0
+
+
+def test_a_destroyed_key_makes_the_way_back_to_a_name_unknown(tmp_path: Path) -> None:
+    before = Pseudonyms(tmp_path / "keys").of("sim-003", START)
+    assert main(["forget", "--archive", str(tmp_path), "--period", MONTH]) == 0
+    assert Pseudonyms(tmp_path / "keys").of("sim-003", START) != before
+
+
+@pytest.mark.parametrize(("period", "problem"), [("2026-13", "is no month"), ("1999-01", "has no key of 1999-01")])
+def test_a_period_that_is_none_is_said(tmp_path: Path, period: str, problem: str) -> None:
+    with pytest.raises(InputError, match=f"^period: .*{problem}"):
+        retention.forget_vehicle(tmp_path, "sim-003", period)
+
+
+def test_nothing_is_forgotten_beside_a_running_service(tmp_path: Path) -> None:
+    with closing(Engine(ServiceConfig(), tmp_path)), pytest.raises(InputError, match="belongs to a running service"):
+        retention.forget_period(tmp_path, MONTH)
+
+
+def test_compacted_files_are_put_elsewhere_once_and_again_when_rewritten(tmp_path: Path) -> None:
+    root, there = tmp_path / "archive", tmp_path / "there"
+    fill(root, 2, 50)
+    assert main(["compact", "--archive", str(root), "--to", there.as_uri()]) == 0
+    copies = {path.relative_to(there): path.read_bytes() for path in there.rglob("*.parquet")}
+    originals = [path for folder in mirror.FOLDERS for path in (root / folder).rglob("*.parquet")]
+    assert copies == {path.relative_to(root): path.read_bytes() for path in originals}
+    assert not [path for path in there.rglob("*") if path.name.endswith(".tmp")]
+    assert mirror.put(root, there.as_uri()) == 0
+    originals[0].write_bytes(originals[1].read_bytes() + b"")
+    assert mirror.put(root, there.as_uri()) == 1
+    with pytest.raises(InputError, match="^to: cannot use nonsense://x "):
+        mirror.put(root, "nonsense://x")
+
+
+@pytest.mark.parametrize("ending", [".parquet", ".geojson", ".csv"])
+@pytest.mark.parametrize("what", ["observations", "rollup"])
+def test_parts_are_exported(tmp_path: Path, what: str, ending: str, capsys: pytest.CaptureFixture[str]) -> None:
+    root, out = tmp_path / "archive", tmp_path / f"out{ending}"
+    fill(root, 2, 50)
+    assert main(["compact", "--archive", str(root)]) == 0
+    capsys.readouterr()
+    words = ["--bbox", "11.9,57,12.1,58", "--from", str(DATE), "--to", str(DATE + timedelta(days=1))]
+    assert main(["export", what, "--archive", str(root), *words, "--out", str(out)]) == 0
+    rows = pa.concat_tables(reading.read(root, Kind.OBSERVATION))
+    inside = (segments.nanoseconds(rows["leave_time"]) < START + 600 * 10**9) & (rows["latitude"].to_numpy() > 57)
+    said = int(capsys.readouterr().out.split()[0])
+    assert 0 < said <= inside.sum()
+    assert what == "rollup" or said == inside.sum()
+    if ending == ".parquet":
+        assert pq.read_table(out).num_rows == said
+
+
+@pytest.mark.parametrize(
+    ("words", "start"),
+    [
+        (["map", "--out", "map.parquet"], "error: to: there is no snapshot"),
+        (["observations", "--out", "x.xls"], "error: out: x.xls has no known ending"),
+        (["observations", "--from", "yesterday", "--out", "x.csv"], "error: from: 'yesterday' is no time"),
+        (["observations", "--out", "/nowhere/at/all.csv"], "error: out: cannot write"),
+    ],
+)
+def test_a_wrong_export_is_one_line(
+    tmp_path: Path, words: list[str], start: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["export", *words, "--archive", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.startswith(start)
+
+
+def test_an_export_of_the_map_is_the_newest_snapshot_before_a_time(tmp_path: Path) -> None:
+    from fleet_service.archive import snapshots
+    from tests.fleet_service.archive.test_geo import a_map
+
+    for k, cells in enumerate((5, 9)):
+        snapshots.write(tmp_path, a_map(cells), START + k * 3600 * 10**9)
+    assert export.map_then(tmp_path, export.Part(0, START + 1800 * 10**9)).num_rows == 5
+    assert export.map_then(tmp_path, export.Part(0, START + 3600 * 10**9)).num_rows == 9

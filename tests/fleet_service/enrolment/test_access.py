@@ -1,0 +1,160 @@
+"""What the routers let through: real sessions with real certificates against the generated access list."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from fleet_service.enrolment.access import access_control
+from fleet_service.enrolment.enrol import Registry, Terms
+from schemas import keys
+from schemas.errors import InputError
+from schemas.transport import configuration
+from tests.faults.attempts import ATTEMPTS
+from tests.faults.ground import HONEST, Ground, ground
+from tests.fleet_service.examples import key
+from tests.secured import ROUTERS, SERVICE, Network, enrolment, network, registry, settings
+from tests.waiting import until
+
+# What does not depend on the routers: clients and service look for themselves.
+HELD_WITHOUT_ROUTERS = {
+    "certificate_without_its_key",
+    "plain_tcp",
+    "false_router_of_another_authority",
+    "false_router_with_the_certificate_of_a_vehicle",
+    "wildcard_put_on_ones_own_name",
+    "another_name_within_ones_own_key",
+    "names_that_look_like_a_tile_or_a_path_are_enrolled",
+    "one_name_with_two_roles",
+}
+
+
+def breaches(where: Ground) -> set[str]:
+    return {name for name, attempt in ATTEMPTS.items() if attempt(where)}
+
+
+@pytest.fixture
+def running(tmp_path: Path) -> Iterator[Network]:
+    with network(tmp_path) as found:
+        yield found
+
+
+def test_nobody_gets_further_than_the_list_lets_him(running: Network) -> None:
+    with ground(running) as found:
+        assert breaches(found) == set()
+
+
+def test_every_attack_gets_through_where_nobody_looks(tmp_path: Path) -> None:
+    with network(tmp_path, guarded=False) as open_to_all, ground(open_to_all) as found:
+        assert breaches(found) == set(ATTEMPTS) - HELD_WITHOUT_ROUTERS
+
+
+def test_a_vehicle_may_exactly_what_the_design_says() -> None:
+    listed = access_control(enrolment())
+    rules = {rule["id"]: rule for rule in listed["rules"]}
+    granted = [rules[name] for policy in listed["policies"] if HONEST in policy["subjects"] for name in policy["rules"]]
+
+    def allowed(flow: str) -> set[tuple[str, str]]:
+        ours = [rule for rule in granted if flow in rule["flows"]]
+        return {(message, place) for rule in ours for message in rule["messages"] for place in rule["key_exprs"]}
+
+    public = (f"{keys.ROOT}/map/**", f"{keys.ROOT}/alert/**")
+    assert allowed("ingress") == {
+        *(("put", f"{keys.ROOT}/{kind}/*/*/*/{HONEST}") for kind in ("obs", "state")),
+        ("liveliness_token", keys.alive_key(HONEST)),
+        ("declare_subscriber", keys.ack_key(HONEST)),
+        *((message, place) for message in ("declare_subscriber", "query") for place in public),
+    }
+    assert allowed("egress") == {
+        ("put", keys.ack_key(HONEST)),
+        *((m, place) for m in ("put", "reply") for place in public),
+        *(("declare_subscriber", f"{keys.ROOT}/{kind}/**") for kind in ("obs", "state")),
+        ("declare_queryable", f"{keys.ROOT}/map/**"),
+    }
+    assert (listed["enabled"], listed["default_permission"]) == (True, "deny")
+
+
+def heard(vehicle: zenoh.Session, name: str, listener: zenoh.Session) -> bool:
+    """Whether what a vehicle puts on its own key reaches a service."""
+    received: list[bytes] = []
+    with listener.declare_subscriber(f"{keys.ROOT}/obs/**", lambda sample: received.append(sample.payload.to_bytes())):
+        publisher = listener.declare_publisher(key(name))  # only a service is told who hears
+
+        def arrived() -> bool:
+            vehicle.put(key(name), b"here")
+            return bool(received)
+
+        until(arrived)
+        publisher.undeclare()
+    return True
+
+
+def test_a_new_vehicle_comes_in_while_routers_are_restarted_one_at_a_time(running: Network) -> None:
+    both = list(running.endpoints.values())
+
+    def anywhere(name: str) -> zenoh.Session:
+        one = settings(both[0], running.folder).model_copy(update={"connect": both})
+        return zenoh.open(configuration(one, name))
+
+    with anywhere(SERVICE) as service, anywhere(HONEST) as honest:
+        assert heard(honest, HONEST, service)
+        assert registry(running.folder).enrol(enrolment(vehicles=[HONEST, "new-001"])).made == ["new-001"]
+        for router in ROUTERS:
+            running.stop(router)
+            assert heard(honest, HONEST, service), "the other router is there"
+            running.start(router)
+            running.linked()
+        with anywhere("new-001") as new:
+            assert heard(new, "new-001", service)
+
+
+def test_a_session_takes_a_renewed_certificate_when_it_connects_again(running: Network) -> None:
+    with running.session(SERVICE) as service, running.session(HONEST) as honest:
+        assert heard(honest, HONEST, service)
+        much_later = Registry(running.folder, Terms(renew_days=364.9), datetime.now(UTC))
+        for step in ("next", "switch", "drop"):
+            much_later.enrol(enrolment(), step)  # type: ignore[arg-type]
+        for router in ROUTERS:
+            running.stop(router)
+        for router in ROUTERS:  # they trust only the new authority, so that the old certificates are worth nothing
+            running.start(router)
+        assert heard(honest, HONEST, service)
+
+
+def test_old_and_new_authority_get_on_while_one_replaces_the_other(running: Network, tmp_path: Path) -> None:
+    registry(running.folder).enrol(enrolment(), "next")
+    for router in ROUTERS[::-1]:
+        running.stop(router)
+        running.start(router)
+    before = tmp_path / "as it was"
+    shutil.copytree(running.folder, before, ignore=shutil.ignore_patterns("authority", "archive", before.name))
+    registry(running.folder).enrol(enrolment(), "switch")
+    running.stop(ROUTERS[1])
+    running.start(ROUTERS[1])
+    running.linked()
+    old = zenoh.open(configuration(settings(running.endpoints[ROUTERS[1]], before), HONEST))
+    with old, running.session(SERVICE, ROUTERS[0]) as service:
+        assert heard(old, HONEST, service)
+
+
+def test_a_certificate_that_is_not_there_is_said_by_name(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"^zenoh.config.transport/link/tls/root_ca_certificate: there is no file .*"):
+        configuration(settings("tls/127.0.0.1:1", tmp_path), HONEST)
+
+
+def test_a_declared_publisher_of_a_vehicle_is_told_that_somebody_listens(running: Network) -> None:
+    """Else it would send nothing, silently."""
+    received: list[bytes] = []
+    with running.session(SERVICE) as service, running.session(HONEST, ROUTERS[1]) as vehicle:
+        service.declare_subscriber(
+            f"{keys.ROOT}/obs/*/*/*/*", lambda sample: received.append(sample.payload.to_bytes())
+        )
+        publisher = vehicle.declare_publisher(key(HONEST))
+        until(lambda: publisher.matching_status.matching)
+        publisher.put(b"here")
+        until(lambda: received)

@@ -1,0 +1,166 @@
+"""What `fleet-service certs` leaves in its folder, whatever was there before."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+
+from fleet_service.cli import main
+from fleet_service.enrolment import authority as ca
+from fleet_service.enrolment.enrol import Registry, Terms
+from schemas.errors import InputError
+from tests.secured import READER, ROUTERS, SERVICE, VEHICLES, WEATHER, enrolment
+
+NOW = datetime(2026, 3, 1, tzinfo=UTC)
+EVERYONE = {*ROUTERS, SERVICE, READER, WEATHER, *VEHICLES}
+
+
+def at(folder: Path, days: float = 0.0, **terms: float) -> Registry:
+    """The registry, some days later."""
+    return Registry(folder, Terms(**terms), NOW + timedelta(days=days))
+
+
+def certificate(folder: Path, name: str) -> x509.Certificate:
+    found = ca.read_certificate(folder / f"{name}.pem")
+    assert found is not None
+    return found
+
+
+def trusted(folder: Path) -> list[x509.Certificate]:
+    return x509.load_pem_x509_certificates((folder / "trust.pem").read_bytes())
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    at(tmp_path).enrol(enrolment())
+    return tmp_path
+
+
+def test_everyone_on_the_list_gets_a_certificate_of_the_authority(folder: Path) -> None:
+    (authority,) = trusted(folder)
+    for name in EVERYONE:
+        found = certificate(folder, name)
+        assert ca.signed(found, authority)
+        assert found.subject.rfc4514_string() == f"CN={name}"
+        assert found.not_valid_after_utc == NOW + timedelta(days=365)
+        uses = found.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+        assert (x509.oid.ExtendedKeyUsageOID.SERVER_AUTH in uses) == (name in ROUTERS), "only a router is a server"
+        assert ca.read(folder / name) is not None, "key and certificate belong together"
+
+
+def test_private_keys_are_for_their_owner_alone(folder: Path) -> None:
+    keys = list(folder.rglob("*.key"))
+    assert len(keys) == len(EVERYONE) + 1
+    assert {oct(path.stat().st_mode & 0o777) for path in keys} == {"0o600"}
+    assert oct((folder / "authority").stat().st_mode & 0o777) == "0o700"
+
+
+def test_running_it_again_changes_nothing(folder: Path) -> None:
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    done = at(folder, 1.0).enrol(enrolment())
+    assert set(done.kept) == EVERYONE
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_what_comes_to_its_end_is_issued_anew(folder: Path) -> None:
+    assert not at(folder, 334.0).enrol(enrolment()).made
+    assert set(at(folder, 336.0).enrol(enrolment()).made) == EVERYONE
+    assert certificate(folder, SERVICE).not_valid_after_utc == NOW + timedelta(days=336 + 365)
+
+
+def test_a_router_with_another_address_gets_another_certificate(folder: Path) -> None:
+    moved = enrolment(routers={"router-a": {"hosts": ["10.0.0.7"]}, "router-b": {}})
+    assert at(folder).enrol(moved).made == ["router-a"]
+    names = certificate(folder, "router-a").extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert [str(address) for address in names.get_values_for_type(x509.IPAddress)] == ["10.0.0.7"]
+
+
+def test_a_pair_that_was_cut_off_half_way_is_made_whole(folder: Path) -> None:
+    (folder / f"{READER}.key").write_bytes((folder / f"{SERVICE}.key").read_bytes())
+    assert at(folder).enrol(enrolment()).made == [READER]
+    assert ca.read(folder / READER) is not None
+
+
+def test_a_name_off_the_list_is_revoked_and_not_given_again_before_its_certificate_ended(folder: Path) -> None:
+    gone, left = VEHICLES
+    fewer = enrolment(vehicles=[left])
+    assert at(folder).enrol(fewer).revoked == [gone]
+    assert not (folder / f"{gone}.key").exists()
+    assert gone not in (folder / "router-a.json5").read_text()
+    with pytest.raises(InputError, match=f"^fleet: '{gone}' was revoked .* until 2027-03-01; give another name$"):
+        at(folder, 1.0).enrol(enrolment())
+    assert gone in at(folder, 366.0).enrol(enrolment()).made
+
+
+def test_another_authority_comes_in_three_steps_and_both_are_trusted_in_between(folder: Path) -> None:
+    (first,) = trusted(folder)
+    assert not at(folder).enrol(enrolment(), "next").made, "everyone must trust it before it signs"
+    assert first in trusted(folder)
+    assert len(trusted(folder)) == 2
+    assert set(at(folder).enrol(enrolment(), "switch").made) == EVERYONE
+    second = trusted(folder)[0]
+    assert set(trusted(folder)) == {first, second}
+    assert ca.signed(certificate(folder, SERVICE), second)
+    assert set(at(folder).enrol(enrolment(), "drop").kept) == EVERYONE
+    assert trusted(folder) == [second]
+
+
+def test_a_step_out_of_order_is_refused(folder: Path) -> None:
+    with pytest.raises(InputError, match=r"^ca: there is no next authority; begin with --ca next"):
+        at(folder).enrol(enrolment(), "switch")
+
+
+def test_no_certificate_outlives_its_authority(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"^days: the authority ends before, on 2026-04-10; "):
+        at(tmp_path, ca_days=40.0).enrol(enrolment())
+
+
+def test_a_lost_key_of_the_authority_is_said_and_not_replaced(folder: Path) -> None:
+    (folder / "authority" / "ca.key").unlink()
+    with pytest.raises(InputError, match=r"lacks the authority's key; restore ca.key"):
+        at(folder).enrol(enrolment())
+
+
+@pytest.mark.parametrize(
+    ("fleet", "options", "said"),
+    [
+        ({"routers": {}}, [], "error: routers: "),
+        ({"routers": {"r-1": {}}, "vehicles": ["a/b"]}, [], "error: vehicles.0: "),
+        (
+            {"routers": {"r-1": {}}, "vehicles": ["shard-0"]},
+            [],
+            "error: content: value error, 'shard-0' is there",
+        ),
+        ({"routers": {"r-1": {"hosts": ["a b"]}}}, [], "error: routers.r-1.hosts.0: value error, 'a b' is no host"),
+        ({"routers": {"r-1": {}}, "cars": []}, [], "error: cars: "),
+        ({"routers": {"r-1": {}}}, ["--days", "-1"], "error: days: -1 is no time; "),
+        ({"routers": {"r-1": {}}}, ["--days", "nan"], "error: days: nan is no time; "),
+        ({"routers": {"r-1": {}}}, ["--days", "20"], "error: renew-days: is not less than the 20 days"),
+        ({"routers": {"r-1": {}}}, ["--ca", "switch"], "error: ca: there is no next authority; "),
+    ],
+)
+def test_what_cannot_be_used_is_one_line_that_names_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], fleet: object, options: list[str], said: str
+) -> None:
+    file = tmp_path / "fleet.json"
+    file.write_text(json.dumps(fleet))
+    assert main(["certs", "--fleet", str(file), "--out", str(tmp_path / "out"), *options]) == 2
+    shown = capsys.readouterr().err
+    assert shown.startswith(said), shown
+    assert shown.count("\n") == 1
+
+
+def test_the_command_says_what_it_did_and_what_is_to_be_done(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "fleet.json"
+    file.write_text(json.dumps({"routers": {"router-a": {}}, "vehicles": ["car-1", "car-2"]}))
+    assert main(["certs", "--fleet", str(file), "--out", str(tmp_path / "out")]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "issued 4: router-a, shard-0, car-1, car-2",
+        f"routers: restart router-a one at a time, each with its file in {tmp_path / 'out'}",
+    ]

@@ -1,0 +1,89 @@
+"""A visit whose place is uncertain: it is shared among cells, and never doubled."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet_service.fusion import Fusion, space
+from schemas import grid, mugrid
+from schemas.numeric import FloatArray, IntArray
+from tests.fleet_service.examples import CELL, LATITUDE, belief, observations, value
+
+WIDTH_M = 10.2  # of a cell at LATITUDE
+
+
+def spread(std: float, yaw: float = 0.0, cell: int = CELL) -> tuple[IntArray, FloatArray]:
+    found = space.places(np.array([cell]), np.array([LATITUDE]), np.array([yaw]), np.array([std]))
+    return found[0][0], found[1][0].astype(float)
+
+
+def information(p: FloatArray) -> float:
+    """Nats that a belief has gained over the prior."""
+    return float(np.sum(p * np.log(np.maximum(p, 1e-300) * mugrid.BINS)))
+
+
+@given(st.floats(0.01, 100.0), st.floats(1.0, 40.0))
+def test_shares_of_all_cells_are_probabilities_that_sum_to_one_at_the_most(std: float, length: float) -> None:
+    share = space.shares(np.array([std]), np.array([length]))[0]
+    assert (share >= -1e-9).all()
+    assert share.sum() <= 1.0 + 1e-9
+    np.testing.assert_allclose(share, share[::-1], atol=1e-9)
+
+
+def test_shares_are_those_of_visits_drawn_anywhere_in_a_cell_with_a_normal_error() -> None:
+    rng = np.random.default_rng(1)
+    for std in (3.0, 8.0):
+        at = np.floor((rng.uniform(0.0, WIDTH_M, 200_000) + std * rng.normal(size=200_000)) / WIDTH_M)
+        drawn = [np.mean(at == k) for k in (-2, -1, 1, 2)]
+        assert space.shares(np.array([std]), np.array([WIDTH_M]))[0] == pytest.approx(drawn, abs=0.005)
+
+
+def test_a_good_fix_stays_in_its_cell_and_a_poor_one_reaches_along_the_heading() -> None:
+    assert not spread(1.5)[1].any()
+    x, y = grid.deinterleave(CELL)
+    for yaw, ahead in ((0.0, (1, 0)), (np.pi / 2, (0, -1)), (np.pi, (-1, 0))):
+        cells, share = spread(5.0, yaw)
+        assert cells.tolist() == [
+            -1,
+            grid.interleave(x - ahead[0], y - ahead[1]),
+            grid.interleave(x + ahead[0], y + ahead[1]),
+            -1,
+        ]
+        assert 0.1 < share[1] == share[2] < 0.25
+    assert not spread(np.nan)[1].any()
+    assert not spread(5.0, np.nan)[1].any()
+
+
+def test_a_visit_is_not_spread_into_another_region() -> None:
+    border = grid.cell_of(LATITUDE, 0.0)  # where two regions meet
+    cells, share = spread(6.0, 0.0, int(border))
+    assert (cells >= 0).sum() == 1
+    assert share.sum() < 0.3
+
+
+@given(st.floats(0.1, 60.0), st.floats(0.1, 1.1), st.floats(0.03, 0.3), st.floats(-3.1, 3.1))
+def test_all_cells_together_learn_no_more_than_one_would(std: float, mu: float, width: float, yaw: float) -> None:
+    sure, unsure = Fusion(120.0), Fusion(120.0)
+    o = observations([0.0], [1], value([mu], width))
+    cells, share = space.places(o.cell, np.array([LATITUDE]), np.array([yaw]), np.array([std]))
+    sure.fold(o)
+    unsure.fold(dataclasses.replace(o, beside=cells, beside_share=share))
+    total = sum(information(unsure.believed(np.array([slot]))[0]) for slot in range(unsure.size))
+    assert total <= information(belief(sure)) + 2e-3  # rounding of the 16 bits
+
+
+def test_a_cell_where_the_vehicle_was_perhaps_learns_a_little_and_is_not_visited() -> None:
+    fusion = Fusion(120.0)
+    cells, share = spread(5.0)
+    o = observations([0.0], [1], value([0.2]))
+    fusion.fold(dataclasses.replace(o, beside=cells[None], beside_share=share[None].astype(np.float32)))
+    own, beside = belief(fusion), belief(fusion, int(cells[2]))
+    assert information(own) > 3 * information(beside) > 0.0
+    slots = fusion.slots_of(np.array([CELL, cells[2]]), np.zeros(2, np.int64))
+    assert fusion.live.vehicles[slots].tolist() == fusion.live.visits[slots].tolist() == [1, 0]
+    assert fusion.live.values[slots[1]] == pytest.approx(0.75 * share[2], rel=1e-5)  # a newcomer's

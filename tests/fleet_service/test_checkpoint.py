@@ -1,0 +1,55 @@
+"""A checkpoint goes on exactly where the fusion was."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from fleet_service.checkpoint import fusion_from, tables_of
+from fleet_service.fusion import Fusion
+from schemas.errors import InputError
+from tests.fleet_service.fusion.test_order import LATENESS_S, delayed, drive
+from tests.fleet_service.fusion.test_weather import RAIN, reports
+
+
+def stored(tables: dict[str, pa.Table]) -> dict[str, pa.Table]:
+    """Written as Parquet and read again."""
+    out = {}
+    for name, table in tables.items():
+        buffer = io.BytesIO()
+        pq.write_table(table, buffer)
+        out[name] = pq.read_table(buffer)
+    return out
+
+
+@pytest.mark.parametrize("cut", [0, 1, 700, 1500])
+def test_a_fusion_from_its_checkpoint_goes_on_bit_for_bit_as_the_one_that_never_stopped(cut: int) -> None:
+    o = drive(11, 1500, 8.0 * 3600.0)  # longer than vehicles are remembered
+    order = delayed(o, 100.0, 12)
+    whole = Fusion(LATENESS_S)
+    whole.weather(reports((0.5, RAIN)))
+    whole.fold(o.take(order[:cut]))
+    again = fusion_from(stored(tables_of(whole)), LATENESS_S)
+    for part in np.array_split(order[cut:], 9):
+        for fusion in (whole, again):
+            fusion.fold(o.take(part))
+    assert again.size == whole.size > 6
+    now = int(o.time.max()) + 10**12
+    there = again.slots_of(whole.cell, whole.sector)
+    np.testing.assert_array_equal(again.beliefs(there, now), whole.beliefs(np.arange(whole.size), now))
+    for name in ("visits", "vehicles", "values", "returned", "crowd"):
+        np.testing.assert_array_equal(getattr(again.live, name)[there], getattr(whole.live, name)[: whole.size])
+    assert [again.trust(v) for v in range(13)] == [whole.trust(v) for v in range(13)]
+
+
+def test_another_version_or_half_a_checkpoint_is_refused() -> None:
+    tables = tables_of(Fusion(LATENESS_S))
+    with pytest.raises(InputError, match="not of version"):
+        fusion_from(tables | {"used": tables["used"].replace_schema_metadata({})}, LATENESS_S)
+    del tables["pairs"]
+    with pytest.raises(InputError, match="not whole"):
+        fusion_from(tables, LATENESS_S)

@@ -1,0 +1,70 @@
+"""What a running service does for its archive beside its work."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from fleet_service.archive.compaction import compacting
+from fleet_service.cli import main
+from fleet_service.upkeep import Job, upkeep
+from schemas.config import ZenohSettings
+from schemas.wire import Kind
+from tests.fleet_service.archive.rows import identities
+from tests.fleet_service.conftest import running
+from tests.fleet_service.examples import SECOND, batch
+from tests.fleet_service.test_service import Fleet
+from tests.waiting import until
+
+
+def test_a_running_service_compacts_and_keeps_every_row_once(
+    router: ZenohSettings, session: zenoh.Session, tmp_path: Path
+) -> None:
+    now = time.time_ns() - SECOND
+    with running(router, tmp_path, compact_s=0.05) as run:
+        fleet = Fleet(session).meet()
+        for seq in range(1, 11):
+            fleet.settle(*(batch(f"sim-{k:03}", seq, now, [0.8]) for k in range(3)))
+        until(lambda: not list((tmp_path / "inbox").glob("*.parquet")))
+        assert any(line.startswith("compacted: ") for line in run.lines)
+    assert len(set(identities(tmp_path, Kind.OBSERVATION))) == len(identities(tmp_path, Kind.OBSERVATION)) == 30
+    with running(router, tmp_path) as again:
+        assert again.service.engine.fusion.live.visits[0] == 30
+        assert main(["compact", "--archive", str(tmp_path)]) == 0  # beside it
+
+
+def test_a_job_that_fails_is_counted_said_and_done_again(tmp_path: Path) -> None:
+    turns: list[int] = []
+
+    def work(stop: threading.Event) -> str | None:
+        turns.append(1)
+        if len(turns) == 1:
+            raise OSError("no disk")
+        return "well" if len(turns) == 2 else None
+
+    counts: Counter[str] = Counter()
+    lines: list[str] = []
+    with upkeep([Job("mending", 0.001, work)], counts, lines.append):
+        until(lambda: len(turns) > 2)
+    assert counts["mending_failures"] == 1
+    assert lines == ["mending failed: no disk", "well"]
+
+
+def test_a_job_of_no_interval_is_never_done(tmp_path: Path) -> None:
+    done: Callable[[threading.Event], str | None] = lambda _: "done"  # noqa: E731
+    lines: list[str] = []
+    with upkeep([Job("never", 0.0, done)], Counter(), lines.append):
+        pass
+    assert not lines
+
+
+def test_the_command_says_when_another_compacts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with compacting(tmp_path):
+        assert main(["compact", "--archive", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.startswith("error: archive: ")

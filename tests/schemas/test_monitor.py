@@ -1,0 +1,109 @@
+"""What a scraper and an operator's programs see: real HTTP on loopback, and lines of JSON."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import socket
+import urllib.error
+import urllib.request
+from collections.abc import Sequence
+
+import pytest
+from prometheus_client.openmetrics.parser import text_string_to_metric_families
+
+from schemas.errors import InputError
+from schemas.monitor import Metric, gauge, serving
+from schemas.operator import Line, log_as, teller
+
+HOSTILE = 'a"b\\c\nd<script>'
+
+
+def read() -> Sequence[Metric]:
+    return [
+        Metric("refused_messages", "counter", "refused, by reason", {"time": 3, HOSTILE: 4}, "reason"),
+        gauge("queue_messages", "waiting", 7),
+    ]
+
+
+def fetch(address: str) -> tuple[int, str, str]:
+    try:
+        with urllib.request.urlopen(address, timeout=10) as reply:
+            return reply.status, reply.headers["Content-Type"], reply.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.headers["Content-Type"], error.read().decode()
+
+
+def test_values_are_read_by_the_formats_own_parser_whatever_their_labels_hold() -> None:
+    with serving("127.0.0.1", 0, read, list) as address:
+        status, form, text = fetch(f"{address}/metrics")
+    families = {family.name: family for family in text_string_to_metric_families(text)}
+    assert status == 200
+    assert form.startswith("application/openmetrics-text; version=1.0.0")
+    refused = {sample.labels["reason"]: sample.value for sample in families["gripmap_refused_messages"].samples}
+    assert refused == {"time": 3, HOSTILE: 4}
+    assert [sample.value for sample in families["gripmap_queue_messages"].samples] == [7]
+
+
+def test_health_follows_the_troubles() -> None:
+    troubles: list[str] = []
+    with serving("127.0.0.1", 0, read, lambda: troubles) as address:
+        assert fetch(f"{address}/healthz")[0] == 200
+        troubles.append("the disk is full")
+        status, form, text = fetch(f"{address}/healthz")
+        assert (status, form) == (503, "application/json")
+        assert json.loads(text) == {"status": "trouble", "troubles": ["the disk is full"]}
+        assert fetch(f"{address}/elsewhere")[0] == 404
+        request = urllib.request.Request(f"{address}/metrics", data=b"x", method="POST")
+        with pytest.raises(urllib.error.HTTPError, match="501") as refused:
+            urllib.request.urlopen(request, timeout=10)
+        refused.value.close()
+
+
+def test_without_a_port_nothing_listens() -> None:
+    with serving("127.0.0.1", None, read, list) as address:
+        assert address is None
+
+
+def test_a_taken_port_is_said() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(InputError, match=f"^metrics_port: cannot listen on 127.0.0.1:{port}"):
+            serving("127.0.0.1", port, read, list).__enter__()
+
+
+def test_lines_are_text_for_people_and_json_for_programs() -> None:
+    line = Line("status: 3 rows", rows=3, counts={"late": 1})
+    plain, structured = io.StringIO(), io.StringIO()
+    teller("text", plain)(line)
+    teller("json", structured, service="shard-0")(line)
+    teller("json", structured)("compacted: 7 rows\nof <many>")
+    assert plain.getvalue() == "status: 3 rows\n"
+    first, second = (json.loads(text) for text in structured.getvalue().splitlines())
+    assert (first["event"], first["rows"], first["counts"], first["service"]) == ("status", 3, {"late": 1}, "shard-0")
+    assert (second["event"], second["message"], second["level"]) == (
+        "compacted",
+        "compacted: 7 rows\nof <many>",
+        "info",
+    )
+
+
+def test_warnings_of_the_program_take_the_same_form() -> None:
+    stream, before = io.StringIO(), logging.root.handlers[:]
+    level = logging.root.level
+    try:
+        log_as("json", stream, service="shard-0")
+        logging.getLogger("edge_agent.publisher").warning("batch %d was rejected", 7)
+    finally:
+        logging.root.handlers[:] = before
+        logging.root.setLevel(level)
+    record = json.loads(stream.getvalue())
+    assert (record["level"], record["event"], record["message"]) == (
+        "warning",
+        "edge_agent.publisher",
+        "batch 7 was rejected",
+    )

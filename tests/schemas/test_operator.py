@@ -1,0 +1,16 @@
+"""What lies behind standard output never ends a process."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+TALK = "import sys\nfrom schemas.operator import tell\nfor _ in range(3): tell('hello', sys.stderr)\nsys.exit(7)"
+
+
+def test_a_full_disk_behind_the_output_does_not_end_the_process() -> None:
+    with Path("/dev/full").open("w") as full:
+        assert subprocess.run([sys.executable, "-c", TALK], stderr=full, check=False).returncode == 7
+    heard = subprocess.run([sys.executable, "-c", TALK], capture_output=True, text=True, check=False)
+    assert heard.stderr == "hello\n" * 3

@@ -1,0 +1,66 @@
+"""Tiles are read as if a stranger had sent them."""
+
+from __future__ import annotations
+
+import contextlib
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from schemas import tables, tiles
+from schemas.errors import WireError
+from schemas.tiles import decode_tile
+
+
+def table(rows: int) -> pa.Table:
+    columns = [
+        pa.array(["measured"] * rows) if f.type == pa.string() else pa.array(np.arange(rows) % 100).cast(f.type)
+        for f in tables.MAP_SCHEMA
+    ]
+    return pa.Table.from_arrays(columns, schema=tables.MAP_SCHEMA)
+
+
+def stream(content: pa.Table, compression: str | None = None) -> bytes:
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, content.schema, options=pa.ipc.IpcWriteOptions(compression=compression)) as writer:
+        writer.write_table(content)
+    return bytes(sink.getvalue())
+
+
+@pytest.mark.parametrize("rows", [0, 1, 300])
+def test_a_tile_comes_back_as_it_was_written(rows: int) -> None:
+    assert decode_tile(stream(table(rows))).equals(table(rows))
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_what_would_have_to_be_unpacked_is_refused_before_it_is(compression: str) -> None:
+    bomb = stream(table(tiles.MAX_ROWS), compression)
+    assert len(bomb) < 0.2 * table(tiles.MAX_ROWS).nbytes
+    with pytest.raises(WireError, match="^tile: is compressed; "):
+        decode_tile(bomb)
+
+
+def test_too_many_cells_are_refused() -> None:
+    with pytest.raises(WireError, match="^tile: has more than 131072 cells"):
+        decode_tile(stream(table(tiles.MAX_ROWS + 1)))
+
+
+def test_other_columns_are_refused() -> None:
+    with pytest.raises(WireError, match="^tile: has other columns"):
+        decode_tile(stream(pa.table({"nothing": pa.nulls(1 << 30)})))
+
+
+GOOD = stream(table(20))
+
+
+@given(st.data())
+def test_no_bytes_raise_anything_but_a_wire_error(data: st.DataObject) -> None:
+    payload = bytearray(GOOD)
+    for _ in range(data.draw(st.integers(1, 4))):
+        payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
+    cut = data.draw(st.integers(0, len(payload)))
+    with contextlib.suppress(WireError):
+        assert decode_tile(bytes(payload[:cut] if cut % 2 else payload)).num_rows <= tiles.MAX_ROWS

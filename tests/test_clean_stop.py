@@ -1,0 +1,59 @@
+"""SIGTERM and Ctrl-C: agent and service flush, settle what they can, and are gone, whatever the router does."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.faults.census import take, told
+from tests.faults.processes import Stage, stage
+from tests.waiting import until
+
+GONE_S = 3.0
+SLACK_S = 2.0  # a machine that is busy with other things
+
+
+@pytest.fixture
+def there(tmp_path: Path) -> Iterator[Stage]:
+    """A router, a service and two vehicles that have had something acknowledged."""
+    with stage(tmp_path, segment_s=0.2) as there:
+        there.load(["sim-001", "sim-002"], 20.0, flush_s=0.2).start()
+        until(lambda: told(there.journals).settled)
+        yield there
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_agent_and_service_settle_and_leave(there: Stage, number: signal.Signals) -> None:
+    (load,) = there.loads
+    for part in (load, there.service):
+        part.send(number)
+        began = time.monotonic()
+        assert part.wait(GONE_S + SLACK_S) == 0
+        assert time.monotonic() - began < GONE_S + SLACK_S
+    end = json.loads(load.lines()[-1])
+    assert end["unsettled"] == 0
+    census = take(there.journals, there.archive)
+    assert (census.lost, census.doubled) == (0, 0)
+    assert any(line.startswith("status: ") for line in there.service.lines())
+
+
+def test_agent_and_service_leave_a_frozen_router_behind_and_lose_nothing(there: Stage) -> None:
+    (load,) = there.loads
+    there.router.send(signal.SIGSTOP)
+    stored = len(told(there.journals).stored)
+    until(lambda: len(told(there.journals).stored) > stored + 4)
+    for part in (load, there.service):
+        part.send(signal.SIGTERM)
+        assert part.wait(GONE_S + SLACK_S) == 0
+    there.router.send(signal.SIGCONT)
+    there.service.start()
+    there.service.line_with("ready: ")
+    load.start()
+    there.drain(60.0)
+    census = take(there.journals, there.archive)
+    assert (census.lost, census.acknowledged_lost, census.doubled) == (0, 0, 0)

@@ -1,0 +1,87 @@
+"""The frame of the fault campaigns: it reports what is missing, and its census sees what is lost or doubled."""
+
+from __future__ import annotations
+
+import json
+import time
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from fleet_service.archive.segments import Writer
+from fleet_service.engine import Engine
+from fleet_service.ingest import Message
+from schemas import wire
+from schemas.config import ServiceConfig
+from schemas.figures import Figure
+from schemas.wire import Batch
+from tests.faults.bars import BARS, figure
+from tests.faults.campaigns import CAMPAIGNS
+from tests.faults.census import take, told
+from tests.faults.crash_model import history
+from tests.faults.crash_spool import spool_history
+from tests.faults.frame import Campaign, Site, conduct
+from tests.fleet_service.examples import SECOND, batch, key
+
+
+def test_every_campaign_owes_figures_of_the_table_and_none_is_owed_twice() -> None:
+    owed = [name for campaign in CAMPAIGNS for name in campaign.owes]
+    assert set(owed) <= set(BARS)
+    assert len(owed) == len(set(owed))
+
+
+def test_a_figure_that_is_owed_and_not_given_does_not_hold(tmp_path: Path) -> None:
+    def forgetful(site: Site) -> list[Figure]:
+        return [figure("faults.kill.doubled", 0)]
+
+    campaign = Campaign("forgetful", forgetful, ("faults.kill.doubled", "faults.frozen.lost"))
+    found = conduct([campaign], tmp_path, "test", quick=True, seed=0)
+    assert {one.name: one.holds for one in found} == {"faults.kill.doubled": True, "faults.frozen.lost": False}
+    written = json.loads((tmp_path / "figures.json").read_text())[1:]
+    assert [row["holds"] for row in written] == [True, False]
+    assert "DOES NOT HOLD" in (tmp_path / "figures.md").read_text()
+
+
+@pytest.fixture
+def kept(tmp_path: Path) -> list[Batch]:
+    """Three batches, of which the archive holds the first two, and the first one twice."""
+    now = time.time_ns()
+    batches = [batch("sim-001", seq, now - SECOND, [0.8, 0.7]) for seq in (1, 2, 3)]
+    for turn, shown in enumerate((batches[:2], batches[:1])):
+        root = tmp_path / "archive" if not turn else tmp_path / "copy"
+        root.mkdir()
+        if turn:
+            (root / "keys").symlink_to(tmp_path / "archive" / "keys")
+        with closing(Engine(ServiceConfig(name=f"shard-{turn}"), root)) as engine:
+            engine.take(
+                [Message(b.kind, key(b.vehicle), wire.encode(b), wire.ENCODING[b.kind]) for b in shown], time.time_ns()
+            )
+            engine.flush()
+    for segment in (tmp_path / "copy" / "inbox").glob("*.parquet"):
+        segment.rename(tmp_path / "archive" / "inbox" / segment.name)
+    return batches
+
+
+def test_the_census_sees_a_lost_batch_and_doubled_rows(kept: list[Batch], tmp_path: Path) -> None:
+    journal = tmp_path / "load.journal"
+    lines = [f"+ {b.vehicle} {b.boot} {b.kind} {b.region} {b.seq} {b.rows} 1.0" for b in kept]
+    lines += [f"- {b.vehicle} {b.boot} {b.kind} {b.region} {b.seq} 0 3.5" for b in kept[1:]]
+    journal.write_text("\n".join(lines) + "\n")
+    census = take([journal], tmp_path / "archive")
+    assert (census.stored, census.settled, census.rows, census.observations) == (3, 2, 6, 6)
+    assert (census.lost, census.acknowledged_lost, census.doubled) == (1, 1, 2)
+    assert told([journal]).longest_wait(since=2.0) == float("inf")
+    journal.write_text("\n".join(lines[1:]) + "\n")
+    assert told([journal]).longest_wait(since=2.0) == 1.5
+
+
+def test_no_history_on_a_disk_that_forgets_loses_or_doubles_anything() -> None:
+    found_bugs = (1064, 1938)  # files that an interrupted compaction had renamed and not synced, then taken for safe
+    assert [problem for number in (*range(12), *found_bugs) for problem in history(number)] == []
+    assert [problem for number in range(3) for problem in spool_history(number)] == []
+
+
+def test_the_disk_that_forgets_catches_a_log_that_does_not_sync(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Writer, "sync", lambda self: None)
+    assert any("is lost" in problem for number in range(12) for problem in history(number))
