@@ -7,6 +7,7 @@ import json
 import queue
 import time
 from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -162,10 +163,16 @@ def test_what_is_not_ours_is_counted_and_the_service_goes_on(
     assert service.service.engine.fusion.live.visits[0] == 1
 
 
+def seconds() -> Iterator[int]:
+    """Moments a second apart, as vehicles that follow each other come by; the last is not yet in the future."""
+    return iter(range(now() - 30 * SECOND, now(), SECOND))
+
+
 def test_ice_raises_an_alert_after_few_passes_and_grip_clears_it(fleet: Fleet) -> None:
-    fleet.settle(*(batch(f"sim-{k:03}", 1, now() - 60 * SECOND, [0.85]) for k in range(6)))
+    moments = seconds()
+    fleet.settle(*(batch(f"sim-{k:03}", 1, now() - 90 * SECOND, [0.85]) for k in range(6)))
     for passes in range(8):
-        fleet.settle(batch(f"sim-{passes:03}", 2, now(), [0.2]))
+        fleet.settle(batch(f"sim-{passes:03}", 2, next(moments), [0.2]))
         if not fleet.alerts.empty():
             break
     alert = fleet.alerts.get(timeout=10.0)
@@ -173,7 +180,7 @@ def test_ice_raises_an_alert_after_few_passes_and_grip_clears_it(fleet: Fleet) -
     assert (alert.cell, alert.raised) == (CELL, True)
     assert alert.p_slippery > 0.9
     for k in range(10):
-        fleet.settle(batch(f"sim-{100 + k}", 1, now(), [0.85]))
+        fleet.settle(batch(f"sim-{100 + k}", 1, next(moments), [0.85]))
     cleared = fleet.alerts.get(timeout=10.0)
     assert (cleared.cell, cleared.raised, cleared.reason) == (CELL, False, "later visits found grip")
 
@@ -187,12 +194,13 @@ def standing(session: zenoh.Session) -> list[wire.Alert]:
 
 def test_who_comes_late_asks_for_the_alerts_that_stand(fleet: Fleet) -> None:
     assert not standing(fleet.session)
-    fleet.settle(*(batch(f"sim-{k:03}", 1, now(), [0.2]) for k in range(3)))
+    moments = seconds()
+    fleet.settle(*(batch(f"sim-{k:03}", 1, next(moments), [0.2]) for k in range(3)))
     raised = fleet.alerts.get(timeout=10.0)
     assert standing(fleet.session) == [raised]
     assert not [reply for reply in fleet.session.get(keys.alert_key(TILE + 1)) if reply.ok]
     for k in range(10):
-        fleet.settle(batch(f"sim-{100 + k}", 1, now(), [0.85]))
+        fleet.settle(batch(f"sim-{100 + k}", 1, next(moments), [0.85]))
     fleet.alerts.get(timeout=10.0)
     assert not standing(fleet.session)
 
