@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from fleet_service.borrow import borrowed
 from fleet_service.map_state import MapState, arrow_stream, cell_table
+from fleet_service.tiles import Shown, Tiles, filtered
 from schemas import grid
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, IntArray
@@ -21,28 +23,71 @@ ROUTE_MOST_M: Final = 500_000.0
 _METRES_PER_DEGREE: Final = 111_195.0  # of a great circle on the mean earth
 
 
-def answer(state: MapState, query: MapQuery, wanted: Callable[[int], bool], now: int) -> Iterator[tuple[int, bytes]]:
-    """Tile and payload of every reply.
+def answer(
+    tiles: Tiles, query: MapQuery, wanted: Callable[[int], bool], now: int, only: int | None = None
+) -> Iterator[tuple[int, bytes]]:
+    """Tile and payload of every reply, each made when it is taken.
 
     Args:
-        state: the map.
+        tiles: of the map.
         query: what is asked.
         wanted: whether a tile's key matches the query's.
         now: for ages and forgetting [ns].
+        only: the one tile that can be wanted, where the query's key names it.
 
     Raises:
         InputError: the route is too long.
     """
     route = along(query) if query.route else None
-    for tile in state.tiles() if route is None else np.unique(grid.tile_of(route[0])).tolist():
-        if wanted(tile) and _near(tile, query):
-            table = select(state, tile, query, route, now)
-            if table.num_rows:
-                yield tile, render(table, query.format, grid.quadkey(tile, grid.TILE_ZOOM))
+    for tile in _near(_visited(tiles, route, only), query):
+        if wanted(tile):
+            if route is None and query.basis is None:
+                payload = _shown(tiles.shown(tile, now), query, tile)
+            else:
+                with tiles.guard:
+                    table = _selected(tiles.state, tile, query, route, now)
+                payload = _rendered(table.filter(pa.array(_asked(filtered(table), query))), query, tile)
+            if payload is not None:
+                yield tile, payload
 
 
-def select(state: MapState, tile: int, query: MapQuery, route: tuple[IntArray, IntArray] | None, now: int) -> pa.Table:
-    """The cells of one tile that a query asks for; along a route in its order."""
+def _visited(tiles: Tiles, route: tuple[IntArray, IntArray] | None, only: int | None) -> list[int]:
+    """The tiles that may have something."""
+    if route is not None:
+        return [int(tile) for tile in np.unique(grid.tile_of(route[0]))]
+    if only is not None:
+        return [only]
+    with tiles.guard:
+        return tiles.state.tiles()
+
+
+def _near(tiles: list[int], query: MapQuery) -> list[int]:
+    """Those that the box touches."""
+    if query.bbox is None or not tiles:
+        return tiles
+    found = np.array(tiles)
+    west, south, east, north = grid.bounds(found, grid.TILE_ZOOM)
+    box = query.bbox
+    inside = (east > box[0]) & (north > box[1]) & (west < box[2]) & (south < box[3])
+    return [int(tile) for tile in found[inside]]
+
+
+def _shown(shown: Shown, query: MapQuery, tile: int) -> bytes | None:
+    """What a query asks for of a tile as it is shown: most often all of it, as it lies there."""
+    keep = _asked(shown.columns, query)
+    if query.format is Format.ARROW and keep.all():
+        return shown.payload if len(keep) else None
+    return _rendered(shown.table.filter(pa.array(keep)), query, tile)
+
+
+def _rendered(table: pa.Table, query: MapQuery, tile: int) -> bytes | None:
+    return render(table, query.format, grid.quadkey(tile, grid.TILE_ZOOM)) if table.num_rows else None
+
+
+def _selected(
+    state: MapState, tile: int, query: MapQuery, route: tuple[IntArray, IntArray] | None, now: int
+) -> pa.Table:
+    """The cells of one tile that may be asked for; along a route in its order."""
     if route is None:
         slots = state.slots(tile)
     else:
@@ -52,16 +97,16 @@ def select(state: MapState, tile: int, query: MapQuery, route: tuple[IntArray, I
     table = cell_table(state.fusion, slots, now)
     if query.basis == "borrowed":
         table = pa.concat_tables([table, borrowed(state.fusion, tile, state.slots(tile), route, now)])
-    return table.filter(pa.array(_asked(table, query)))
+    return table
 
 
-def _asked(table: pa.Table, query: MapQuery) -> BoolArray:
+def _asked(columns: Mapping[str, NDArray[Any]], query: MapQuery) -> BoolArray:
     """Rows with enough vehicles that touch the box, (k,)."""
-    keep = table["vehicles"].to_numpy() >= query.min_vehicles
+    keep = columns["vehicles"] >= query.min_vehicles
     if query.bbox is not None:
         west, south, east, north = query.bbox
-        keep &= (table["east"].to_numpy() > west) & (table["west"].to_numpy() < east)
-        keep &= (table["north"].to_numpy() > south) & (table["south"].to_numpy() < north)
+        keep &= (columns["east"] > west) & (columns["west"] < east)
+        keep &= (columns["north"] > south) & (columns["south"] < north)
     return np.asarray(keep)
 
 
@@ -88,13 +133,6 @@ def along(query: MapQuery) -> tuple[IntArray, IntArray]:
     _, first = np.unique(cell * grid.SECTORS + sector, return_index=True)
     order = np.sort(first)
     return cell[order], sector[order]
-
-
-def _near(tile: int, query: MapQuery) -> bool:
-    if query.bbox is None:
-        return True
-    west, south, east, north = (float(v) for v in grid.bounds(tile, grid.TILE_ZOOM))
-    return bool(east > query.bbox[0] and north > query.bbox[1] and west < query.bbox[2] and south < query.bbox[3])
 
 
 def render(table: pa.Table, form: Format, tile: str) -> bytes:

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_service.fusion import Fusion
-from fleet_service.map_state import map_table
+from fleet_service.map_state import Cells, map_table
 from schemas import grid, mugrid, tables
 from schemas.numeric import IntArray
 
@@ -43,7 +43,8 @@ def borrowed(fusion: Fusion, tile: int, slots: IntArray, route: tuple[IntArray, 
     np.minimum.at(vehicles, group, fusion.live.vehicles[lender])
     np.minimum.at(first, group, fusion.live.first[lender])
     np.maximum.at(last, group, fusion.live.time[lender])
-    return map_table(
+    cells = Cells(
         wanted // grid.SECTORS, wanted % grid.SECTORS, belief, ["borrowed"] * len(wanted), vehicles,
         np.zeros(len(wanted), np.int64), first, last, now,
     )  # fmt: skip
+    return map_table(cells)

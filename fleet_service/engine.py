@@ -9,8 +9,8 @@ import queue
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
@@ -31,8 +31,9 @@ from fleet_service.checkpoint import fusion_from, tables_of
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.weather import Reports
 from fleet_service.ingest import Admitted, Candidate, Intake, Message
-from fleet_service.map_state import MapState, arrow_stream, cell_table
+from fleet_service.map_state import MapState, cell_table
 from fleet_service.streams import Streams
+from fleet_service.tiles import Tiles
 from fleet_service.warm import warm_up
 from fleet_service.weather import WeatherDesk, archived
 from schemas import grid, wire
@@ -73,6 +74,7 @@ class Engine:
         self._alerts = Alerts(self.fusion)
         self._alerts.resume(standing)
         self._guard = threading.Lock()
+        self._tiles = Tiles(self.map, self._guard, config.public_vehicles)
         self._acks = Acks()
         streams = Streams()
         self._intake = Intake(streams, Pseudonyms(root / "keys"), self.counts, self._acks)
@@ -170,6 +172,8 @@ class Engine:
             folded = self.fusion.fold(observations(rows, rows["vehicle_number"]))
             self.map.changed(folded.slots)
             raised = self._alerts.folded(folded.slots)
+            if raised:
+                self._tiles.settle()
         rows["late"], rows["weight"] = folded.late, folded.weight
         self.counts["late"] += int(folded.late.sum())
         return raised
@@ -197,6 +201,7 @@ class Engine:
             self.failing = True
         else:
             self.failing = False
+            self._tiles.settle()
             if self._checkpoint_wanted.is_set():
                 self._checkpoint_wanted.clear()
                 with self._guard:
@@ -206,15 +211,8 @@ class Engine:
 
     def tiles(self, now: int) -> list[tuple[int, bytes]]:
         """Tile and Arrow stream of every tile that changed since the last call, as far as it is public."""
-        out = []
-        for tile in self.map.take_dirty():
-            with self._guard:
-                slots = self.map.slots(tile)
-                public = slots[self.fusion.live.vehicles[slots] >= self._config.public_vehicles]
-                table = cell_table(self.fusion, public, now)
-            if table.num_rows:
-                out.append((tile, arrow_stream(table)))
-        return out
+        made = ((tile, self._tiles.make(tile, now)) for tile in self.map.take_dirty())
+        return [(tile, shown.payload) for tile, shown in made if shown.table.num_rows]
 
     def whole_map(self, now: int) -> pa.Table:
         """All public cells; the lock is held for a few at a time, so that ingest goes on."""
@@ -231,8 +229,10 @@ class Engine:
         with self._guard:
             return self._alerts.faded(now)
 
-    def answer(self, query: MapQuery, wanted: Callable[[int], bool], now: int) -> list[tuple[int, bytes]]:
-        """Tile and payload of every reply to a query.
+    def answer(
+        self, query: MapQuery, wanted: Callable[[int], bool], now: int, only: int | None = None
+    ) -> Iterator[tuple[int, bytes]]:
+        """Tile and payload of every reply to a query, each made when it is taken; see `answer.answer`.
 
         Raises:
             InputError: a route too long, a time in the future, or an archive that cannot be read.
@@ -240,8 +240,7 @@ class Engine:
         least = max(query.min_vehicles, self._config.public_vehicles)
         query = query.model_copy(update={"min_vehicles": least})
         if query.at is None:
-            with self._guard:
-                return list(answer(self.map, query, wanted, now))
+            return answer(self._tiles, query, wanted, now, only)
         at = int(query.at.timestamp() * 1e9)
         if at > now:
             raise InputError("at", "lies in the future", "give a time that has been")
@@ -252,7 +251,7 @@ class Engine:
                 pass  # folding is what counts; the alerts of then are history
         except OSError as error:
             raise InputError("at", f"the archive cannot be read ({error.strerror})", "ask again later") from error
-        return list(answer(MapState(past), query, wanted, at))
+        return answer(Tiles(MapState(past), nullcontext(), least), query, wanted, at, only)
 
 
 def _box(query: MapQuery) -> tuple[float, float, float, float] | None:

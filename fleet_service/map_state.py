@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -40,11 +40,20 @@ class MapState:
         )  # in parts, which are joined when they are asked for
         self._indexed = 0
         self._dirty: set[int] = set()
+        self._changed: dict[int, int] = {}
+        self.change = 0  # how often anything changed
 
     def changed(self, slots: IntArray) -> None:
         """Note cells that were folded into."""
         self._index()
-        self._dirty.update(np.unique(tile_of(self.fusion, slots)).tolist())
+        self.change += 1
+        tiles = np.unique(tile_of(self.fusion, slots)).tolist()
+        self._dirty.update(tiles)
+        self._changed.update(dict.fromkeys(tiles, self.change))
+
+    def changed_at(self, tile: int) -> int:
+        """Value of `change` when the tile changed the last time; 0 if it did not."""
+        return self._changed.get(tile, 0)
 
     def take_dirty(self) -> list[int]:
         """Tiles that changed since the last call."""
@@ -93,30 +102,47 @@ def basis_of(belief: FloatArray, values: Float32Array) -> list[str]:
     return ["measured" if is_so else "bound" for is_so in measured.tolist()]
 
 
-def cell_table(fusion: Fusion, slots: IntArray, now: int) -> pa.Table:
-    """The cells of `slots` as they are believed at `now` [ns], in the schema of the map."""
+class Cells(NamedTuple):
+    """What a fusion knows of cells: columns (k,) and beliefs (k, 32), read at `now` [ns]."""
+
+    cell: IntArray
+    sector: IntArray
+    belief: FloatArray
+    basis: list[str]
+    vehicles: CountArray
+    observations: CountArray
+    first: IntArray
+    last: IntArray
+    now: int
+
+
+def cells_at(fusion: Fusion, slots: IntArray, now: int) -> Cells:
+    """The cells of `slots` as they are believed at `now` [ns]; copies, so that the fusion may go on."""
     belief, live = fusion.beliefs(slots, now), fusion.live
     key = live.key[slots]
-    return map_table(
+    return Cells(
         key // grid.SECTORS, key % grid.SECTORS, belief, basis_of(belief, live.values[slots]), live.vehicles[slots],
         live.visits[slots], live.first[slots], live.time[slots], now,
     )  # fmt: skip
 
 
-def map_table(
-    cell: IntArray, sector: IntArray, belief: FloatArray, basis: list[str], vehicles: CountArray,
-    observations: CountArray, first: IntArray, last: IntArray, now: int,
-) -> pa.Table:  # fmt: skip
-    """Columns (k,) and beliefs (k, 32) as a table of the map."""
-    latitude, longitude = grid.centre(cell)
-    west, south, east, north = grid.bounds(cell)
+def cell_table(fusion: Fusion, slots: IntArray, now: int) -> pa.Table:
+    """The cells of `slots` as they are believed at `now` [ns], in the schema of the map."""
+    return map_table(cells_at(fusion, slots, now))
+
+
+def map_table(cells: Cells) -> pa.Table:
+    """Cells as a table of the map."""
+    latitude, longitude = grid.centre(cells.cell)
+    west, south, east, north = grid.bounds(cells.cell)
+    lower, middle, upper = (mugrid.quantiles(cells.belief, q) for q in (LOWER, 0.5, UPPER))
     columns: dict[str, Any] = {
-        "cell": cell, "sector": sector, "mu": mugrid.quantiles(belief, 0.5),
-        "mu_lower": mugrid.quantiles(belief, LOWER), "mu_upper": mugrid.quantiles(belief, UPPER),
-        "p_slippery": belief @ SLIPPERY_SHARE, "basis": basis, "vehicles": vehicles, "observations": observations,
-        "first_time": first, "last_time": last, "age_s": np.maximum(now - last, 0) * 1e-9,
+        "cell": cells.cell, "sector": cells.sector, "mu": middle, "mu_lower": lower, "mu_upper": upper,
+        "p_slippery": cells.belief @ SLIPPERY_SHARE, "basis": cells.basis, "vehicles": cells.vehicles,
+        "observations": cells.observations, "first_time": cells.first, "last_time": cells.last,
+        "age_s": np.maximum(cells.now - cells.last, 0) * 1e-9,
         "latitude": latitude, "longitude": longitude, "west": west, "south": south, "east": east, "north": north,
-        "safe_deceleration": GRAVITY * mugrid.quantiles(belief, LOWER),
+        "safe_deceleration": GRAVITY * lower,
     }  # fmt: skip
     arrays = [pa.array(columns[f.name]).cast(f.type, safe=False) for f in tables.MAP_SCHEMA]
     return pa.Table.from_arrays(arrays, schema=tables.MAP_SCHEMA)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable
+from functools import lru_cache
 from typing import Final
 
 import zenoh
@@ -18,14 +19,15 @@ from schemas.errors import InputError
 from schemas.query import MapQuery
 
 TEXT: Final = "text/plain"
-Answering = Callable[[MapQuery, Callable[[int], bool]], list[tuple[int, bytes]]]
+Answering = Callable[[MapQuery, Callable[[int], bool], int | None], Iterable[tuple[int, bytes]]]
 
 
 class Replies:
     """The callback of the queryables.
 
     Args:
-        answer: gives tile and payload of every reply to a query, for the tiles that a predicate wants.
+        answer: gives tile and payload of every reply to a query, for the tiles that a predicate wants, and the only
+            one, where the query's key is a tile's.
         counts: takes `queries`, and `bad_queries.FIELD`.
     """
 
@@ -66,7 +68,10 @@ class Replies:
 
     def _send(self, asked: zenoh.Query, wanted: MapQuery) -> None:
         expression = asked.key_expr
-        for tile, payload in self._answer(wanted, lambda t: expression.intersects(zenoh.KeyExpr(keys.map_key(t)))):
+        only = _tile(str(expression))
+        for tile, payload in self._answer(
+            wanted, lambda t: t == only or expression.intersects(zenoh.KeyExpr(keys.map_key(t))), only
+        ):
             asked.reply(keys.map_key(tile), payload, encoding=wanted.format.encoding)
 
     def _refuse(self, asked: zenoh.Query, error: InputError) -> None:
@@ -74,3 +79,12 @@ class Replies:
         self._counts[f"bad_queries.{field}"] += 1
         with asked:
             asked.reply_err(str(error), encoding=TEXT)
+
+
+@lru_cache(1 << 12)
+def _tile(expression: str) -> int | None:
+    """The tile that a key names; None where it is none's, or many."""
+    try:
+        return keys.parse(expression).place
+    except InputError:
+        return None

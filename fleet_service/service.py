@@ -33,7 +33,7 @@ from schemas.operator import Line
 from schemas.query import MapQuery
 from schemas.wire import Alert, Kind
 
-MESSAGES_PER_TURN: Final = 4096  # so that a flood does not delay alerts, segments and tiles by more than a moment
+MESSAGES_PER_TURN: Final = 512  # so that a flood does not delay alerts, answers and segments by more than a moment
 IDLE_S: Final = 0.05  # longest wait for a message; bounds how late a segment or a tile can be
 STATUS_S: Final = 5.0
 LEAVE_S: Final = 1.5  # of the three seconds in which a service is gone
@@ -198,8 +198,8 @@ class Service:
         )
         self._say(Line(text, cells=self.engine.fusion.size, queue=len(self.inbox), counts=dict(counts)))
 
-    def _answer(self, wanted: MapQuery, near: Callable[[int], bool]) -> list[tuple[int, bytes]]:
-        return self.engine.answer(wanted, near, self._clock.now())
+    def _answer(self, wanted: MapQuery, near: Callable[[int], bool], only: int | None) -> Iterator[tuple[int, bytes]]:
+        return self.engine.answer(wanted, near, self._clock.now(), only)
 
 
 def put(session: zenoh.Session, key: str, payload: bytes, encoding: str) -> None:

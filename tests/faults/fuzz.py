@@ -110,7 +110,7 @@ def _ask(site: Site, engine: Engine, asked: dict[str, str], now: int) -> tuple[i
     try:
         wanted = query.parse(asked)
         if wanted.at is None:  # a past is a replay of the archive, minutes by now
-            engine.answer(wanted, lambda _: True, now)
+            list(engine.answer(wanted, lambda _: True, now))
     except InputError:
         return 0, 0
     except Exception:  # noqa: BLE001

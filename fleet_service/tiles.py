@@ -1,0 +1,98 @@
+"""Tiles as they are shown: made when they are asked for or put, and shown again while they are good.
+
+A tile that is shown is at most SHOWN_NS old and holds everything that was acknowledged, or alerted, before it was asked
+for: what an answer can be no fresher than by more than a put can. Most questions under load then cost a look.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from typing import Any, Final, NamedTuple
+
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from fleet_service.map_state import MapState, arrow_stream, cells_at, map_table
+from schemas.numeric import IntArray
+
+SHOWN_NS: Final = 1_000_000_000  # as old as a tile that is put once a second may be
+KEPT_BYTES: Final = 32 << 20
+FILTERED: Final = ("vehicles", "west", "south", "east", "north")  # columns by which a question chooses cells
+
+
+class Shown(NamedTuple):
+    """A tile's public cells.
+
+    Attributes:
+        payload: as an Arrow stream.
+        table: the same; shares the payload's memory.
+        columns: FILTERED as arrays (k,).
+        made: when [ns].
+        change: the last change of the map that is in it.
+    """
+
+    payload: bytes
+    table: pa.Table
+    columns: Mapping[str, NDArray[Any]]
+    made: int
+    change: int
+
+
+class Tiles:
+    """The tiles of a map.
+
+    Args:
+        state: the map.
+        guard: held while the map is read; not while Arrow is written.
+        least: vehicles of a cell that is public.
+    """
+
+    def __init__(self, state: MapState, guard: AbstractContextManager[Any], least: int) -> None:
+        self.state, self.guard, self._least = state, guard, least
+        self._kept: dict[int, Shown] = {}
+        self._held = 0  # bytes
+        self._settled = 0  # change up to which all must be seen
+
+    def settle(self) -> None:
+        """All that the map holds now is promised to somebody: no tile without it is shown from here on."""
+        self._settled = self.state.change
+
+    def shown(self, tile: int, now: int) -> Shown:
+        """A tile that is good enough for a question at `now` [ns]."""
+        kept = self._kept.get(tile)
+        if kept is None or not 0 <= now - kept.made <= SHOWN_NS:
+            return self.make(tile, now)
+        whole = kept.change >= min(self._settled, self.state.changed_at(tile))
+        return kept if whole else self.make(tile, now)
+
+    def make(self, tile: int, now: int) -> Shown:
+        """A tile as it is believed at `now` [ns]."""
+        with self.guard:
+            change = self.state.change
+            cells = cells_at(self.state.fusion, self._public(self.state.slots(tile)), now)
+        payload = arrow_stream(map_table(cells))
+        table = pa.ipc.open_stream(payload).read_all()
+        made = Shown(payload, table, filtered(table), now, change)
+        self._keep(tile, made)
+        return made
+
+    def _public(self, slots: IntArray) -> IntArray:
+        return slots[self.state.fusion.live.vehicles[slots] >= self._least]
+
+    def _keep(self, tile: int, made: Shown) -> None:
+        with self.guard:
+            self._drop(tile)
+            self._kept[tile] = made
+            self._held += len(made.payload)
+            while self._held > KEPT_BYTES:
+                self._drop(next(iter(self._kept)))
+
+    def _drop(self, tile: int) -> None:
+        kept = self._kept.pop(tile, None)
+        self._held -= len(kept.payload) if kept else 0
+
+
+def filtered(table: pa.Table) -> dict[str, NDArray[Any]]:
+    """The columns by which a question chooses cells."""
+    return {name: table[name].to_numpy() for name in FILTERED}
