@@ -32,18 +32,27 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
     which is what makes a bank of N = 1 and of N = thousands bit-equal. Where the cache's disk is full, a kernel is
     compiled at each start.
     """
-    return _compile(function, release_gil=False)
+    return _compile(function)
+
+
+def inlined(function: Callable[P, R]) -> Callable[P, R]:
+    """`compiled` into each of its callers: for a few lines of arithmetic in a loop, where a call costs more than they.
+
+    The optimiser then works on the four wheels side by side. Callers hand such functions numbers and tuples: what is
+    read from an array has to be read again after every write to another.
+    """
+    return _compile(function, forceinline=True)
 
 
 def released(function: Callable[P, R]) -> Callable[P, R]:
     """`compiled`, and other Python threads run meanwhile: for long kernels that touch only what they are handed."""
-    return _compile(function, release_gil=True)
+    return _compile(function, nogil=True)
 
 
-def _compile(function: Callable[P, R], *, release_gil: bool) -> Callable[P, R]:
+def _compile(function: Callable[P, R], *, nogil: bool = False, forceinline: bool = False) -> Callable[P, R]:
     if "NUMBA_CACHE_DIR" not in os.environ:
         numba.config.CACHE_DIR = _kernel_cache(function.__module__.partition(".")[0])  # type: ignore[attr-defined]
-    kernel = numba.njit(cache=True, error_model="numpy", nogil=release_gil)(function)
+    kernel = numba.njit(cache=True, error_model="numpy", nogil=nogil, forceinline=forceinline)(function)
     kernel._cache = _Cache(function)  # type: ignore[attr-defined, no-untyped-call] # no public way
     return cast(Callable[P, R], kernel)
 

@@ -11,10 +11,10 @@ import math
 import numpy as np
 
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.parameters import Body, Four, P, body
 from edge_agent.dynamics.slip import slips, wheel_position
 from edge_agent.dynamics.tyres import combined_dugoff, combined_magic
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray, compiled, inlined
 
 DUGOFF = 0.0  # in place of a Magic Formula shape c, which is above 1
 
@@ -28,11 +28,12 @@ def turned(delta: FloatArray) -> FloatArray:
     return out
 
 
-@compiled
+@inlined
 def _slips(radius: float, ahead: float, aside: float, cos: float, sin: float, omega: float) -> tuple[float, float]:
     """Slips of a wheel whose centre moves by ahead, aside [m/s] in body axes, at cos(delta), sin(delta)."""
     along, across = cos * ahead + sin * aside, cos * aside - sin * ahead
-    return slips(radius, along / radius if math.isnan(omega) else omega, along, across)
+    slip_x, slip_y = slips(radius, omega, along, across)
+    return (0.0 if math.isnan(omega) else slip_x), slip_y
 
 
 @compiled
@@ -51,7 +52,7 @@ def tyre_forces(
     steering: (4, 2) of `turned`; omega, mu (4,); shape: c of the Magic Formula (e = 0), or DUGOFF. A wheel whose speed
     is NaN rolls freely.
     """
-    loads = wheel_loads(row, motion[3], motion[4])
+    loads = wheel_loads(body(row), motion[3], motion[4])
     for wheel in range(4):
         x, y = wheel_position(row, wheel)
         ahead, aside = motion[0] - y * motion[2], motion[1] + x * motion[2]
@@ -64,40 +65,41 @@ def tyre_forces(
         force_x[wheel], force_y[wheel] = pair
 
 
-@compiled
+@inlined
 def response(
-    row: FloatArray,
+    body: Body,
     vx: float,
     vy: float,
     rate: float,
     ax: float,
     ay: float,
-    steering: FloatArray,
-    omega: FloatArray,
-    known_x: FloatArray,
-    mu: FloatArray,
+    cos: Four,
+    sin: Four,
+    omega: Four,
+    known_x: Four,
+    mu: Four,
 ) -> tuple[float, float, float]:
-    """(a_x, a_y [m/s^2], yaw acceleration [rad/s^2]) of four Dugoff tyres' forces; arguments as `tyre_forces`.
+    """(a_x, a_y [m/s^2], yaw acceleration [rad/s^2]) of four Dugoff tyres' forces; cos, sin (4,) of the steering.
 
     known_x (4,) [N] replaces the tyre's longitudinal force where it is not NaN. Written out per wheel, with numbers and
     no arrays between: this is where the papers' filters spend their time.
     """
-    fl, fr, rl, rr = wheel_loads(row, ax, ay)
-    a, b, front, rear = row[P.TO_FRONT], row[P.TO_REAR], 0.5 * row[P.TRACK_FRONT], 0.5 * row[P.TRACK_REAR]
-    tyre, aside = (row[P.RADIUS], row[P.SLOPE_X], row[P.SLOPE_Y]), vy + a * rate
-    x_fl, y_fl = _pull(tyre, fl, mu[0], vx - front * rate, aside, steering[0, 0], steering[0, 1], omega[0], known_x[0])
-    x_fr, y_fr = _pull(tyre, fr, mu[1], vx + front * rate, aside, steering[1, 0], steering[1, 1], omega[1], known_x[1])
+    fl, fr, rl, rr = wheel_loads(body, ax, ay)
+    a, b, front, rear = body.to_front, body.to_rear, 0.5 * body.track_front, 0.5 * body.track_rear
+    aside = vy + a * rate
+    x_fl, y_fl = _pull(body, fl, mu[0], vx - front * rate, aside, cos[0], sin[0], omega[0], known_x[0])
+    x_fr, y_fr = _pull(body, fr, mu[1], vx + front * rate, aside, cos[1], sin[1], omega[1], known_x[1])
     aside = vy - b * rate
-    x_rl, y_rl = _pull(tyre, rl, mu[2], vx - rear * rate, aside, steering[2, 0], steering[2, 1], omega[2], known_x[2])
-    x_rr, y_rr = _pull(tyre, rr, mu[3], vx + rear * rate, aside, steering[3, 0], steering[3, 1], omega[3], known_x[3])
+    x_rl, y_rl = _pull(body, rl, mu[2], vx - rear * rate, aside, cos[2], sin[2], omega[2], known_x[2])
+    x_rr, y_rr = _pull(body, rr, mu[3], vx + rear * rate, aside, cos[3], sin[3], omega[3], known_x[3])
     moment = a * (y_fl + y_fr) - b * (y_rl + y_rr) + front * (x_fr - x_fl) + rear * (x_rr - x_rl)
-    mass = row[P.MASS]
-    return (x_fl + x_fr + x_rl + x_rr) / mass, (y_fl + y_fr + y_rl + y_rr) / mass, moment / row[P.YAW_INERTIA]
+    mass = body.mass
+    return (x_fl + x_fr + x_rl + x_rr) / mass, (y_fl + y_fr + y_rl + y_rr) / mass, moment / body.yaw_inertia
 
 
-@compiled
+@inlined
 def _pull(
-    tyre: tuple[float, float, float],
+    body: Body,
     load: float,
     mu: float,
     ahead: float,
@@ -107,9 +109,8 @@ def _pull(
     omega: float,
     known_x: float,
 ) -> tuple[float, float]:
-    """Force (ahead, left) [N] in body axes of one wheel; tyre = radius, slope_x, slope_y."""
-    radius, slope_x, slope_y = tyre
-    slip_x, slip_y = _slips(radius, ahead, aside, cos, sin, omega)
-    force_x, force_y = combined_dugoff(slip_x, slip_y, slope_x * load, slope_y * load, mu, load)
+    """Force (ahead, left) [N] in body axes of one wheel."""
+    slip_x, slip_y = _slips(body.radius, ahead, aside, cos, sin, omega)
+    force_x, force_y = combined_dugoff(slip_x, slip_y, body.slope_x * load, body.slope_y * load, mu, load)
     force_x = force_x if math.isnan(known_x) else known_x
     return cos * force_x - sin * force_y, sin * force_x + cos * force_y

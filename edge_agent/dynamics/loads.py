@@ -7,26 +7,26 @@ ISO 8855 signs: accelerating loads the rear, a left turn (a_y > 0) loads the rig
 
 from __future__ import annotations
 
-from edge_agent.dynamics.parameters import GRAVITY, P
-from schemas.numeric import FloatArray, compiled
+from edge_agent.dynamics.parameters import GRAVITY, Body, Four
+from schemas.numeric import inlined
 
 LEAST_LOAD_SHARE = 0.02  # of a static wheel load: a lifted wheel keeps a trace of load, so that shares stay finite
 
 
-@compiled
-def wheel_loads(row: FloatArray, ax: float, ay: float) -> tuple[float, float, float, float]:
-    """Loads (fl, fr, rl, rr) [N] of the vehicle `row` at accelerations ax, ay [m/s^2].
+@inlined
+def wheel_loads(body: Body, ax: float, ay: float) -> Four:
+    """Loads (fl, fr, rl, rr) [N] at accelerations ax, ay [m/s^2].
 
     The lateral transfer of each axle is in proportion to the mass it carries (equal roll stiffness per load).
     """
-    mass, height = row[P.MASS], row[P.CG_HEIGHT]
-    base = row[P.TO_FRONT] + row[P.TO_REAR]
+    mass, height = body.mass, body.cg_height
+    base = body.to_front + body.to_rear
     pitch = mass * ax * height / base
-    front = mass * GRAVITY * row[P.TO_REAR] / base - pitch
-    rear = mass * GRAVITY * row[P.TO_FRONT] / base + pitch
+    front = mass * GRAVITY * body.to_rear / base - pitch
+    rear = mass * GRAVITY * body.to_front / base + pitch
     roll = ay * height / GRAVITY
-    shift_front = front * roll / row[P.TRACK_FRONT]
-    shift_rear = rear * roll / row[P.TRACK_REAR]
+    shift_front = front * roll / body.track_front
+    shift_rear = rear * roll / body.track_rear
     least = LEAST_LOAD_SHARE * mass * GRAVITY / 4.0
     return (
         max(0.5 * front - shift_front, least),

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import IntEnum
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from schemas.numeric import FloatArray
+from schemas.numeric import FloatArray, inlined
 from schemas.vehicle import Vehicle
 
 GRAVITY = 9.81  # [m/s^2]
@@ -62,3 +63,37 @@ def parameter_row(vehicle: Vehicle) -> FloatArray:
 def parameter_table(vehicles: Sequence[Vehicle]) -> FloatArray:
     """One row per vehicle, shape (N, 12)."""
     return np.stack([parameter_row(v) for v in vehicles])
+
+
+class Body(NamedTuple):
+    """What body and tyres take of a row, as numbers and not in an array: see `inlined`."""
+
+    mass: float
+    yaw_inertia: float
+    to_front: float
+    to_rear: float
+    track_front: float
+    track_rear: float
+    cg_height: float
+    radius: float
+    slope_x: float
+    slope_y: float
+
+
+@inlined
+def body(row: FloatArray) -> Body:
+    """The body of a row (12,)."""
+    return Body(
+        row[P.MASS], row[P.YAW_INERTIA], row[P.TO_FRONT], row[P.TO_REAR], row[P.TRACK_FRONT], row[P.TRACK_REAR],
+        row[P.CG_HEIGHT], row[P.RADIUS], row[P.SLOPE_X], row[P.SLOPE_Y],
+    )  # fmt: skip
+
+
+Four: TypeAlias = tuple[float, float, float, float]
+"""A number of each wheel."""
+
+
+@inlined
+def four(values: FloatArray) -> Four:
+    """Values (4,) as numbers."""
+    return values[0], values[1], values[2], values[3]

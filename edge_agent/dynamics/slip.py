@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from edge_agent.dynamics.parameters import P
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray, compiled, inlined
 
 SLOWEST_M_S = 0.5  # slip's denominator is kept above it: near standstill slip has no meaning
 
@@ -35,7 +35,7 @@ def wheel_velocity(
     return cos * ahead + sin * left, cos * left - sin * ahead
 
 
-@compiled
+@inlined
 def slips(radius: float, omega: float, along: float, across: float) -> tuple[float, float]:
     """(slip_x, slip_y) [1]: (R*omega - v_wx)/|v_wx| and -v_wy/|v_wx|, the tangent of the slip angle.
 

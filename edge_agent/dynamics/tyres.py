@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 
-from schemas.numeric import compiled
+from schemas.numeric import compiled, inlined
 
 TINY = 1e-12  # below it a slip has no direction and no force
 
@@ -73,18 +73,17 @@ def combined_magic(
     return gain * theta_x, gain * theta_y
 
 
-@compiled
+@inlined
 def combined_dugoff(
     slip_x: float, slip_y: float, stiffness_x: float, stiffness_y: float, mu: float, load: float
 ) -> tuple[float, float]:
-    """(Fx, Fy) [N] of one wheel in its own frame by similarity with the Dugoff curve; arguments as `combined_magic`."""
-    grip = mu * load
-    if grip <= 0.0:
-        return 0.0, 0.0
-    theta_x = stiffness_x * slip_x / grip
-    theta_y = stiffness_y * slip_y / grip
-    theta = math.sqrt(theta_x * theta_x + theta_y * theta_y)
-    if theta < TINY:
-        return 0.0, 0.0
-    gain = grip * dugoff(theta) / theta
-    return gain * theta_x, gain * theta_y
+    """(Fx, Fy) [N] of one wheel in its own frame by similarity with the Dugoff curve; arguments as `combined_magic`.
+
+    Up to half the grip, theta <= 1/2, that is K*slip itself.
+    """
+    grip = max(mu * load, 0.0)
+    free_x, free_y = stiffness_x * slip_x, stiffness_y * slip_y
+    free = math.sqrt(free_x * free_x + free_y * free_y)
+    share = grip / free  # 1/theta
+    gain = 1.0 if 2.0 * free <= grip else share * (1.0 - 0.25 * share)
+    return gain * free_x, gain * free_y

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edge_agent.dynamics.chassis import response, turned
-from edge_agent.dynamics.parameters import GRAVITY, parameter_table
+from edge_agent.dynamics.parameters import GRAVITY, body, four, parameter_table
 from edge_agent.estimators import flags
 from edge_agent.estimators.gaussian import pair
 from edge_agent.estimators.gaussian.bank import (
@@ -155,7 +155,10 @@ def _measure(
     for p in range(points.shape[0]):
         for wheel in range(4):
             mu[wheel] = min(max(points[p, wheel], LOWER), UPPER)
-        ax, ay, turn = response(row, x[X.VX], x[X.VY], x[X.YAW_RATE], x[X.AX], x[X.AY], steering, omega, known, mu)
+        ax, ay, turn = response(
+            body(row), x[X.VX], x[X.VY], x[X.YAW_RATE], x[X.AX], x[X.AY], four(steering[:, 0]), four(steering[:, 1]),
+            four(omega), four(known), four(mu),
+        )  # fmt: skip
         outcomes[p, 0], outcomes[p, 1], outcomes[p, 2] = ax, ay, memory.yaw_rate[n] + gone * turn
     weighted_mean(outcomes, memory.weight, predicted)
     deviations(points, mean, memory.weight, state, 0)

@@ -28,7 +28,7 @@ import numpy as np
 from edge_agent.dynamics.body import advance_velocity
 from edge_agent.dynamics.chassis import DUGOFF, response, turned, tyre_forces
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import GRAVITY, P, parameter_table
+from edge_agent.dynamics.parameters import GRAVITY, Four, P, body, four, parameter_table
 from edge_agent.estimators import flags
 from edge_agent.estimators.friction_mixture.sample import rolling_speed
 from edge_agent.estimators.gaussian.bank import (
@@ -142,11 +142,12 @@ def _friction(x: FloatArray, mean: FloatArray, share: float, mu: FloatArray) -> 
 
 @compiled
 def _felt(
-    row: FloatArray, x: FloatArray, use: FloatArray, steering: FloatArray, mu: FloatArray, unknown: FloatArray
+    row: FloatArray, x: FloatArray, use: FloatArray, steering: FloatArray, mu: FloatArray, unknown: Four
 ) -> tuple[float, float]:
     """(a_y, yaw acceleration) of the tyres at x (7,)."""
     _, ay, turn = response(
-        row, x[X.VX], x[X.VY], x[X.YAW_RATE], use[S.AX], use[S.AY], steering, use[S.OMEGA : S.OMEGA + 4], unknown, mu,
+        body(row), x[X.VX], x[X.VY], x[X.YAW_RATE], use[S.AX], use[S.AY], four(steering[:, 0]), four(steering[:, 1]),
+        four(use[S.OMEGA : S.OMEGA + 4]), unknown, four(mu),
     )  # fmt: skip
     return ay, turn
 
@@ -156,7 +157,7 @@ def _step(memory: Memory, track: Track, row: FloatArray, n: int, gone: float) ->
     mean, root, use = memory.mean[n], memory.root[n], track.use[n]
     count = memory.xi.shape[0]
     points, work = np.empty((count, STATES)), np.empty((ROWS + STATES, count + 2 * STATES))
-    noise, unknown, mu = np.zeros((STATES, STATES)), np.full(4, math.nan), np.empty(4)
+    noise, unknown, mu = np.zeros((STATES, STATES)), (math.nan, math.nan, math.nan, math.nan), np.empty(4)
     steering = turned(use[S.DELTA : S.DELTA + 4])
     middle, share = mean.copy(), told_share(math.hypot(use[S.AX], use[S.AY]) / GRAVITY)
     keep = math.exp(-abs(mean[X.VX]) * gone / FORGET_M)
@@ -192,7 +193,7 @@ def _measure(
 ) -> None:
     mean, root, now, use = memory.mean[n], memory.root[n], track.now[n], track.use[n]
     count = points.shape[0]
-    outcomes, predicted, unknown = np.empty((count, ROWS)), np.empty(ROWS), np.full(4, math.nan)
+    outcomes, predicted, unknown = np.empty((count, ROWS)), np.empty(ROWS), (math.nan, math.nan, math.nan, math.nan)
     state, measured = np.empty((STATES, count)), np.empty((ROWS, count))
     innovation, std = np.empty(ROWS), np.empty(ROWS)
     middle, steering, mu, force_y = mean.copy(), turned(use[S.DELTA : S.DELTA + 4]), np.empty(4), np.empty(4)
@@ -210,7 +211,7 @@ def _measure(
     speed, std[0] = freed_speed(row, track.before[n], use, gone)
     innovation[0], innovation[1], innovation[2] = speed, now[S.YAW_RATE], now[S.AY]
     std[1], std[2] = RATE_STD, looks * math.hypot(AY_STD, AY_SHARE * use[S.AY])
-    loads = wheel_loads(row, use[S.AX], use[S.AY])
+    loads = wheel_loads(body(row), use[S.AX], use[S.AY])
     for wheel in range(4):
         force = wheel_force(row, track.before[n], use, wheel, gone)
         slip_std = SLIP_STD + OMEGA_STD * row[P.RADIUS] / max(abs(mean[X.VX]), 1.0)

@@ -6,7 +6,7 @@ The drives are ordinary ones; a fault begins at BEGINS. `told` is whether the he
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -112,7 +112,7 @@ def harmed(batch: Batch, case: Case) -> Batch:
 def outcome(batch: Batch, said: Estimates, case: Case) -> dict[str, FloatArray]:
     """What is measured of a case, per drive: `finite`, `told` (1 or 0), coverage and width from BEGINS on, RMSE."""
     after = batch.t[:, 0] >= BEGINS
-    named = (getattr(said, field.name) for field in fields(said) if field.name != "evidence")
+    named = (getattr(said, name) for name in said._fields if name != "evidence")
     whole = np.stack([np.isfinite(a).reshape(*batch.t.shape, -1).all(axis=-1) for a in named if a is not None])
     ordered = (said.mu_lower <= said.mu) & (said.mu <= said.mu_upper)
     found = {

@@ -9,7 +9,6 @@ between their quantiles, or tell the prior.
 from __future__ import annotations
 
 import copy
-from dataclasses import fields
 from itertools import pairwise
 from typing import Final
 
@@ -40,7 +39,7 @@ def watched(bank: Bank, batch: Batch) -> tuple[Estimates, FloatArray]:
 
 def joined(parts: list[Estimates]) -> Estimates:
     """Estimates of one drive, one stretch after the other; evidence is left out."""
-    told = [field.name for field in fields(Estimates) if field.name not in ("mu_wheel", "evidence")]
+    told = [name for name in Estimates._fields if name not in ("mu_wheel", "evidence")]
     wheels = [part.mu_wheel for part in parts if part.mu_wheel is not None]
     return Estimates(
         **{name: np.concatenate([getattr(part, name) for part in parts]) for name in told},

@@ -28,7 +28,7 @@ from typing import Final
 
 from edge_agent.dynamics.body import accelerations
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.parameters import P, body
 from edge_agent.dynamics.slip import SLOWEST_M_S, slips, wheel_position, wheel_velocity
 from edge_agent.dynamics.tyres import TINY, brush, magic_formula
 from schemas.numeric import FloatArray, compiled
@@ -122,8 +122,8 @@ def slip_limit(p: FloatArray, i: int) -> float:
 @compiled
 def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> None:
     """Fill `w` (8, 4) for the state `x` (12,), parameters `p` (25,) and inputs `u` (4, 4)."""
-    loads = wheel_loads(p, x[X.AX_LAGGED], x[X.AY_LAGGED])
-    at_rest = wheel_loads(p, 0.0, 0.0)
+    loads = wheel_loads(body(p), x[X.AX_LAGGED], x[X.AY_LAGGED])
+    at_rest = wheel_loads(body(p), 0.0, 0.0)
     for i in range(4):
         load, omega = loads[i], x[X.OMEGA + i]
         along, across = wheel_velocity(p, i, x[X.VX], x[X.VY], x[X.YAW_RATE], u[U.STEER, i])

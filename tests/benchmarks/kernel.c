@@ -32,10 +32,10 @@ static void respond(const double *p, double vx, double vy, double r, double ax, 
         double ahead = vx - y * r, aside = vy + x * r;
         double along = c[w] * ahead + s[w] * aside, across = c[w] * aside - s[w] * ahead;
         double speed = fmax(fabs(along), 0.5);
-        double tx = p[SLOPE_X] * load * (p[RADIUS] * omega[w] - along) / speed / grip;
-        double ty = p[SLOPE_Y] * load * -across / speed / grip, theta = sqrt(tx * tx + ty * ty);
-        double gain = theta < 1e-12 ? 0.0 : grip * (theta <= 0.5 ? 1.0 : (1.0 - 0.25 / theta) / theta);
-        double f_ahead = c[w] * gain * tx - s[w] * gain * ty, f_left = s[w] * gain * tx + c[w] * gain * ty;
+        double free_x = p[SLOPE_X] * load * (p[RADIUS] * omega[w] - along) / speed;
+        double free_y = p[SLOPE_Y] * load * -across / speed, free = sqrt(free_x * free_x + free_y * free_y);
+        double share = grip / free, gain = 2.0 * free <= grip ? 1.0 : share * (1.0 - 0.25 * share);
+        double f_ahead = gain * (c[w] * free_x - s[w] * free_y), f_left = gain * (s[w] * free_x + c[w] * free_y);
         fx += f_ahead, fy += f_left, moment += x * f_left - y * f_ahead;
     }
     out[0] = fx / p[MASS], out[1] = fy / p[MASS], out[2] = moment / p[INERTIA];

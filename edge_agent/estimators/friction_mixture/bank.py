@@ -7,8 +7,7 @@ however the samples are cut into calls.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +26,7 @@ from edge_agent.estimators.shares import checked, in_shares
 from schemas.mugrid import BINS, CENTRES
 from schemas.numeric import BoolArray, FloatArray, compiled, released
 
-OUTPUTS = (
+OUTPUTS = (  # the first fields of Estimates
     "vx", "vy", "yaw_rate", "sideslip", "vx_std", "vy_std", "yaw_rate_std", "sideslip_std",
     "mu", "mu_lower", "mu_upper", "mu_utilised", "innovation_nis", "adaptation", "innovation_log_likelihood",
 )  # fmt: skip
@@ -37,8 +36,7 @@ SLOWEST_M_S = 0.5  # sideslip is taken against at least this speed
 YAW_RATE_OFFSET_STD = 0.001  # [rad/s]
 
 
-@dataclass(frozen=True)
-class Estimates:
+class Estimates(NamedTuple):
     """What a bank says per sample and vehicle; arrays of shape (T, N) unless said otherwise."""
 
     vx: FloatArray  # [m/s]
@@ -197,8 +195,7 @@ class EstimatorBank:
             advance_some(self._memory, self._design, self._scratch[share], *whole, first, last)
 
         in_shares(work, count, threads)
-        named = dict(zip(OUTPUTS, out, strict=True))
-        return Estimates(**named, health=health, mu_wheel=wheels, evidence=None if closes is None else evidence)
+        return Estimates._make((*out, health, wheels, None if closes is None else evidence))
 
 
 def new_scratch() -> Scratch:

@@ -23,7 +23,7 @@ from enum import IntEnum
 
 from edge_agent.dynamics.body import axle_lateral_forces
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.parameters import P, body
 from edge_agent.dynamics.slip import wheel_position
 from edge_agent.dynamics.wheel import force_from_torque
 from edge_agent.estimators import flags
@@ -201,7 +201,7 @@ def block_features(
     _kinematics(held, gain_sum, features)
     features[F.YAW_RATE] = mean_or(sums, counts, S.YAW_RATE, held[H.YAW_RATE])
     ax, ay = mean_or(sums, counts, S.AX, 0.0), mean_or(sums, counts, S.AY, 0.0)
-    fl, fr, rl, rr = wheel_loads(row, ax, ay)
+    fl, fr, rl, rr = wheel_loads(body(row), ax, ay)
     loads[0], loads[1], loads[2], loads[3] = fl, fr, rl, rr
     for wheel in range(4):
         features[F.STEER_COS + wheel] = math.cos(steer[wheel])

@@ -83,8 +83,7 @@ class GaussianBank(Generic[M]):
         in_shares(
             lambda _, first, last: self._kernel(self._memory, self._track, stretch, first, last), count, threads
         )  # fmt: skip
-        named = dict(zip(OUTPUTS, out, strict=True))
-        return Estimates(**named, health=health, mu_wheel=wheels if self._wheels else None, evidence=None)
+        return Estimates._make((*out, health, wheels if self._wheels else None, None))
 
 
 @compiled

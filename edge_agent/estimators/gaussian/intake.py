@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import GRAVITY, P
+from edge_agent.dynamics.parameters import GRAVITY, P, body
 from edge_agent.estimators import flags
 from edge_agent.estimators.friction_mixture.sample import GAP_S, POSITION_S, limit, reading, rolling_speed
 from schemas.numeric import BoolArray, FloatArray, IntArray, compiled
@@ -125,7 +125,7 @@ def _inputs(track: Track, row: FloatArray, n: int, sample: FloatArray) -> None:
 def _excitation(track: Track, row: FloatArray, n: int, time: float) -> None:
     """Grip used by the hardest-working wheel now: hypot of torque over radius and load, and lateral g."""
     use = track.use[n]
-    loads = wheel_loads(row, use[S.AX], use[S.AY])
+    loads = wheel_loads(body(row), use[S.AX], use[S.AY])
     used = 0.0
     for wheel in range(4):
         along = use[S.TORQUE + wheel] / (row[P.RADIUS] * loads[wheel])

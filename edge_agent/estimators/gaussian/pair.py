@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.parameters import P, body
 from edge_agent.dynamics.slip import wheel_velocity
 from edge_agent.estimators.friction_mixture.sample import rolling_speed
 from edge_agent.estimators.gaussian.bank import FIRST_V_STD, UNKNOWN_V_STD
@@ -183,7 +183,7 @@ def doubted(std: float, innovation: float) -> float:
 @compiled
 def freed_speed(row: FloatArray, before: FloatArray, use: FloatArray, gone: float) -> tuple[float, float]:
     """(mean of R*omega/(1 + slip), its standard deviation) [m/s], the slip being F_x/K; NaN without any wheel."""
-    loads = wheel_loads(row, use[S.AX], use[S.AY])
+    loads = wheel_loads(body(row), use[S.AX], use[S.AY])
     total, most, count = 0.0, 0.0, 0
     for wheel in range(4):
         omega = use[S.OMEGA + wheel]

@@ -8,19 +8,23 @@ acceleration, where the papers carry the moment itself (000, 001): divided by I_
 from __future__ import annotations
 
 import math
+from typing import TypeAlias
 
 import numpy as np
 
 from edge_agent.dynamics.body import advance_velocity
 from edge_agent.dynamics.chassis import response
+from edge_agent.dynamics.parameters import Body, Four, body, four
 from edge_agent.estimators.gaussian.intake import wheel_force
 from schemas.mugrid import LOWER, UPPER
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray, compiled, inlined
 from schemas.signals import S
 
 LONGEST_S = 0.02  # of one of Heun's steps, at a speed of
 CALM_M_S = 2.0  # or more: below, the pole of lateral motion, about 170/v [1/s], asks for shorter ones
 SHORTEST_SHARE = 0.2
+ABREAST = 8  # points are filled up to a multiple of it: the widest vectors of today's processors, in doubles
+Inputs: TypeAlias = tuple[Four, Four, Four]  # wheel speeds, cosines and sines of the steering
 
 
 @compiled
@@ -46,44 +50,74 @@ def carry(
     velocity follows a_x and a_y of the state alone, which measurements correct for drag and slopes. Else forces come
     from slip and z is the friction of all wheels.
     """
-    slowest = abs(points[0, 0])
-    for p in range(points.shape[0]):
-        slowest = min(slowest, abs(points[p, 0]))
-    count = substeps(slowest, gone)
-    step = gone / count
-    mu, known, omega, steering = np.empty(4), np.empty(4), np.empty(4), np.empty((4, 2))
-    for wheel in range(4):
-        known[wheel] = wheel_force(row, before, use, wheel, gone) if torque else math.nan
-        mu[wheel] = min(max(friction[wheel], LOWER), UPPER)
-    _inputs(before, use, 0.0, omega, steering)
-    for k in range(count):
-        omega_from, steering_from = omega.copy(), steering.copy()
-        _inputs(before, use, (k + 1) / count, omega, steering)
-        for p in range(points.shape[0]):
-            if not torque:
-                mu[:] = min(max(points[p, 5], LOWER), UPPER)
-            v, u, ax, ay, r = points[p, 0], points[p, 1], points[p, 2], points[p, 3], points[p, 4]
-            _, _, turn = response(row, v, u, r, ax, ay, steering_from, omega_from, known, mu)
-            turn = points[p, 5] if torque else turn
-            slope_x, slope_y = ax + r * u, ay - r * v
-            ahead, aside, rate = v + step * slope_x, u + step * slope_y, r + step * turn
-            vx, vy = advance_velocity(v, u, ax, ay, r, step) if torque else (ahead, aside)
-            felt_x, felt_y, again = response(row, vx, vy, rate, ax, ay, steering, omega, known, mu)
-            if not torque:
-                vx = v + 0.5 * step * (slope_x + felt_x + rate * aside)
-                vy = u + 0.5 * step * (slope_y + felt_y - rate * ahead)
-            rate = r + 0.5 * step * (turn + again)
-            points[p, 0], points[p, 1], points[p, 4] = vx, vy, rate
-            points[p, 2], points[p, 3], again = response(row, vx, vy, rate, ax, ay, steering, omega, known, mu)
-            if torque:
-                points[p, 5] = again
+    count = points.shape[0]
+    columns = np.empty((6, -(-count // ABREAST) * ABREAST))
+    for p in range(columns.shape[1]):
+        for i in range(6):
+            columns[i, p] = points[min(p, count - 1), i]
+    times = substeps(np.abs(columns[0]).min(), gone)
+    unknown = (math.nan, math.nan, math.nan, math.nan)
+    known = _forces(row, before, use, gone) if torque else unknown
+    told = four(np.minimum(np.maximum(friction, LOWER), UPPER)) if torque else unknown
+    begin = _inputs(before, use, 0.0)
+    for k in range(times):
+        end = _inputs(before, use, (k + 1) / times)
+        _heun(body(row), columns, begin, end, known, told, gone / times, torque)
+        begin = end
+    for p in range(count):
+        for i in range(6):
+            points[p, i] = columns[i, p]
 
 
 @compiled
-def _inputs(before: FloatArray, use: FloatArray, share: float, omega: FloatArray, steering: FloatArray) -> None:
-    """Wheel speeds (4,) and turned steering (4, 2) at a share of the way from one sample to the next."""
-    for wheel in range(4):
-        d, w = S.DELTA + wheel, S.OMEGA + wheel
-        delta = (1.0 - share) * before[d] + share * use[d]
-        omega[wheel] = (1.0 - share) * before[w] + share * use[w]
-        steering[wheel, 0], steering[wheel, 1] = math.cos(delta), math.sin(delta)
+def _heun(
+    vehicle: Body, columns: FloatArray, begin: Inputs, end: Inputs, known: Four, told: Four, step: float, torque: bool
+) -> None:
+    """One of Heun's steps of the states in `columns` (6, P), in place. Arithmetic alone: the points go side by side."""
+    (omega_from, cos_from, sin_from), (omega, cos, sin) = begin, end
+    column_v, column_u, column_x, column_y = columns[0], columns[1], columns[2], columns[3]
+    column_r, column_z = columns[4], columns[5]
+    for p in range(columns.shape[1]):
+        v, u, ax, ay, r, z = column_v[p], column_u[p], column_x[p], column_y[p], column_r[p], column_z[p]
+        one = min(max(z, LOWER), UPPER)
+        mu = told if torque else (one, one, one, one)
+        _, _, turn = response(vehicle, v, u, r, ax, ay, cos_from, sin_from, omega_from, known, mu)
+        turn = z if torque else turn
+        slope_x, slope_y = ax + r * u, ay - r * v
+        ahead, aside, rate = v + step * slope_x, u + step * slope_y, r + step * turn
+        vx, vy = advance_velocity(v, u, ax, ay, r, step) if torque else (ahead, aside)
+        felt_x, felt_y, again = response(vehicle, vx, vy, rate, ax, ay, cos, sin, omega, known, mu)
+        if not torque:
+            vx = v + 0.5 * step * (slope_x + felt_x + rate * aside)
+            vy = u + 0.5 * step * (slope_y + felt_y - rate * ahead)
+        rate = r + 0.5 * step * (turn + again)
+        felt_x, felt_y, again = response(vehicle, vx, vy, rate, ax, ay, cos, sin, omega, known, mu)
+        column_v[p], column_u[p], column_x[p], column_y[p], column_r[p] = vx, vy, felt_x, felt_y, rate
+        column_z[p] = again if torque else z
+
+
+@inlined
+def _inputs(before: FloatArray, use: FloatArray, share: float) -> Inputs:
+    """Wheel speeds, cosines and sines of the steering at a share of the way from one sample to the next."""
+    keep, delta, omega = 1.0 - share, S.DELTA, S.OMEGA
+    fl, fr = keep * before[delta] + share * use[delta], keep * before[delta + 1] + share * use[delta + 1]
+    rl, rr = keep * before[delta + 2] + share * use[delta + 2], keep * before[delta + 3] + share * use[delta + 3]
+    return (
+        (
+            keep * before[omega] + share * use[omega],
+            keep * before[omega + 1] + share * use[omega + 1],
+            keep * before[omega + 2] + share * use[omega + 2],
+            keep * before[omega + 3] + share * use[omega + 3],
+        ),
+        (math.cos(fl), math.cos(fr), math.cos(rl), math.cos(rr)),
+        (math.sin(fl), math.sin(fr), math.sin(rl), math.sin(rr)),
+    )
+
+
+@inlined
+def _forces(row: FloatArray, before: FloatArray, use: FloatArray, gone: float) -> Four:
+    """Longitudinal forces [N] from the wheels' torque."""
+    return (
+        wheel_force(row, before, use, 0, gone), wheel_force(row, before, use, 1, gone),
+        wheel_force(row, before, use, 2, gone), wheel_force(row, before, use, 3, gone),
+    )  # fmt: skip

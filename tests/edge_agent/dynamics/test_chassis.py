@@ -11,7 +11,7 @@ from edge_agent.dynamics.body import accelerations
 from edge_agent.dynamics.chassis import DUGOFF, response, turned, tyre_forces
 from edge_agent.dynamics.drive_wheel import ELECTRIC_S, blended, drive_wheel, slip_share
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import P, parameter_row
+from edge_agent.dynamics.parameters import P, body, four, parameter_row
 from edge_agent.dynamics.tyres import brush
 from edge_agent.simulation.presets import PRESETS
 from schemas.numeric import FloatArray
@@ -30,7 +30,7 @@ def forces(shape: float, mu: float, omega: FloatArray) -> tuple[FloatArray, Floa
 
 @pytest.mark.parametrize("shape", [DUGOFF, 1.4])
 def test_no_wheel_has_more_than_its_friction_and_stiff_ones_have_it_almost(shape: float) -> None:
-    loads = np.array(wheel_loads(ROW, MOTION[3], MOTION[4]))
+    loads = np.array(wheel_loads(body(ROW), MOTION[3], MOTION[4]))
     x, y = forces(shape, 0.1, np.full(4, 80.0))
     used = np.hypot(x, y) / (0.1 * loads)
     assert (used <= 1.0).all()
@@ -46,15 +46,17 @@ def test_a_wheel_without_speed_rolls_freely() -> None:
 
 
 def test_the_response_is_that_of_the_tyres_unless_a_force_is_known() -> None:
-    omega = np.full(4, 57.0)
-    vx, vy, rate, ax, ay = MOTION
-    free = response(ROW, vx, vy, rate, ax, ay, turned(DELTA), omega, UNKNOWN, np.full(4, 0.8))
+    omega, (vx, vy, rate, ax, ay), steering = np.full(4, 57.0), MOTION, turned(DELTA)
+
+    def felt(known: FloatArray) -> tuple[float, float, float]:
+        cos, sin, mu = four(steering[:, 0]), four(steering[:, 1]), (0.8, 0.8, 0.8, 0.8)
+        return response(body(ROW), vx, vy, rate, ax, ay, cos, sin, four(omega), four(known), mu)
+
     tyre_x, tyre_y = forces(DUGOFF, 0.8, omega)
-    assert free == pytest.approx(accelerations(ROW, tyre_x, tyre_y, DELTA), rel=1e-12, abs=1e-12)
-    known = np.array([100.0, 200.0, np.nan, np.nan])
-    told = response(ROW, vx, vy, rate, ax, ay, turned(DELTA), omega, known, np.full(4, 0.8))
+    assert felt(UNKNOWN) == pytest.approx(accelerations(ROW, tyre_x, tyre_y, DELTA), rel=1e-12, abs=1e-12)
     tyre_x[:2] = 100.0, 200.0
-    assert told == pytest.approx(accelerations(ROW, tyre_x, tyre_y, DELTA), rel=1e-12, abs=1e-12)
+    known = np.array([100.0, 200.0, np.nan, np.nan])
+    assert felt(known) == pytest.approx(accelerations(ROW, tyre_x, tyre_y, DELTA), rel=1e-12, abs=1e-12)
 
 
 def test_the_brush_curve_starts_with_slope_one_and_stays_at_one_from_three_on() -> None:

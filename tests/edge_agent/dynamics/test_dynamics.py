@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from edge_agent.dynamics import body, loads, slip, tyres, wheel
+from edge_agent.dynamics import body, loads, parameters, slip, tyres, wheel
 from edge_agent.dynamics.parameters import GRAVITY, P, parameter_row
 from schemas.vehicle import Vehicle
 
@@ -57,7 +57,7 @@ def test_no_combination_of_slips_gives_more_than_the_friction_circle() -> None:
 
 
 def test_wheel_loads_carry_the_weight_and_a_left_turn_loads_the_right() -> None:
-    fl, fr, rl, rr = loads.wheel_loads(ROW, 2.0, 3.0)
+    fl, fr, rl, rr = loads.wheel_loads(parameters.body(ROW), 2.0, 3.0)
     assert fl + fr + rl + rr == pytest.approx(CAR.mass * GRAVITY)
     assert fr > fl
     assert rr > rl

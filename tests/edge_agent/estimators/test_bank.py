@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields
 from itertools import pairwise
 
 import numpy as np
@@ -18,7 +17,7 @@ from schemas.signals import Health, S
 from tests.edge_agent.estimators.drives import drive, joined
 
 PRIOR_WIDTH = 0.9 * 1.15
-ARRAYS = [f.name for f in fields(Estimates) if f.name not in ("mu_wheel", "evidence")]
+ARRAYS = [name for name in Estimates._fields if name not in ("mu_wheel", "evidence")]
 
 
 def run(name: str, t: FloatArray, signals: FloatArray, vehicle: object, closes: FloatArray | None = None) -> Estimates:

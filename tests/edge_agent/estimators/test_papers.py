@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from itertools import pairwise
 
 import numpy as np
@@ -25,7 +24,7 @@ from tests.edge_agent.estimators.test_bank import FAULTS
 PAPERS = ("paper-aco-fckf", "federated-ckf", "adaptive-federated-ckf", "compensated-wckf", "sr-ukf")
 SET_BY_HAND = ("adaptive-federated-ckf", "compensated-wckf")
 BY_WHEEL = ("federated-ckf", "sr-ukf")
-ARRAYS = [f.name for f in fields(Estimates) if f.name not in ("mu_wheel", "evidence")]
+ARRAYS = [name for name in Estimates._fields if name not in ("mu_wheel", "evidence")]
 PRIOR_WIDTH = 0.9 * 1.15
 
 

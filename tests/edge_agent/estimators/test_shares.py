@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import numpy as np
 import pytest
 
@@ -13,7 +11,7 @@ from edge_agent.estimators.shares import in_shares
 from schemas.errors import InputError
 from tests.edge_agent.estimators.drives import drive
 
-ARRAYS = [f.name for f in fields(Estimates) if f.name not in ("mu_wheel", "evidence")]
+ARRAYS = [name for name in Estimates._fields if name not in ("mu_wheel", "evidence")]
 
 
 @pytest.mark.parametrize(("count", "threads"), [(7, 1), (7, 2), (7, 3), (2, 5), (1, 4), (0, 2)])
