@@ -12,19 +12,21 @@ from schemas.wire import Kind, StreamAck, encode_ack
 # A message is never larger than its receiver reads (wire.MAX_BYTES): 16 streams of 24 refusals of 150 bytes.
 STREAMS_PER_ACK: Final = 16
 ITEMS_PER_STREAM: Final = 24
-_Stream = tuple[int, Kind, int]
+AckedStream = tuple[int, Kind, int]  # boot, kind, region
 
 
 class Acks:
     """What is to be told to whom."""
 
     def __init__(self) -> None:
-        self._durable: dict[str, dict[_Stream, set[int]]] = defaultdict(lambda: defaultdict(set))
-        self._rejected: dict[str, dict[_Stream, list[tuple[int, int, str]]]] = defaultdict(lambda: defaultdict(list))
+        self._durable: dict[str, dict[AckedStream, set[int]]] = defaultdict(lambda: defaultdict(set))
+        self._rejected: dict[str, dict[AckedStream, list[tuple[int, int, str]]]] = defaultdict(
+            lambda: defaultdict(list)
+        )
 
-    def durable(self, vehicle: str, batch: Head) -> None:
+    def durable(self, vehicle: str, stream: AckedStream, seq: int) -> None:
         """The batch is on disk."""
-        self._durable[vehicle][batch.boot, batch.kind, batch.region].add(batch.seq)
+        self._durable[vehicle][stream].add(seq)
 
     def rejected(self, vehicle: str, batch: Head, row: int, reason: str) -> None:
         """The batch was refused for good."""
@@ -50,7 +52,7 @@ class Acks:
 
 
 def _parts(
-    stream: _Stream, durable: tuple[tuple[int, int], ...], rejected: tuple[tuple[int, int, str], ...]
+    stream: AckedStream, durable: tuple[tuple[int, int], ...], rejected: tuple[tuple[int, int, str], ...]
 ) -> Iterator[StreamAck]:
     """What is to be told about a stream, in pieces."""
     for at in range(0, max(len(durable), len(rejected)), ITEMS_PER_STREAM):

@@ -12,6 +12,7 @@ that a sender reads is the text of the rule.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Final, NamedTuple
 
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas import grid, keys
-from schemas.decoding import Head
+from schemas.decoding import Heads
 from schemas.errors import InputError
 from schemas.numeric import IntArray
 from schemas.wire import Columns, Kind
@@ -80,17 +81,46 @@ class Refusal(NamedTuple):
     reason: str
 
 
-def check_identity(parsed: keys.Parsed, batch: Head) -> Refusal | None:
-    """Whether the batch is the key owner's, for the key's region, with a usable sequence number."""
-    if parsed.topic.name != _TOPIC[batch.kind] or parsed.who != batch.vehicle:
-        return Refusal("vehicle", BATCH, "vehicle: is not the one of the key; publish on your own key")
-    if parsed.place != batch.region:
-        return Refusal("region", BATCH, "region: is not the one of the key; never let a batch span regions")
-    if batch.boot < 0 or not 1 <= batch.first_held <= batch.seq:
-        return Refusal("seq", BATCH, "seq: boot >= 0 and 1 <= first_held <= seq do not hold; count from 1 without gaps")
-    if batch.estimator and not _is_estimator(batch.estimator):
-        return Refusal("estimator", BATCH, "estimator: is no name; use up to 64 of a-z, 0-9 and -")
-    return None
+def check_heads(
+    kind: Kind, owners: Sequence[keys.Parsed], heads: Heads, time: IntArray, clock: Clock
+) -> tuple[IntArray, tuple[Refusal, ...]]:
+    """Whether batches are their keys' owners', for the keys' regions, with usable sequence numbers, and in time.
+
+    Args:
+        kind: of the batches.
+        owners: whose key each came on, (k,).
+        heads: of the batches.
+        time: of each one's first record [ns], (k,).
+        clock: service time and bounds.
+
+    Returns:
+        (k,) index of the first broken rule into the second value, -1 for a good one; and the rules.
+    """
+    topic, held = _TOPIC[kind], heads.first_held
+    strange = [o.who != name or o.topic.name != topic for o, name in zip(owners, heads.vehicle, strict=True)]
+    elsewhere = np.array([owner.place for owner in owners], np.int64) != heads.region
+    nameless = {name for name in set(heads.estimator) if name and not _is_estimator(name)}
+    unnamed = [name in nameless for name in heads.estimator] if nameless else np.zeros(len(owners), bool)
+    broken = (
+        np.array(strange, bool), elsewhere, (heads.boot < 0) | (held < 1) | (held > heads.seq),
+        np.array(unnamed, bool), _untimely(time, time, clock),
+    )  # fmt: skip
+    return _first(broken), _HEAD_RULES
+
+
+_HEAD_RULES: Final = (
+    Refusal("vehicle", BATCH, "vehicle: is not the one of the key; publish on your own key"),
+    Refusal("region", BATCH, "region: is not the one of the key; never let a batch span regions"),
+    Refusal("seq", BATCH, "seq: boot >= 0 and 1 <= first_held <= seq do not hold; count from 1 without gaps"),
+    Refusal("estimator", BATCH, "estimator: is no name; use up to 64 of a-z, 0-9 and -"),
+    Refusal("time", 0, "time: too old or in the future; set the clock"),
+)
+
+
+def _first(broken: Sequence[NDArray[np.bool_]]) -> IntArray:
+    """Index of the first that is broken of each, -1 where none is."""
+    stacked = np.stack(broken)
+    return np.where(stacked.any(axis=0), stacked.argmax(axis=0), -1)
 
 
 @lru_cache(1024)
@@ -126,8 +156,7 @@ def check_rows(kind: Kind, columns: Columns, region: IntArray, clock: Clock) -> 
     extra.append((grid.region_of(cell) != region, "region", "cell: lies outside the batch's region; start a batch"))
     broken += [rows for rows, _, _ in extra]
     rules += [Refusal(rule, 0, reason) for _, rule, reason in extra]
-    stacked = np.stack(broken)
-    return np.where(stacked.any(axis=0), stacked.argmax(axis=0), -1), tuple(rules)
+    return _first(broken), tuple(rules)
 
 
 def _broken_ranges(kind: Kind, columns: Columns) -> tuple[list[NDArray[np.bool_]], list[Refusal]]:

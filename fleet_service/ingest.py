@@ -21,14 +21,14 @@ from fleet_service.admit import Clock, Refusal
 from fleet_service.archive.pseudonyms import Pseudonyms, number
 from fleet_service.archive.segments import Rows, stepped
 from fleet_service.limits import Limits
-from fleet_service.streams import StreamKey, Streams
-from schemas import keys
-from schemas.decoding import Decoded, Head, decode_many
+from fleet_service.streams import Stream, StreamKey, Streams
+from schemas.decoding import Decoded, Head, Heads, decode_many
 from schemas.grid import cell_of
-from schemas.numeric import IntArray
+from schemas.numeric import BoolArray, IntArray
 from schemas.wire import Kind
 
 FIRST_TIME: Final = {Kind.OBSERVATION: "enter_time", Kind.STATE: "time"}  # by which a batch is too old
+DAY_NS: Final = 86_400 * 10**9
 FORGET_NS: Final = 600 * 10**9  # between two looks for streams too old to matter
 
 
@@ -87,12 +87,14 @@ class Inbox:
 
 
 class Candidate(NamedTuple):
-    """A decoded batch that is new: its sender, its stream, what it says of itself, and the time of its first record."""
+    """A decoded batch that is new: its place among the decoded, sender, stream, and the time of its first record."""
 
+    place: int
     vehicle: str
     pseudonym: str
-    stream: StreamKey
-    head: Head
+    name: StreamKey
+    stream: Stream
+    seq: int
     time: int
 
 
@@ -116,6 +118,7 @@ class Intake:
     def __init__(self, streams: Streams, pseudonyms: Pseudonyms, counts: Counter[str], acks: Acks) -> None:
         self._streams, self._pseudonyms, self._counts, self._acks = streams, pseudonyms, counts, acks
         self._pending: set[tuple[StreamKey, int]] = set()  # admitted, not yet on disk
+        self._known: dict[tuple[str, int], tuple[str, int]] = {}  # pseudonyms and their numbers, by vehicle and day
         self._forgot = 0
 
     def admit(self, messages: Sequence[Message], clock: Clock) -> dict[Kind, Admitted]:
@@ -123,6 +126,7 @@ class Intake:
         if clock.now - self._forgot > FORGET_NS:
             self._forgot = clock.now
             self._streams.forget(clock.now - clock.oldest)
+            self._known.clear()
         out = {}
         for kind in Kind:
             ours = [m for m in messages if m.kind is kind]
@@ -133,81 +137,84 @@ class Intake:
     def settled(self, candidates: Sequence[Candidate]) -> None:
         """The candidates' rows are on disk: acknowledge them."""
         for candidate in candidates:
-            self._pending.discard((candidate.stream, candidate.head.seq))
-            self._acks.durable(candidate.vehicle, candidate.head)
+            self._pending.discard((candidate.name, candidate.seq))
+            self._acks.durable(candidate.vehicle, candidate.name[1:], candidate.seq)
 
     def _admit(self, kind: Kind, messages: list[Message], clock: Clock) -> Admitted:
-        owners = [admit.owner_of(message.key) for message in messages]
-        self._count("key", owners.count(None))
-        known = [at for at, owner in enumerate(owners) if owner is not None]
-        found = decode_many(kind, [(messages[at].payload, messages[at].encoding) for at in known])
+        keyed = [(message, owner) for message in messages if (owner := admit.owner_of(message.key)) is not None]
+        self._count("key", len(messages) - len(keyed))
+        found = decode_many(kind, [(message.payload, message.encoding) for message, _ in keyed])
         for _, error in found.errors:
             self._count(error.field)
-        starts = np.cumsum(found.sizes) - found.sizes
-        times: list[int] = found.columns[FIRST_TIME[kind]][starts].tolist()
-        candidates: dict[tuple[StreamKey, int], Candidate] = {}
-        chosen: list[int] = []
-        for at, (place, head, time) in enumerate(zip(found.places, found.heads, times, strict=True)):
-            candidate = self._candidate(owners[known[place]], head, time, clock)
-            if candidate is not None:
-                if candidates.setdefault((candidate.stream, head.seq), candidate) is candidate:
-                    chosen.append(at)
-                else:
-                    self._counts["duplicates"] += 1
-        return self._rows(kind, list(candidates.values()), found, chosen, clock)
+        time = found.columns[FIRST_TIME[kind]][np.cumsum(found.sizes) - found.sizes]
+        owners = [keyed[place][1] for place in found.places]
+        broken, rules = admit.check_heads(kind, owners, found.heads, time, clock)
+        for place in np.flatnonzero(broken >= 0).tolist():
+            self._refuse(str(owners[place].who), found.heads.at(place), rules[broken[place]])
+        return self._rows(kind, self._new(kind, found.heads, time, broken < 0), found, clock)
 
-    def _candidate(self, owner: keys.Parsed | None, head: Head, time: int, clock: Clock) -> Candidate | None:
-        assert owner is not None
-        assert owner.who is not None
-        refusal = admit.check_identity(owner, head)
-        if refusal is None and not clock.now - clock.oldest <= time <= clock.now + clock.ahead:
-            refusal = Refusal("time", 0, "time: too old or in the future; set the clock")
-        if refusal is not None:
-            self._refuse(owner.who, head, refusal)
-            return None
+    def _new(self, kind: Kind, heads: Heads, time: IntArray, good: BoolArray) -> list[Candidate]:
+        """Those of the good batches that were not admitted before, each once."""
+        out: dict[tuple[StreamKey, int], Candidate] = {}
+        numbers = (heads.boot, heads.region, heads.seq, heads.first_held, time, time // DAY_NS)
+        batches = zip(range(len(good)), heads.vehicle, *(column.tolist() for column in numbers), strict=True)
+        known, streams, pending, again = self._known, self._streams, self._pending, 0
+        for place, vehicle, boot, region, seq, first_held, at, day in compress(batches, good.tolist()):
+            who = known.get((vehicle, day)) or self._look_up(vehicle, at, day)
+            if who is None:
+                continue
+            pseudonym, of = who
+            name = (of, boot, kind, region)
+            stream = streams[name]
+            stream.raise_to(first_held)
+            if stream.admitted(seq):
+                again += 1
+                if (name, seq) not in pending:
+                    self._acks.durable(vehicle, name[1:], seq)
+            elif (name, seq) in out:
+                again += 1
+            else:
+                out[name, seq] = Candidate(place, vehicle, pseudonym, name, stream, seq, at)
+        if again:
+            self._counts["duplicates"] += again
+        return list(out.values())
+
+    def _look_up(self, vehicle: str, time: int, day: int) -> tuple[str, int] | None:
+        """Pseudonym and number of a vehicle; None without a key: it keeps its batch until the disk is well again."""
         try:
-            pseudonym = self._pseudonyms.of(owner.who, time)
-        except OSError:  # no key, no row: the sender keeps the batch until the disk is well again
+            pseudonym = self._pseudonyms.of(vehicle, time)
+        except OSError:
             self._counts["key_failures"] += 1
             return None
-        name = (number(pseudonym), head.boot, head.kind, head.region)
-        stream = self._streams[name]
-        stream.raise_to(head.first_held)
-        if stream.admitted(head.seq):
-            self._counts["duplicates"] += 1
-            if (name, head.seq) not in self._pending:
-                self._acks.durable(owner.who, head)
-            return None
-        return Candidate(owner.who, pseudonym, name, head, time)
+        found = self._known[vehicle, day] = pseudonym, number(pseudonym)
+        return found
 
-    def _rows(
-        self, kind: Kind, candidates: list[Candidate], found: Decoded, chosen: list[int], clock: Clock
-    ) -> Admitted:
-        rows, sizes = _chosen(found, chosen)
+    def _rows(self, kind: Kind, candidates: list[Candidate], found: Decoded, clock: Clock) -> Admitted:
+        rows, heads, sizes = _chosen(found, candidates)
         owner = np.repeat(np.arange(len(candidates)), sizes)
-        rows["region"] = np.array([c.head.region for c in candidates], np.int64)[owner]
+        rows["region"] = heads.region[owner]
         broken, rules = admit.check_rows(kind, rows, rows["region"], clock)
         rows["row"] = (np.arange(len(owner)) - (np.cumsum(sizes) - sizes)[owner]).astype(np.int32)
         bad: set[int] = set()
         for index in np.flatnonzero(broken >= 0).tolist():  # only refused rows are visited one by one
-            if int(owner[index]) not in bad:
-                bad.add(int(owner[index]))
+            place = int(owner[index])
+            if place not in bad:
+                bad.add(place)
                 refusal = rules[broken[index]]._replace(row=int(rows["row"][index]))
-                self._refuse(candidates[owner[index]].vehicle, candidates[owner[index]].head, refusal)
+                self._refuse(candidates[place].vehicle, heads.at(place), refusal)
         bad.update(place for place, c in enumerate(candidates) if place not in bad and not self._note(c))
         if bad:
             good = np.array([place not in bad for place in range(len(candidates))], bool)
             rows = {name: column[good[owner]] for name, column in rows.items()}
-            candidates, sizes = list(compress(candidates, good)), sizes[good]
-        return Admitted(candidates, _named(kind, candidates, rows, sizes, clock))
+            candidates, heads, sizes = list(compress(candidates, good)), heads.take(good), sizes[good]
+        return Admitted(candidates, _named(kind, candidates, heads, rows, sizes, clock))
 
     def _note(self, candidate: Candidate) -> bool:
         """Whether there is room to remember the batch; without, it is not acknowledged: older ones must come first."""
-        seq = candidate.head.seq
-        if not self._streams[candidate.stream].admit(seq, candidate.time):
+        if not candidate.stream.admit(candidate.seq, candidate.time):
             self._counts["too_many_gaps"] += 1
             return False
-        self._pending.add((candidate.stream, seq))
+        self._pending.add((candidate.name, candidate.seq))
         return True
 
     def _refuse(self, vehicle: str, head: Head, refusal: Refusal) -> None:
@@ -220,26 +227,24 @@ class Intake:
             self._counts[f"refused.{rule}"] += times
 
 
-def _chosen(found: Decoded, chosen: list[int]) -> tuple[Rows, IntArray]:
-    """Rows of the chosen batches, and the sizes of these."""
+def _chosen(found: Decoded, candidates: list[Candidate]) -> tuple[Rows, Heads, IntArray]:
+    """Rows, heads and sizes of the chosen batches."""
     rows: Rows = {**found.columns, "told": found.told}
-    if len(chosen) == len(found.sizes):
-        return rows, found.sizes
+    if len(candidates) == len(found.sizes):
+        return rows, found.heads, found.sizes
     kept = np.zeros(len(found.sizes), bool)
-    kept[chosen] = True
+    kept[[candidate.place for candidate in candidates]] = True
     mine = np.repeat(kept, found.sizes)
-    return {name: column[mine] for name, column in rows.items()}, found.sizes[kept]
+    return {name: column[mine] for name, column in rows.items()}, found.heads.take(kept), found.sizes[kept]
 
 
-def _named(kind: Kind, candidates: list[Candidate], rows: Rows, sizes: IntArray, clock: Clock) -> Rows:
+def _named(kind: Kind, candidates: list[Candidate], heads: Heads, rows: Rows, sizes: IntArray, clock: Clock) -> Rows:
     """Rows with what their batches say of themselves, as the archive wants them."""
     owner = np.repeat(np.arange(len(candidates)), sizes)
-    heads = [c.head for c in candidates]
     rows["vehicle"] = np.array([c.pseudonym for c in candidates], np.str_)[owner]
-    rows["vehicle_number"] = np.array([c.stream[0] for c in candidates], np.int64)[owner]
-    rows["estimator"] = np.array([head.estimator[:64] for head in heads], np.str_)[owner]
-    for name in ("boot", "seq", "first_held"):
-        rows[name] = np.array([getattr(head, name) for head in heads], np.int64)[owner]
+    rows["vehicle_number"] = np.array([c.name[0] for c in candidates], np.int64)[owner]
+    rows["estimator"] = np.array([name[:64] for name in heads.estimator], np.str_)[owner]
+    rows |= {"boot": heads.boot[owner], "seq": heads.seq[owner], "first_held": heads.first_held[owner]}
     rows["received_at"] = np.full(len(owner), clock.now, np.int64)
     if kind is Kind.STATE:
         rows["cell"] = cell_of(rows["latitude"], rows["longitude"])

@@ -1,15 +1,16 @@
 """Many payloads → one set of columns. Python is touched per message and per column, never per record.
 
-The protobuf library parses each message; then column by column the values of all messages are taken together. What is
-wrong with a message is an error beside the others and never their loss. A column that a sender left out is filled:
-floats with NaN, the cell and the sector from the pose, the leaving time from the entering one.
+A compiled walk (`schemas.reader`) finds the fields in the bytes of all messages; then column by column the values of
+all are taken together. What the walk does not understand, JSON among it, the protobuf library reads and writes anew in
+the plain form, so that there is one way from bytes to columns. What is wrong with a message is an error beside the
+others and never their loss. A column that a sender left out is filled: floats with NaN, the cell and the sector from
+the pose, the leaving time from the entering one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import chain, compress
-from operator import attrgetter
+from itertools import compress
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -18,13 +19,23 @@ from numpy.typing import NDArray
 from schemas import grid, mugrid
 from schemas.errors import WireError
 from schemas.numeric import BoolArray, IntArray
-from schemas.wire import ENCODING, MAX_ROWS, MESSAGES, Batch, Columns, Kind, column_types, parse
+from schemas.reader import NUMBERS, TEXTS, Walked, gather, walk
+from schemas.wire import (
+    ENCODING,
+    MAX_BYTES,
+    MAX_ROWS,
+    MESSAGES,
+    NEEDED,
+    PLAIN,
+    Batch,
+    Columns,
+    Kind,
+    column_types,
+    parse,
+)
 
-NEEDED: Final = {
-    Kind.OBSERVATION: ("enter_time", "latitude", "longitude"),
-    Kind.STATE: ("time", "latitude", "longitude"),
-}
 _ABSENT: Final = {"abs_active": -1}  # what an absent integer reads as, where it is not 0
+_LIKELIHOOD: Final = "log_likelihood"
 
 
 class Head(NamedTuple):
@@ -37,6 +48,32 @@ class Head(NamedTuple):
     seq: int
     first_held: int
     estimator: str
+
+
+class Heads(NamedTuple):
+    """The same of k batches, by column."""
+
+    kind: Kind
+    vehicle: list[str]
+    boot: IntArray
+    region: IntArray
+    seq: IntArray
+    first_held: IntArray
+    estimator: list[str]
+
+    def at(self, place: int) -> Head:
+        """The head of one."""
+        return Head(
+            self.kind, self.vehicle[place], int(self.boot[place]), int(self.region[place]), int(self.seq[place]),
+            int(self.first_held[place]), self.estimator[place],
+        )  # fmt: skip
+
+    def take(self, kept: BoolArray) -> Heads:
+        """Some of them."""
+        return Heads(
+            self.kind, list(compress(self.vehicle, kept)), self.boot[kept], self.region[kept], self.seq[kept],
+            self.first_held[kept], list(compress(self.estimator, kept)),
+        )  # fmt: skip
 
 
 class Decoded(NamedTuple):
@@ -52,7 +89,7 @@ class Decoded(NamedTuple):
     """
 
     places: list[int]
-    heads: list[Head]
+    heads: Heads
     sizes: IntArray
     columns: Columns
     told: BoolArray
@@ -61,24 +98,41 @@ class Decoded(NamedTuple):
 
 def decode_many(kind: Kind, payloads: Sequence[tuple[bytes, str]]) -> Decoded:
     """Read batches of one kind from payloads and their encodings."""
-    places: list[int] = []
-    messages: list[Any] = []
     errors: list[tuple[int, WireError]] = []
-    for place, (payload, encoding) in enumerate(payloads):
-        try:
-            messages.append(parse(payload, encoding, MESSAGES[kind], ENCODING[kind]))
-            places.append(place)
-        except WireError as error:
-            errors.append((place, error))
-    fields = _Fields.of(kind, messages)
-    if not fields.sound.all():
-        errors += [(places[at], _complaint(messages[at], kind)) for at in np.flatnonzero(~fields.sound).tolist()]
-        places, messages = (list(compress(those, fields.sound)) for those in (places, messages))
-        fields = _Fields.of(kind, messages)
-    heads = [
-        Head(kind, m.vehicle, m.boot, m.region, m.seq, m.first_held or 1, m.estimator) for m in messages
-    ]  # fmt: skip
-    return _without_misfits(Decoded(places, heads, *fields.columns(), errors), fields)
+    usual = {ENCODING[kind], *PLAIN}
+    plain = [payload if encoding in usual and len(payload) <= MAX_BYTES else b"" for payload, encoding in payloads]
+    data, walked = _walked(kind, plain, True)
+    places = list(range(len(plain)))
+    if not walked.understood.all():
+        for place in np.flatnonzero(~walked.understood).tolist():
+            try:
+                plain[place] = _plainly(kind, *payloads[place])
+            except WireError as error:
+                errors.append((place, error))
+        wrong = {place for place, _ in errors}
+        places = [place for place in places if place not in wrong]
+        data, walked = _walked(kind, [plain[place] for place in places], False)
+        assert walked.understood.all(), "the protobuf library writes what we do not read"
+    fields = _Fields(kind, data, walked)
+    return _without_misfits(Decoded(places, fields.heads(), *fields.columns(), errors), fields)
+
+
+def _walked(kind: Kind, messages: list[bytes], strict: bool) -> tuple[NDArray[np.uint8], Walked]:
+    data = np.frombuffer(b"".join(messages), np.uint8)
+    return data, walk(kind, data, np.cumsum(np.fromiter(map(len, messages), np.int64, len(messages))), strict)
+
+
+def _plainly(kind: Kind, payload: bytes, encoding: str) -> bytes:
+    """A message as our own encoder writes it.
+
+    Raises:
+        WireError: it is none.
+    """
+    message = parse(payload, encoding, MESSAGES[kind], ENCODING[kind])
+    _check(message, kind)
+    message.DiscardUnknownFields()
+    data: bytes = message.SerializeToString()
+    return data
 
 
 def decode(payload: bytes, encoding: str, kind: Kind) -> Batch:
@@ -90,71 +144,78 @@ def decode(payload: bytes, encoding: str, kind: Kind) -> Batch:
     found = decode_many(kind, [(payload, encoding)])
     for _, error in found.errors:
         raise error
-    (head,) = found.heads
+    head = found.heads.at(0)
     if kind is Kind.OBSERVATION and not found.told.all():
-        found.columns["log_likelihood"] = found.columns["log_likelihood"][:, :0]
+        found.columns[_LIKELIHOOD] = found.columns[_LIKELIHOOD][:, :0]
     return Batch(kind, *head[1:-1], found.columns, head.estimator)
 
 
-def _complaint(message: Any, kind: Kind) -> WireError:  # noqa: ANN401
-    """What is wrong with the lengths of a message's columns."""
+def _check(message: Any, kind: Kind) -> None:  # noqa: ANN401
+    """Whether a message's columns have the lengths that they should.
+
+    Raises:
+        WireError: they have not.
+    """
     first = NEEDED[kind][0]
     n = len(getattr(message, first))
     if not 1 <= n <= MAX_ROWS:
-        return WireError(first, f"{n} records", f"send 1 to {MAX_ROWS}")
+        raise WireError(first, f"{n} records", f"send 1 to {MAX_ROWS}")
     for name in column_types(kind):
         given = len(getattr(message, name))
-        if name == "log_likelihood":
+        if name == _LIKELIHOOD:
             if given not in (0, n * mugrid.BINS):
-                return WireError(name, f"{given} bytes for {n} records", f"send {mugrid.BINS} a record, or none")
+                raise WireError(name, f"{given} bytes for {n} records", f"send {mugrid.BINS} a record, or none")
         elif given != n and (given or name in NEEDED[kind]):
-            return WireError(name, f"has {given} records, {first} has {n}", "give every column the same length")
-    raise AssertionError("nothing is wrong with it")
+            raise WireError(name, f"has {given} records, {first} has {n}", "give every column the same length")
 
 
 class _Fields(NamedTuple):
-    """The fields of k messages, by column, and their lengths."""
+    """The fields of k messages, where they lie."""
 
     kind: Kind
-    sent: dict[str, list[Any]]
-    lengths: dict[str, IntArray]
-    sizes: IntArray
-    sound: BoolArray
+    data: NDArray[np.uint8]
+    walked: Walked
 
-    @staticmethod
-    def of(kind: Kind, messages: list[Any]) -> _Fields:
-        sent = {name: list(map(attrgetter(name), messages)) for name in column_types(kind)}
-        lengths = {name: np.fromiter(map(len, fields), np.int64, len(fields)) for name, fields in sent.items()}
-        sizes = lengths[NEEDED[kind][0]]
-        sound = (sizes >= 1) & (sizes <= MAX_ROWS)
-        for name, given in lengths.items():
-            full = sizes * mugrid.BINS if name == "log_likelihood" else sizes
-            sound &= (given == full) | ((given == 0) & (name not in NEEDED[kind]))
-        return _Fields(kind, sent, lengths, sizes, sound)
+    @property
+    def sizes(self) -> IntArray:
+        """Records of each message."""
+        return self.walked.sizes
+
+    def sent(self, name: str) -> BoolArray:
+        """Which messages come with a column, (k,)."""
+        return np.asarray(self.walked.counts[:, list(column_types(self.kind)).index(name)] > 0)
 
     def given(self, name: str) -> BoolArray:
         """Which records come with a column, (n,)."""
-        return np.repeat(self.lengths[name] > 0, self.sizes)
+        return np.repeat(self.sent(name), self.sizes)
+
+    def heads(self) -> Heads:
+        """Heads, with the first of all sequence numbers held where the sender does not say which."""
+        data = self.data.tobytes()
+        texts = {
+            name: [
+                str(data[begin:end], "utf-8") for begin, end in zip(*self.walked.texts[:, at].T.tolist(), strict=True)
+            ]
+            for at, name in enumerate(TEXTS)
+        }
+        boot, region, seq, first_held = (self.walked.numbers[:, at].copy() for at in range(len(NUMBERS)))
+        first_held[first_held == 0] = 1
+        return Heads(self.kind, texts["vehicle"], boot, region, seq, first_held, texts["estimator"])
 
     def columns(self) -> tuple[IntArray, Columns, BoolArray]:
         """Sizes, columns as they were sent (integers wide) or filled, and `told`."""
         out: Columns = {}
-        told = np.zeros(int(self.sizes.sum()), bool)
-        for name, dtype in column_types(self.kind).items():
-            given = self.given(name)
-            values: NDArray[Any]
+        n = int(self.sizes.sum())
+        told = np.zeros(n, bool)
+        for at, (name, dtype) in enumerate(column_types(self.kind).items()):
             column: NDArray[Any]
-            if name == "log_likelihood":
-                told, values = given, np.frombuffer(b"".join(self.sent[name]), np.uint8).reshape(-1, mugrid.BINS)
-                column = np.zeros((len(told), mugrid.BINS), np.uint8)
+            if name == _LIKELIHOOD:
+                told, column = self.given(name), np.zeros((n, mugrid.BINS), np.uint8)
+            elif dtype.kind == "f":
+                column = np.full(n, np.nan, dtype)
             else:
-                wide = dtype if dtype.kind == "f" else np.dtype(np.int64)
-                values = np.fromiter(chain.from_iterable(self.sent[name]), wide, int(self.lengths[name].sum()))
-                column = np.full(len(given), np.nan if dtype.kind == "f" else _ABSENT.get(name, 0), wide)
-            if len(values) == len(column):
-                column = values
-            else:
-                column[given] = values
+                column = np.full(n, _ABSENT.get(name, 0), np.int64)
+            gather(self.data, self.walked, at, self.kind, column)
             out[name] = column
         return self.sizes, out, told
 
@@ -163,7 +224,7 @@ def _without_misfits(found: Decoded, fields: _Fields) -> Decoded:
     """Derive what follows from the pose; drop messages of which a number does not fit, or that have no place."""
     kind, columns = fields.kind, found.columns
     bad: dict[int, WireError] = {}
-    owner = np.repeat(np.arange(len(found.heads)), found.sizes)
+    owner = np.repeat(np.arange(len(found.sizes)), found.sizes)
 
     def refuse(rows: NDArray[np.bool_], error: WireError) -> None:
         for at in np.unique(owner[rows]).tolist():
@@ -176,7 +237,7 @@ def _without_misfits(found: Decoded, fields: _Fields) -> Decoded:
             refuse(outside, WireError(name, f"does not fit {dtype}", "use the values that the .proto names"))
             columns[name] = np.where(outside, 0, columns[name]).astype(dtype)
     placed = fields.given("cell") if kind is Kind.OBSERVATION else np.zeros(len(owner), bool)
-    homeless = np.repeat(np.array([not head.region for head in found.heads], bool), found.sizes)
+    homeless = np.repeat(found.heads.region == 0, found.sizes)
     needs_place = ~placed & (homeless | (kind is Kind.OBSERVATION))
     for name in ("latitude", "longitude"):
         nowhere = ~(np.abs(columns[name]) <= 180.0) & needs_place
@@ -187,10 +248,10 @@ def _without_misfits(found: Decoded, fields: _Fields) -> Decoded:
     heads = _with_regions(found, columns)
     if not bad:
         return found._replace(heads=heads)
-    kept = np.array([at not in bad for at in range(len(heads))])
+    kept = np.array([at not in bad for at in range(len(found.sizes))])
     rows = kept[owner]
     return Decoded(
-        list(compress(found.places, kept)), list(compress(heads, kept)), found.sizes[kept],
+        list(compress(found.places, kept)), heads.take(kept), found.sizes[kept],
         {name: column[rows] for name, column in columns.items()}, found.told[rows],
         found.errors + [(found.places[at], error) for at, error in bad.items()],
     )  # fmt: skip
@@ -204,7 +265,7 @@ def _derive(columns: Columns, fields: _Fields, unplaced: BoolArray) -> None:
         at = np.flatnonzero(unplaced)
         columns["cell"] = columns["cell"].copy()
         columns["cell"][at] = grid.cell_of(columns["latitude"][at], columns["longitude"][at])
-    unsaid = fields.lengths["sector"] == 0
+    unsaid = ~fields.sent("sector")
     if unsaid.any():
         starts = np.cumsum(fields.sizes) - fields.sizes
         headed = np.logical_and.reduceat(np.isfinite(columns["yaw"]), starts)
@@ -212,16 +273,16 @@ def _derive(columns: Columns, fields: _Fields, unplaced: BoolArray) -> None:
         columns["sector"][rows] = grid.sector_of(columns["yaw"][rows])
 
 
-def _with_regions(found: Decoded, columns: Columns) -> list[Head]:
+def _with_regions(found: Decoded, columns: Columns) -> Heads:
     """Heads, with the region of the first record where the sender did not name it."""
-    starts = np.cumsum(found.sizes) - found.sizes
-    heads = list(found.heads)
-    for at, head in enumerate(heads):
-        if not head.region:
-            row = int(starts[at])
-            if "cell" in columns:
-                cell = columns["cell"][row]
-            else:
-                cell = grid.cell_of(*(np.nan_to_num(columns[name][row]) for name in ("latitude", "longitude")))
-            heads[at] = head._replace(region=int(grid.region_of(cell)))
-    return heads
+    heads, homeless = found.heads, found.heads.region == 0
+    if not homeless.any():
+        return heads
+    rows = (np.cumsum(found.sizes) - found.sizes)[homeless]
+    if "cell" in columns:
+        cell = columns["cell"][rows]
+    else:
+        cell = grid.cell_of(*(np.nan_to_num(columns[name][rows]) for name in ("latitude", "longitude")))
+    region = heads.region.copy()
+    region[homeless] = grid.region_of(cell)
+    return heads._replace(region=region)

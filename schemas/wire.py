@@ -22,7 +22,7 @@ from schemas.errors import WireError
 from schemas.proto import gripmap_pb2 as pb
 
 JSON: Final = "application/json"
-_PLAIN: Final = ("application/protobuf", "zenoh/bytes", "")  # protobuf of which the key says what it is
+PLAIN: Final = ("application/protobuf", "zenoh/bytes", "")  # protobuf of which the key says what it is
 ARROW: Final = "application/vnd.apache.arrow.stream"
 GEOJSON: Final = "application/geo+json"
 MAX_ROWS: Final = 50
@@ -36,10 +36,16 @@ class Kind(StrEnum):
     OBSERVATION = "obs"
     STATE = "state"
 
+    __hash__ = str.__hash__  # the enumeration's own is Python, and a kind is part of every stream's name
+
 
 Columns = dict[str, NDArray[Any]]
 
 MESSAGES: Final[dict[Kind, type[Any]]] = {Kind.OBSERVATION: pb.ObservationBatch, Kind.STATE: pb.StateBatch}
+NEEDED: Final = {  # columns without which a batch is none; the first one's length is the number of records
+    Kind.OBSERVATION: ("enter_time", "latitude", "longitude"),
+    Kind.STATE: ("time", "latitude", "longitude"),
+}
 _FIELDS: Final = {Kind.OBSERVATION: tables.OBSERVATION, Kind.STATE: tables.STATE}
 _PB_KIND: Final = {Kind.OBSERVATION: pb.KIND_OBSERVATION, Kind.STATE: pb.KIND_STATE}
 _KIND_OF: Final = {number: kind for kind, number in _PB_KIND.items()}
@@ -121,7 +127,7 @@ def parse(payload: bytes, encoding: str, message: type[Any], expected: str) -> A
     if len(payload) > MAX_BYTES:
         raise WireError("payload", f"{len(payload)} bytes", f"send at most {MAX_BYTES}")
     try:
-        if encoding == expected or encoding in _PLAIN:
+        if encoding == expected or encoding in PLAIN:
             return message.FromString(payload)
         if encoding == JSON:
             return json_format.Parse(payload, message(), max_recursion_depth=8)

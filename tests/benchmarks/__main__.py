@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,14 +17,18 @@ from tests.benchmarks.agent import agent
 from tests.benchmarks.contract import contract
 from tests.benchmarks.estimators import estimators
 from tests.benchmarks.fusion import fusion
+from tests.benchmarks.growth import growth
 from tests.benchmarks.ingest import ingest
 from tests.benchmarks.measure import SEED
 from tests.benchmarks.service import service
+from tests.benchmarks.shards import shards
+from tests.benchmarks.state import state
 from tests.benchmarks.step import bank, step
 
 FOLDER = Path(".bench")
 PARTS: dict[str, Callable[[], list[Figure]]] = {
-    part.__name__: part for part in (step, bank, estimators, agent, contract, fusion, ingest, service)
+    part.__name__: part
+    for part in (step, bank, estimators, agent, contract, fusion, ingest, growth, service, shards, state)
 }
 
 
@@ -35,9 +40,14 @@ def main() -> int:
     if unknown := set(chosen) - set(PARTS):
         parser.error(f"{', '.join(sorted(unknown))}: unknown; choose from {', '.join(PARTS)}")
     found: list[Figure] = []
-    for name in chosen:
-        print(f"{name}: {(PARTS[name].__doc__ or '').splitlines()[0]}", flush=True)
+    began = time.monotonic()
+    for number, name in enumerate(chosen, 1):
+        print(f"{number}/{len(chosen)} {name}: {(PARTS[name].__doc__ or '').splitlines()[0]}", flush=True)
+        part = time.monotonic()
         found += PARTS[name]()
+        print(f"    {time.monotonic() - part:.0f} s", flush=True)
+    if len(chosen) == len(PARTS):
+        found.append(Figure("bench.total_s", time.monotonic() - began, "s, all parts", 600))
     figures.write(FOLDER / "figures.json", "bench", [SEED], found)
     print(f"\n{figures.markdown(found)}\n\n{FOLDER}/figures.json")
     return 0

@@ -22,15 +22,16 @@ from deploy.router import open_router
 from schemas import grid, keys, mugrid, wire
 from schemas.config import ZenohSettings
 from schemas.figures import Figure
+from schemas.tiles import decode_tile
 from schemas.transport import open_session
 from schemas.wire import Batch, Kind
 
 RATE = 20_000  # observations/s of the load
 ROWS = 10  # of a message
 VEHICLES = 500
-CELLS = 1_000
-QUERIES, ALERTS = 200, 60
-BARE = "gripmap-bare/tile"
+COLUMNS, LINES = 40, 50  # of the tile's cells that the load visits; the box of a query holds half of them
+QUERIES, ALERTS, ACKS = 200, 60, 60
+BARE, BARE_BOX = "gripmap-bare/tile", "gripmap-bare/box"
 LATITUDE, LONGITUDE = 57.7, 11.97
 SECOND = 10**9
 _TILE = int(grid.tile_of(grid.cell_of(LATITUDE, LONGITUDE)))
@@ -59,29 +60,35 @@ def publish(session: zenoh.Session, one: Batch) -> None:
 
 
 def load(endpoint: str) -> None:
-    """Send RATE observations a second of unexcited visits to CELLS cells until this process is ended."""
+    """Send RATE observations a second of unexcited visits until this process is ended."""
     rng, seq, began, sent = np.random.default_rng(0), 0, time.monotonic(), 0
     session = open_session(ZenohSettings(connect=[endpoint]))
     assert session is not None
     while True:
         seq += 1
         for vehicle in range(VEHICLES):
-            at = rng.integers(0, 40, ROWS), rng.integers(0, 25, ROWS)
+            at = rng.integers(0, COLUMNS, ROWS), rng.integers(0, LINES, ROWS)
             publish(session, batch(f"load-{vehicle:04d}", seq, *at, False))
             sent += ROWS
             time.sleep(max(began + sent / RATE - time.monotonic(), 0.0))
 
 
-def bare(endpoint: str, payload: str) -> None:
-    """Answer with a file's bytes and nothing else until this process is ended."""
-    session, data = open_session(ZenohSettings(connect=[endpoint])), Path(payload).read_bytes()
+def bare(endpoint: str, folder: str) -> None:
+    """Answer with the bytes of two files and nothing else until this process is ended."""
+    session = open_session(ZenohSettings(connect=[endpoint]))
     assert session is not None
 
-    def reply(asked: zenoh.Query) -> None:
-        with asked:
-            asked.reply(BARE, data)
+    def replier(key: str) -> Callable[[zenoh.Query], None]:
+        data = (Path(folder) / Path(key).name).read_bytes()
 
-    session.declare_queryable(BARE, reply, complete=True)
+        def reply(asked: zenoh.Query) -> None:
+            with asked:
+                asked.reply(key, data)
+
+        return reply
+
+    for key in (BARE, BARE_BOX):
+        session.declare_queryable(key, replier(key), complete=True)
     sys.stdin.read()
 
 
@@ -136,18 +143,47 @@ def alert_delays_ms(session: zenoh.Session) -> list[float]:
     return out
 
 
+def ack_delays_s(session: zenoh.Session) -> list[float]:
+    """From a vehicle's publish to its acknowledgement, of batches at times that have nothing to do with the service's.
+
+    Raises:
+        TimeoutError: one was not acknowledged.
+    """
+    heard: SimpleQueue[tuple[int, float]] = SimpleQueue()
+
+    def hear(sample: zenoh.Sample) -> None:
+        now = time.perf_counter()
+        for stream in wire.decode_ack(sample.payload.to_bytes())[1]:
+            for first, last in stream.durable:
+                for seq in range(first, last + 1):
+                    heard.put((seq, now))
+
+    session.declare_subscriber(keys.ack_key("acked-0"), hear)
+    rng, sent = np.random.default_rng(0), {}
+    for seq in range(1, ACKS + 1):
+        sent[seq] = time.perf_counter()
+        publish(session, batch("acked-0", seq, rng.integers(0, COLUMNS, 1), rng.integers(0, LINES, 1), False))
+        time.sleep(rng.uniform(0.0, 0.3))
+    out = []
+    for _ in sent:
+        seq, when = heard.get(timeout=30.0)
+        out.append(when - sent[seq])
+    return out
+
+
 def service() -> list[Figure]:
-    """Queries and alerts under 20 000 observations/s, beside a queryable that does nothing."""
+    """Queries, alerts and acknowledgements under 20 000 observations/s, beside a queryable that does nothing."""
     tile = keys.map_key(_TILE)
     west, south, east, north = (
         float(v[0]) for v in grid.bounds(grid.interleave(np.array([_X]), np.array([_Y])))
-    )  # the first cell: the box goes over 40 columns and 25 rows from it
-    box = f"{west},{north - 25 * (north - south)},{west + 40 * (east - west)},{north}"
+    )  # the first cell: the box goes over all columns and half of the lines from it; borders lie in it, so less a bit
+    wide, high = COLUMNS * (east - west), LINES // 2 * (north - south)
+    box = f"{west + 1e-6},{north - high + 1e-6},{west + wide - 1e-6},{north - 1e-6}"
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         router, (endpoint, *_) = open_router(listen="tcp/127.0.0.1:0")
         stack.enter_context(router)
-        config, payload = folder / "service.json", folder / "tile.arrow"
+        config = folder / "service.json"
         config.write_text(f'{{"zenoh": {{"connect": ["{endpoint}"]}}}}')
         words = ("-m", "fleet_service.cli", "run", "--archive", str(folder / "archive"), "--config", str(config))
         stack.enter_context(process(*words))
@@ -157,19 +193,25 @@ def service() -> list[Figure]:
         stack.enter_context(process("-c", f"from tests.benchmarks.service import load; load({endpoint!r})"))
         until(lambda: len(ask(client, f"{keys.ROOT}/map/**")))
         time.sleep(10.0)  # the window fills
-        payload.write_bytes(ask(client, tile))
-        nothing = f"from tests.benchmarks.service import bare; bare({endpoint!r}, {str(payload)!r})"
+        asked = (tile, f"{tile}?bbox={box}")
+        for key, selector in zip((BARE, BARE_BOX), asked, strict=True):
+            (folder / Path(key).name).write_bytes(ask(client, selector))
+        cells = [decode_tile((folder / Path(key).name).read_bytes()).num_rows for key in (BARE, BARE_BOX)]
+        nothing = f"from tests.benchmarks.service import bare; bare({endpoint!r}, {str(folder)!r})"
         stack.enter_context(process("-c", nothing))
         until(lambda: len(ask(client, BARE)))
-        ours, boxed, least = durations_ms(
-            lambda: ask(client, tile), lambda: ask(client, f"{tile}?bbox={box}"), lambda: ask(client, BARE)
+        ours, boxed, *least = durations_ms(
+            *(lambda selector=selector: ask(client, selector) for selector in (*asked, BARE, BARE_BOX))
         )
-        alerts = alert_delays_ms(client)
-    limit = statistics.median(least)
+        alerts, acks = alert_delays_ms(client), ack_delays_s(client)
+    limits = [statistics.median(times) for times in least]
+    vs = [f"of {limit:.1f} ms, {number} cells" for limit, number in zip(limits, cells, strict=True)]
     return [
-        Figure("bench.query.tile_vs_bare", statistics.median(ours) / limit, f"of {limit:.1f} ms", 2),
-        Figure("bench.query.bbox_vs_bare", statistics.median(boxed) / limit, "1 000 cells", 2),
+        Figure("bench.query.tile_vs_bare", statistics.median(ours) / limits[0], vs[0], 2),
+        Figure("bench.query.bbox_vs_bare", statistics.median(boxed) / limits[1], vs[1], 2),
         Figure("bench.query.p99_ms", float(np.quantile(ours + boxed, 0.99)), "ms, under 20 000 observations/s", 25),
         Figure("bench.alert.p50_ms", statistics.median(alerts), "ms, publish to subscriber, under load", 50),
         Figure("bench.alert.p99_ms", float(np.quantile(alerts, 0.99)), "ms", 250),
+        Figure("bench.ack.p50_s", statistics.median(acks), "s, publish to acknowledgement, under load", 1.2),
+        Figure("bench.ack.p99_s", float(np.quantile(acks, 0.99)), "s", 2.5),
     ]

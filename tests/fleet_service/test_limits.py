@@ -83,8 +83,8 @@ def test_an_acknowledgement_is_never_larger_than_its_receiver_reads() -> None:
     acks, sent = Acks(), [batch("sim-001", seq, 0, [0.8]) for seq in range(1, 3001, 2)]
     for one in sent:
         acks.rejected("sim-001", one, 0, "x" * 120)
-    for one in [batch("sim-001", seq, 0, [0.8]) for seq in range(5001, 9001, 2)]:
-        acks.durable("sim-001", one)
+    for seq in range(5001, 9001, 2):
+        acks.durable("sim-001", (sent[0].boot, sent[0].kind, sent[0].region), seq)
     messages = acks.messages()
     told = [stream for _, payload in messages for stream in wire.decode_ack(payload)[1]]
     assert max(len(payload) for _, payload in messages) <= wire.MAX_BYTES

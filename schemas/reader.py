@@ -1,0 +1,204 @@
+"""Where everything lies in the bytes of many protobuf batches: one compiled walk, no object per message.
+
+The protobuf module stays the one authority. This reader knows only what our own encoder, and any other that
+follows the .proto plainly, writes: each field once, columns packed, numbers that fit, names of plain letters, columns
+of one length. Of all else it says that it did not understand it; then `decoding` has the module read it and write it
+anew.
+Source: protobuf's encoding reference (tags, varints, packed fields).
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from google.protobuf.descriptor import FieldDescriptor
+from numpy.typing import NDArray
+
+from schemas import mugrid
+from schemas.numeric import BoolArray, ByteArray, IntArray, compiled
+from schemas.wire import MAX_ROWS, MESSAGES, NEEDED, Kind, column_types
+
+NUMBERS: Final = ("boot", "region", "seq", "first_held")
+TEXTS: Final = ("vehicle", "estimator")
+_WIDTH: Final = {  # bytes of an element; 0: varints
+    FieldDescriptor.TYPE_SFIXED64: 8, FieldDescriptor.TYPE_DOUBLE: 8, FieldDescriptor.TYPE_FLOAT: 4,
+    FieldDescriptor.TYPE_INT32: 0, FieldDescriptor.TYPE_BYTES: 1,
+}  # fmt: skip
+_VARINT, _FIXED64, _RUN = 0, 1, 2  # wire types
+_FIELDS: Final = 64  # field numbers below
+_UNKNOWN: Final = -1
+_TEXT: Final = len(NUMBERS)  # roles: numbers, texts, columns
+_COLUMN: Final = _TEXT + len(TEXTS)
+
+
+class Walked(NamedTuple):
+    """Where the fields of k messages lie in their bytes.
+
+    Attributes:
+        understood: whether the rest holds for a message, (k,).
+        numbers: NUMBERS of each, (k, 4).
+        texts: begin and end of TEXTS, (k, 2, 2).
+        begins: of each column, (k, columns).
+        counts: elements of each column, (k, columns); bytes of the likelihood.
+        sizes: records of each, (k,).
+    """
+
+    understood: BoolArray
+    numbers: IntArray
+    texts: IntArray
+    begins: IntArray
+    counts: IntArray
+    sizes: IntArray
+
+
+class _Layout(NamedTuple):
+    """A kind of message as arrays: role of each field number; width, elements a record and need of each column."""
+
+    roles: IntArray
+    widths: IntArray
+    per_record: IntArray
+    needed: BoolArray
+
+
+@cache
+def _layout(kind: Kind) -> _Layout:
+    fields = MESSAGES[kind].DESCRIPTOR.fields_by_name
+    names = list(column_types(kind))
+    roles = np.full(_FIELDS, _UNKNOWN)
+    for role, name in enumerate((*NUMBERS, *TEXTS, *names)):
+        roles[fields[name].number] = role
+    return _Layout(
+        roles, np.array([_WIDTH[fields[name].type] for name in names]),
+        np.array([mugrid.BINS if name == "log_likelihood" else 1 for name in names]),
+        np.array([name in NEEDED[kind] for name in names]),
+    )  # fmt: skip
+
+
+def walk(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True) -> Walked:
+    """Look through messages that lie one after the other in `data`, each up to its end (k,).
+
+    Args:
+        kind: of the messages.
+        data: all bytes.
+        ends: of each message.
+        strict: whether a name that is not plain ASCII is left to the module; not when it wrote the bytes itself.
+    """
+    layout, k = _layout(kind), len(ends)
+    columns = len(layout.widths)
+    out = Walked(
+        np.zeros(k, bool), np.zeros((k, len(NUMBERS)), np.int64), np.zeros((k, len(TEXTS), 2), np.int64),
+        np.zeros((k, columns), np.int64), np.zeros((k, columns), np.int64), np.zeros(k, np.int64),
+    )  # fmt: skip
+    first = list(column_types(kind)).index(NEEDED[kind][0])
+    _walk(data, ends, layout, first, strict, out)
+    return out
+
+
+def gather(data: ByteArray, walked: Walked, column: int, kind: Kind, into: NDArray[Any]) -> None:
+    """Copy a column of all messages behind each other into an array (n, …) that holds what absent ones read as."""
+    width, each = int(_layout(kind).widths[column]), int(_layout(kind).per_record[column])
+    begins, counts = walked.begins[:, column], walked.counts[:, column]
+    if width:
+        _copy(data, begins, counts * width, walked.sizes * (each * width), into.reshape(-1).view(np.uint8))
+    else:
+        _unpack(data, begins, counts, walked.sizes, into)
+
+
+@compiled
+def _varint(data: ByteArray, at: int, end: int) -> tuple[int, int]:
+    """A number and where it ends; -1 where it is none of at most 64 bits."""
+    value, shift = 0, 0
+    while at < end and shift < 64:
+        byte = int(data[at])
+        at += 1
+        if shift == 63 and byte > 1:
+            return 0, -1
+        value |= (byte & 127) << shift
+        if byte < 128:
+            return value, at
+        shift += 7
+    return 0, -1
+
+
+@compiled
+def _walk(data: ByteArray, ends: IntArray, layout: _Layout, first: int, strict: bool, out: Walked) -> None:
+    at = 0
+    for k in range(len(ends)):
+        end, seen, fine = ends[k], 0, True
+        while fine and at < end:
+            tag, at = _varint(data, at, min(end, at + 2))
+            number, wire = tag >> 3, tag & 7
+            fine = at >= 0 and 0 < number < _FIELDS and layout.roles[number] != _UNKNOWN and not (seen >> number) & 1
+            if fine:
+                seen |= 1 << number
+                at = _field(data, at, end, layout.roles[number], wire, layout, strict, out, k)
+                fine = at >= 0
+        n = out.counts[k, first]
+        fine = fine and 1 <= n <= MAX_ROWS
+        for column in range(len(layout.widths)):
+            count = out.counts[k, column]
+            fine = fine and (count == n * layout.per_record[column] or (count == 0 and not layout.needed[column]))
+        out.understood[k], out.sizes[k], at = fine, n, end
+
+
+@compiled
+def _field(
+    data: ByteArray, at: int, end: int, role: int, wire: int, layout: _Layout, strict: bool, out: Walked, k: int
+) -> int:  # fmt: skip
+    """Note one field; returns where it ends, or -1 where it is not as we write it."""
+    if role == 0:  # boot
+        if wire != _FIXED64 or end - at < 8:
+            return -1
+        value = 0
+        for place in range(8):
+            value |= int(data[at + place]) << (8 * place)
+        out.numbers[k, role] = value
+        return at + 8
+    if role < _TEXT:
+        out.numbers[k, role], at = _varint(data, at, end)
+        return at if wire == _VARINT else -1
+    length, at = _varint(data, at, end)
+    if wire != _RUN or at < 0 or not 0 <= length <= end - at:
+        return -1
+    if role < _COLUMN:
+        out.texts[k, role - _TEXT, 0], out.texts[k, role - _TEXT, 1] = at, at + length
+        for place in range(at, at + length):
+            if strict and data[place] >= 128:
+                return -1
+        return at + length
+    column = role - _COLUMN
+    width, count = layout.widths[column], 0
+    if width > 0:
+        count = length // width
+        if count * width != length:
+            return -1
+    else:
+        place = at
+        while place < at + length:
+            value, place = _varint(data, place, at + length)
+            if place < 0 or not -(1 << 31) <= value < 1 << 31:
+                return -1
+            count += 1
+    out.begins[k, column], out.counts[k, column] = at, count
+    return at + length
+
+
+@compiled
+def _copy(data: ByteArray, begins: IntArray, lengths: IntArray, rooms: IntArray, into: ByteArray) -> None:
+    to = 0
+    for k in range(len(begins)):
+        for place in range(lengths[k]):
+            into[to + place] = data[begins[k] + place]
+        to += rooms[k]
+
+
+@compiled
+def _unpack(data: ByteArray, begins: IntArray, counts: IntArray, sizes: IntArray, into: IntArray) -> None:
+    to = 0
+    for k in range(len(begins)):
+        at = begins[k]
+        for place in range(counts[k]):
+            into[to + place], at = _varint(data, at, len(data))
+        to += sizes[k]

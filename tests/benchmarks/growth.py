@@ -1,0 +1,60 @@
+"""How the cost of a stream grows with its rate: the engine's processor time from 10³ to 10⁵ observations a second.
+
+Ten observations to a message, one message a second of each vehicle: more rate is more vehicles, as in life. A second of
+the stream is taken in turns, then comes what a second brings: segment, acknowledgements, tiles. The stream's clock is
+made up, so that a rate which the machine could not keep is measured as well. Without the network.
+"""
+
+from __future__ import annotations
+
+import gc
+import tempfile
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from fleet_service.engine import Engine
+from fleet_service.fusion.constants import EPOCH_NS
+from schemas.config import ServiceConfig
+from schemas.figures import Figure
+from schemas.wire import Kind
+from tests.benchmarks.ingest import messages
+
+RATES: Final = {1_000: 24, 10_000: 12, 100_000: 6}  # observations/s, and seconds of each that are measured
+ROWS: Final = 10
+TURN: Final = 512  # messages, as the service's worker takes them
+LATENESS_S: Final = 4.0  # short, so that the window is full and settling is paid for from the beginning
+WARM_S: Final = 4
+SECOND: Final = 10**9
+
+
+def growth() -> list[Figure]:
+    """Cost of a second against the observations in it, 10^3 to 10^5."""
+    cost = {rate: second_s(rate, seconds) for rate, seconds in RATES.items()}
+    slope = float(np.polyfit(np.log(list(cost)), np.log(list(cost.values())), 1)[0])
+    told = ", ".join(f"{1e6 * spent / rate:.1f} us at {rate}/s" for rate, spent in cost.items())
+    return [Figure("bench.growth.rate_exponent", slope, f"of the rate; an observation costs {told}", 1.05)]
+
+
+def second_s(rate: int, seconds: int) -> float:
+    """Processor time [s] of a second of the stream, after a warm-up; rounds of an epoch are whole."""
+    vehicles, spent = rate // ROWS, 0.0
+    begin = time.time_ns() // EPOCH_NS * EPOCH_NS
+    config = ServiceConfig(lateness_s=LATENESS_S)
+    with tempfile.TemporaryDirectory() as folder, closing(Engine(config, Path(folder))) as engine:
+        gc.collect()
+        gc.freeze()  # as the service does when it starts
+        for second in range(WARM_S + seconds):
+            now = begin + second * SECOND
+            sent = messages(vehicles, ROWS, now, vehicles, second * vehicles)
+            began = time.process_time()
+            for at in range(0, len(sent), TURN):
+                engine.take(sent[at : at + TURN], now)
+            engine.flush()
+            engine.tiles(now)
+            spent += time.process_time() - began if second >= WARM_S else 0.0
+        assert engine.counts[Kind.OBSERVATION] == rate * (WARM_S + seconds), engine.counts
+    return spent / seconds

@@ -1,0 +1,165 @@
+"""Two services with a region each beside one with both: a burst until the last of it is acknowledged.
+
+Twice: the engines alone, a process each, on messages that lie ready; and whole services over Zenoh, where the router
+and the sender need a share of the same cores, which a fleet's would not.
+"""
+
+from __future__ import annotations
+
+import gc
+import pickle
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import Final
+
+import zenoh
+
+from deploy.router import open_router
+from fleet_service.engine import Engine
+from fleet_service.ingest import Message
+from schemas import keys, wire
+from schemas.config import ServiceConfig, ZenohSettings
+from schemas.figures import Figure
+from schemas.transport import open_session
+from schemas.wire import Kind
+from tests.benchmarks.ingest import messages
+from tests.faults.processes import Part
+from tests.waiting import until
+
+ROWS: Final = 10
+BURST: Final = 8_000  # messages in each region
+TURN: Final = 512  # messages that an engine takes at once
+VEHICLES: Final = 100  # of each region
+ROUNDS: Final = 3
+PATIENCE_S: Final = 120.0
+
+
+def shards() -> list[Figure]:
+    """A burst into one service, and into two that share its regions: engines alone, and whole over Zenoh."""
+    sent = [_burst(k) for k in range(ROUNDS + 1)]
+    alone = [statistics.median(engines_s(sent, split)) for split in (1, 2)]
+    whole = [statistics.median(services_s(sent, split)) for split in (1, 2)]
+    rates = [2 * BURST * ROWS / seconds for seconds in (alone[0], whole[0])]
+    told = f"times one, which took {rates[1]:.0f} observations/s; router and sender on the same cores"
+    return [
+        Figure("bench.shards.speedup", alone[0] / alone[1], f"times one engine, {rates[0]:.0f}/s", 1.6, "more"),
+        Figure("bench.shards.over_zenoh", whole[0] / whole[1], told),
+    ]
+
+
+def engines_s(bursts: Sequence[Sequence[Message]], processes: int) -> list[float]:
+    """From the word to the last acknowledgement, of every burst but the first."""
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        running = []
+        for number in range(processes):
+            root = folder / str(number)
+            root.mkdir()
+            shares = [[tuple(message) for message in burst[number::processes]] for burst in bursts]
+            (root / "sent").write_bytes(pickle.dumps(shares))
+            command = [sys.executable, "-c", f"from tests.benchmarks.shards import engine; engine({str(root)!r})"]
+            running.append(
+                stack.enter_context(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True))
+            )
+        return [_round(running) for _ in range(len(bursts) + 1)][2:]
+
+
+def _round(running: Sequence[subprocess.Popen[str]]) -> float:
+    """Tell all to go on, and wait until all have said that they did; the first round is their start."""
+    began = time.perf_counter()
+    for process in running:
+        assert process.stdin is not None
+        print("go", file=process.stdin, flush=True)
+    for process in running:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "done\n"
+    return time.perf_counter() - began
+
+
+def engine(root: str) -> None:
+    """One engine, a burst at each line of standard input."""
+    bursts = [[Message(*fields) for fields in burst] for burst in pickle.loads((Path(root) / "sent").read_bytes())]
+    with closing(Engine(ServiceConfig(), Path(root) / "archive")) as there:
+        gc.freeze()
+        for burst in ([], *bursts):
+            sys.stdin.readline()
+            for at in range(0, len(burst), TURN):
+                there.take(burst[at : at + TURN], time.time_ns())
+            there.flush()
+            print("done", flush=True)
+        assert there.counts[Kind.OBSERVATION] == sum(map(len, bursts)) * ROWS, there.counts
+
+
+def _burst(number: int) -> list[Message]:
+    """Messages of both regions in turn."""
+    now = time.time_ns()
+    west, east = (messages(BURST, ROWS, now, VEHICLES, number * BURST, side) for side in (0, 1))
+    return [message for pair in zip(west, east, strict=True) for message in pair]
+
+
+def regions(burst: Sequence[Message]) -> list[str]:
+    """The two region expressions of a burst."""
+    return ["/".join(message.key.split("/")[3:6]) for message in burst[:2]]
+
+
+def services_s(bursts: Sequence[Sequence[Message]], services: int) -> list[float]:
+    """From the first put to the last acknowledgement, of every burst but the first."""
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        router, (endpoint, *_) = open_router(listen="tcp/127.0.0.1:0")
+        stack.enter_context(router)
+        parts = [_part(folder, endpoint, number, regions(bursts[0])[number::services]) for number in range(services)]
+        for part in parts:
+            stack.callback(part.kill)
+            part.start()
+        for part in parts:
+            part.line_with("ready: ")
+        session = open_session(ZenohSettings(connect=[endpoint]))
+        assert session is not None
+        stack.enter_context(session)
+        return [_send(session, burst) for burst in bursts][1:]
+
+
+def _part(folder: Path, endpoint: str, number: int, share: list[str]) -> Part:
+    name = f"shard-{number}"
+    settings = {"connect": [endpoint]}
+    config = ServiceConfig(name=name, regions=share, queue_batches=4 * BURST, zenoh=ZenohSettings(**settings))
+    path = folder / f"{name}.json"
+    path.write_text(config.model_dump_json(include={"name", "regions", "queue_batches", "zenoh"}))
+    words = ("-m", "fleet_service.cli", "run", "--archive", str(folder / name), "--config", str(path))
+    return Part(name, [sys.executable, *words], folder)
+
+
+def _send(session: zenoh.Session, burst: Sequence[Message]) -> float:
+    settled, done = 0, threading.Event()
+
+    def hear(sample: zenoh.Sample) -> None:
+        nonlocal settled
+        _, streams = wire.decode_ack(sample.payload.to_bytes())
+        settled += sum(last - first + 1 for stream in streams for first, last in stream.durable)
+        if settled >= len(burst):
+            done.set()
+
+    subscriber = session.declare_subscriber(f"{keys.ROOT}/ack/*", hear)
+    for key in {message.key for message in burst}:
+        publisher = session.declare_publisher(key)
+        until(lambda publisher=publisher: publisher.matching_status.matching)
+        publisher.undeclare()
+    began = time.perf_counter()
+    for message in burst:
+        session.put(message.key, message.payload, encoding=message.encoding, congestion_control=_BLOCK)
+    if not done.wait(PATIENCE_S):
+        raise TimeoutError(f"{len(burst) - settled} batches were not acknowledged")
+    took = time.perf_counter() - began
+    subscriber.undeclare()
+    return took
+
+
+_BLOCK: Final = zenoh.CongestionControl.BLOCK

@@ -1,0 +1,103 @@
+"""A million cells: a checkpoint while ingest goes on, and a restart from it with what came since.
+
+The checkpoint is what a restart begins from; it is asked for as the service's upkeep does, beside a worker that takes
+messages all the time. The restart is a process of its own: imports, checkpoint, rows since, kernels, session, ready.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import threading
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Final
+
+import pyarrow as pa
+
+from deploy.router import open_router
+from fleet_service.archive import checkpoints
+from fleet_service.checkpoint import tables_of
+from fleet_service.engine import ALERTS, Engine
+from fleet_service.ingest import Message
+from schemas.config import ServiceConfig
+from schemas.figures import Figure
+from tests.benchmarks.fusion import CELLS, START, filled
+from tests.benchmarks.ingest import messages
+from tests.faults.processes import Part
+
+SPAN_S: Final = 600.0  # in which every cell was visited once
+TURN: Final = 100  # messages of ten
+SINCE: Final = 10_000  # messages after the last checkpoint: 100 000 observations
+RESTARTS: Final = 3
+SECOND: Final = 10**9
+
+
+def state() -> list[Figure]:
+    """A checkpoint of 10^6 cells beside ingest, and a restart from it."""
+    now = START + int(SPAN_S) * SECOND
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        root = folder / "archive"
+        fusion, _ = filled(CELLS, 1, SPAN_S)
+        checkpoints.save(root, tables_of(fusion) | {ALERTS: pa.table({})}, now)
+        del fusion
+        with closing(Engine(ServiceConfig(), root)) as engine:
+            took, held = checkpoint_s(engine, root, messages(SINCE, 10, now), now)
+            cells = engine.fusion.size
+        restart = sorted(restart_s(folder, root) for _ in range(RESTARTS))[RESTARTS // 2]
+    told = f"s, checkpoint of {cells / 1e6:.2f} 10^6 cells on disk; ingest waited {1e3 * held:.0f} ms at the most"
+    return [
+        Figure("bench.state.snapshot_s", took, told, 1),
+        Figure("bench.state.restart_s", restart, f"s, process to ready, {10 * SINCE} observations since", 5),
+    ]
+
+
+def checkpoint_s(engine: Engine, root: Path, sent: list[Message], now: int) -> tuple[float, float]:
+    """From the question to the checkpoint on disk, and the longest turn of the worker meanwhile [s].
+
+    All of `sent` is taken, half of it after the checkpoint.
+    """
+    parts = [sent[at : at + TURN] for at in range(0, len(sent), TURN)]
+    turns: list[float] = []
+    saved = threading.Event()
+
+    def work() -> None:
+        for number, part in enumerate(parts):
+            began = time.perf_counter()
+            engine.take(part, now)
+            engine.flush()
+            turns.append(time.perf_counter() - began)
+            if number == len(parts) // 2:
+                saved.wait()
+
+    worker = threading.Thread(target=work)
+    for part in parts[:2]:  # warm
+        engine.take(part, now)
+    worker.start()
+    began = time.perf_counter()
+    taken = engine.checkpoint(threading.Event())
+    assert taken is not None
+    checkpoints.save(root, *taken)
+    took, busy = time.perf_counter() - began, len(turns)
+    saved.set()
+    worker.join()
+    return took, max(turns[: busy + 1])
+
+
+def restart_s(folder: Path, root: Path) -> float:
+    """From the start of the process until it says that it is ready."""
+    router, (endpoint, *_) = open_router(listen="tcp/127.0.0.1:0")
+    with router:
+        config = folder / "service.json"
+        config.write_text(json.dumps({"zenoh": {"connect": [endpoint]}}))
+        words = ("-m", "fleet_service.cli", "run", "--archive", str(root), "--config", str(config))
+        service = Part("service", [sys.executable, *words], folder)
+        began = time.perf_counter()
+        service.start()
+        service.line_with("ready: ")
+        took = time.perf_counter() - began
+        service.kill()
+    return took

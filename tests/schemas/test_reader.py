@@ -1,0 +1,160 @@
+"""The compiled reader beside the protobuf module: what it understands it reads as the module does, to the last bit."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from schemas import mugrid
+from schemas.decoding import decode, decode_many
+from schemas.errors import WireError
+from schemas.proto import gripmap_pb2 as pb
+from schemas.reader import NUMBERS, TEXTS, gather, walk
+from schemas.wire import ENCODING, MESSAGES, NEEDED, Kind, column_types
+
+compiled = settings(deadline=None)  # the first example waits for the compiler
+KINDS = st.sampled_from(list(Kind))
+_I64 = st.integers(-(2**63), 2**63 - 1)
+_I32 = st.one_of(st.integers(-3, 5), st.integers(-(2**31), 2**31 - 1))
+_FLOAT = st.floats(width=32)
+
+
+@st.composite
+def sent(draw: Callable[[Any], Any], kind: Kind) -> Any:  # noqa: ANN401 protobuf messages are untyped
+    """A message with records, some of its columns, and anything in them."""
+    rows = draw(st.integers(1, 4))
+    message = MESSAGES[kind](
+        vehicle=draw(st.sampled_from(["sim-001", "", "a" * 200])), estimator=draw(st.sampled_from(["", "ckf"])),
+        boot=draw(_I64), region=draw(_I64), seq=draw(_I64), first_held=draw(_I64),
+    )  # fmt: skip
+    for name, dtype in column_types(kind).items():
+        if name not in NEEDED[kind] and not draw(st.booleans()):
+            continue
+        if name == "log_likelihood":
+            message.log_likelihood = draw(st.binary(min_size=32 * rows, max_size=32 * rows))
+        else:
+            element = _FLOAT if dtype.kind == "f" else _I64 if dtype.itemsize == 8 else _I32
+            getattr(message, name).extend(draw(st.lists(element, min_size=rows, max_size=rows)))
+    return message
+
+
+def agrees(kind: Kind, payload: bytes) -> bool:
+    """Whether the reader understands the bytes; if so, it has read what the module reads, or this fails."""
+    data = np.frombuffer(payload, np.uint8)
+    found = walk(kind, data, np.array([len(payload)]))
+    if not found.understood[0]:
+        return False
+    message = MESSAGES[kind].FromString(payload)
+    assert found.numbers[0].tolist() == [getattr(message, name) for name in NUMBERS]
+    texts = [payload[begin:end].decode() for begin, end in found.texts[0].tolist()]
+    assert texts == [getattr(message, name) for name in TEXTS]
+    for at, (name, dtype) in enumerate(column_types(kind).items()):
+        values = getattr(message, name)
+        rows = int(found.sizes[0])
+        if not len(values):
+            assert not found.counts[0, at]
+        elif name == "log_likelihood":
+            into = np.zeros((rows, mugrid.BINS), np.uint8)
+            gather(data, found, at, kind, into)
+            assert into.tobytes() == values
+        else:
+            wide = dtype if dtype.kind == "f" else np.dtype(np.int64)
+            column = np.zeros(rows, wide)
+            gather(data, found, at, kind, column)
+            assert column.tobytes() == np.array(list(values), wide).tobytes()
+    return True
+
+
+@compiled
+@given(KINDS.flatmap(lambda kind: st.tuples(st.just(kind), sent(kind))))
+def test_what_the_module_writes_is_understood_and_read_to_the_last_bit(case: tuple[Kind, Any]) -> None:
+    kind, message = case
+    assert agrees(kind, message.SerializeToString())
+
+
+@compiled
+@given(
+    KINDS.flatmap(lambda kind: st.tuples(st.just(kind), sent(kind))),
+    st.lists(st.tuples(st.integers(0, 2000), st.integers(0, 255)), max_size=4),
+    st.integers(0, 2000),
+    st.binary(max_size=12),
+)
+def test_damaged_bytes_are_left_to_the_module_or_read_as_it_reads_them(
+    case: tuple[Kind, Any], flips: list[tuple[int, int]], cut: int, inserted: bytes
+) -> None:
+    kind, message = case
+    payload = bytearray(message.SerializeToString())
+    for place, value in flips:
+        payload[place % len(payload)] = value
+    agrees(kind, bytes(payload))
+    place = cut % len(payload)
+    agrees(kind, bytes(payload[:place]))
+    agrees(kind, bytes(payload[:place]) + inserted + bytes(payload[place:]))
+
+
+@compiled
+@given(st.binary(max_size=200), KINDS)
+def test_any_bytes_at_all_are_left_to_the_module_or_read_as_it_reads_them(payload: bytes, kind: Kind) -> None:
+    agrees(kind, payload)
+
+
+def _example() -> Any:  # noqa: ANN401
+    message = pb.ObservationBatch(vehicle="sim-001", boot=7, region=5, seq=3, first_held=2)
+    message.enter_time.extend([1, 2])
+    message.latitude.extend([57.0, 57.0])
+    message.longitude.extend([12.0, 12.0])
+    message.health.extend([-1, 2])
+    return message
+
+
+def _run(number: int, body: bytes) -> bytes:
+    return bytes([(number << 3 & 127 | 2) | 128, number >> 4, len(body)]) + body
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        _run(40, b"unknown"),
+        _run(31, bytes([1, 1])),  # health a second time, which appends
+        _run(25, struct.pack("<2f", 1.0, 2.0)) + _run(25, b""),
+        b"\x98\x00" + b"\x01",  # field 3 by a tag that is longer than it need be
+        bytes([25 << 3 & 127 | 5 | 128, 25 >> 4]) + struct.pack("<f", 1.0),  # speed, not packed
+        bytes([2 << 3 | 1]) + bytes(8),  # boot a second time, which replaces
+        _run(33, b"\x00" * 7),
+        _run(32, b"\x80" * 9 + b"\x02" + b"\x00"),  # more than 64 bits
+        _run(32, b"\x80\x80\x80\x80\x10" + b"\x00"),  # more than 32 bits
+    ],
+)
+def test_what_our_encoder_never_writes_is_left_to_the_module(more: bytes) -> None:
+    payload = _example().SerializeToString()
+    assert agrees(Kind.OBSERVATION, payload)
+    assert not agrees(Kind.OBSERVATION, payload + more)
+    with_error = decode_many(Kind.OBSERVATION, [(payload, ""), (payload + more, ""), (payload, "")])
+    assert with_error.places[0] == 0
+    assert with_error.places[-1] == 2
+
+
+def test_a_message_with_unknown_fields_columns_apart_or_unpacked_is_read_all_the_same() -> None:
+    message = _example()
+    plain = decode(message.SerializeToString(), "", Kind.OBSERVATION)
+    unpacked = b"".join(bytes([25 << 3 & 127 | 5 | 128, 25 >> 4]) + struct.pack("<f", v) for v in (3.0, 4.0))
+    odd = decode(_run(40, b"later version") + message.SerializeToString() + unpacked, "", Kind.OBSERVATION)
+    assert odd.columns["speed"].tolist() == [3.0, 4.0]
+    assert (odd.vehicle, odd.boot, odd.seq) == (plain.vehicle, plain.boot, plain.seq)
+    assert odd.columns["health"].tolist() == [-1, 2]
+
+
+def test_a_name_that_is_not_ascii_is_read_by_the_module_and_a_broken_one_refused() -> None:
+    message = _example()
+    message.vehicle = "müller"
+    payload = message.SerializeToString()
+    assert not agrees(Kind.OBSERVATION, payload)
+    assert decode(payload, ENCODING[Kind.OBSERVATION], Kind.OBSERVATION).vehicle == "müller"
+    with pytest.raises(WireError, match="^payload: "):
+        decode(payload.replace("ü".encode(), b"\xff\xff"), "", Kind.OBSERVATION)
