@@ -1,8 +1,10 @@
-"""What a running service does for its archive now and then, in a thread of low priority beside the worker."""
+"""What a running service does for its archive now and then, at low priority beside the worker."""
 
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import threading
 import time
 from collections import Counter
@@ -12,14 +14,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from fleet_service.archive import checkpoints, mirror, rollup, snapshots
-from fleet_service.archive.compaction import compact
+from fleet_service.archive import checkpoints, segments, snapshots
 from fleet_service.archive.retention import retire
 from fleet_service.engine import Engine
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
+from schemas.wire import Kind
 
 ROUND_ROWS: Final = 250_000  # of one round of compaction: a second of work, 150 MB
+LOOK_S: Final = 0.1  # between two looks whether a compaction has ended, or shall
 DAY_S: Final = 86_400.0
 SOON_S: Final = 60.0  # after the start; the first turn of a job does not wait for its whole interval
 _NICE: Final = 10  # the worker goes first
@@ -37,12 +40,11 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path) -> list[Job]
     """What keeps an archive in order, as the settings say."""
 
     def compaction(stop: threading.Event) -> str | None:
-        done = compact(root, ROUND_ROWS, stop)
-        rollup.complete(root)
-        copies = mirror.put(root, config.put_to) if config.put_to else 0
-        if not done.segments:
+        if not config.put_to and not any(segments.paths(root, kind) for kind in Kind):
             return None
-        return f"compacted: {done.rows} rows, {done.segments} segments" + (f", {copies} files put" if copies else "")
+        words = ["compact", "--archive", str(root), "--round-rows", str(ROUND_ROWS)]
+        said = _beside([*words, *(["--to", config.put_to] if config.put_to else [])], stop)
+        return said and f"compacted: {said}"
 
     def snapshot(_: threading.Event) -> str | None:
         now = time.time_ns()
@@ -67,6 +69,27 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path) -> list[Job]
         Job("snapshot", config.snapshot_s, snapshot),
         Job("retention", DAY_S if config.raw_days else 0.0, retention),
     ]
+
+
+def _beside(words: Sequence[str], stop: threading.Event) -> str | None:
+    """What a command of `fleet-service` said, run as a process of its own; None if it was stopped.
+
+    Its memory goes with it, and the worker shares no interpreter with it. A compaction may die at any instant.
+
+    Raises:
+        InputError: it failed.
+    """
+    command = [sys.executable, "-m", "fleet_service.cli", *words]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:
+        while child.poll() is None and not stop.wait(LOOK_S):
+            pass
+        if child.poll() is None:
+            child.terminate()
+            return None
+        said, complaint = child.communicate()
+    if child.returncode:
+        raise InputError(words[0], complaint.strip() or f"ended with {child.returncode}", "it is tried again")
+    return said.strip()
 
 
 @contextmanager

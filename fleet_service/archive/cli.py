@@ -18,6 +18,9 @@ def add_commands(commands: Commands) -> None:
     """Declare them."""
     compact = _command(commands, "compact", _compact, "sort the log into files by date and zone, roll them up")
     compact.add_argument("--to", metavar="URI", help="then put what is new there, e.g. s3://bucket/folder")
+    compact.add_argument(
+        "--round-rows", metavar="N", type=int, help="rows in memory at once; default a million, half a gigabyte"
+    )
     retention = _command(commands, "retention", _retention, "remove old raw rows; their roll-ups stay")
     retention.add_argument("--raw-days", metavar="N", type=int, required=True, help="days of raw rows that stay")
     forget = _command(commands, "forget", _forget, "destroy the key of a month, or remove one vehicle's rows of it")
@@ -72,9 +75,12 @@ def _done(arguments: argparse.Namespace, run: Callable[[argparse.Namespace], str
 
 def _compact(arguments: argparse.Namespace) -> str:
     from fleet_service.archive import mirror, rollup
-    from fleet_service.archive.compaction import compact
+    from fleet_service.archive.compaction import ROUND_ROWS, compact
 
-    done = compact(arguments.archive)
+    rows = ROUND_ROWS if arguments.round_rows is None else arguments.round_rows
+    if rows < 1:
+        raise InputError("round-rows", f"{rows} is below 1", "give the rows of one round")
+    done = compact(arguments.archive, rows)
     parts = rollup.complete(arguments.archive)
     said = f"{done.rows} rows of {done.segments} segments moved into {done.files} files, {parts} rolled up"
     return said if arguments.to is None else f"{said}, {mirror.put(arguments.archive, arguments.to)} put"

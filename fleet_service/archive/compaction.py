@@ -13,7 +13,6 @@ if a file of its partition names the segment, so that `reading` sees it once, an
 from __future__ import annotations
 
 import json
-import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -56,13 +55,12 @@ def compacting(root: Path) -> Iterator[None]:
         yield
 
 
-def compact(root: Path, round_rows: int = ROUND_ROWS, stop: threading.Event | None = None) -> Compacted:
+def compact(root: Path, round_rows: int = ROUND_ROWS) -> Compacted:
     """Move all rows of the inbox into the compacted files.
 
     Args:
         root: of the archive; a service may run on it.
         round_rows: rows in memory at once.
-        stop: ends it after the round that runs.
 
     Raises:
         InputError: another process compacts it.
@@ -78,9 +76,8 @@ def compact(root: Path, round_rows: int = ROUND_ROWS, stop: threading.Event | No
             # the segments that they stand for may only be deleted when power loss can no longer forget them.
             sync_tree(root, {part.folder(root, layout.TABLES[kind]) for parts in done.values() for part in parts})
             rest = _Rest(root, kind, iter(waiting), done)
-            while not (stop and stop.is_set()) and (moved := _round(rest, round_rows)).segments:
+            while (moved := _round(rest, round_rows)).segments:
                 total = Compacted(*map(sum, zip(total, moved, strict=True)))
-    pa.default_memory_pool().release_unused()  # hundreds of megabytes that a service would keep till the next time
     return total
 
 

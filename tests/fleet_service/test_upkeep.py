@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -13,26 +13,30 @@ import zenoh
 
 from fleet_service.archive.compaction import compacting
 from fleet_service.cli import main
-from fleet_service.upkeep import Job, upkeep
-from schemas.config import ZenohSettings
+from fleet_service.engine import Engine
+from fleet_service.ingest import Message
+from fleet_service.upkeep import Job, archive_jobs, upkeep
+from schemas import wire
+from schemas.config import ServiceConfig, ZenohSettings
+from schemas.errors import InputError
 from schemas.wire import Kind
 from tests.fleet_service.archive.rows import identities
 from tests.fleet_service.conftest import running
-from tests.fleet_service.examples import SECOND, batch
-from tests.fleet_service.test_service import Fleet
+from tests.fleet_service.examples import batch, key
+from tests.fleet_service.test_service import Fleet, now
 from tests.waiting import until
 
 
 def test_a_running_service_compacts_and_keeps_every_row_once(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path
 ) -> None:
-    now = time.time_ns() - SECOND
+    moment = now()
     with running(router, tmp_path, compact_s=0.05) as run:
         fleet = Fleet(session).meet()
         for seq in range(1, 11):
-            fleet.settle(*(batch(f"sim-{k:03}", seq, now, [0.8]) for k in range(3)))
+            fleet.settle(*(batch(f"sim-{k:03}", seq, moment, [0.8]) for k in range(3)))
         until(lambda: not list((tmp_path / "inbox").glob("*.parquet")))
-        assert any(line.startswith("compacted: ") for line in run.lines)
+        until(lambda: any(line.startswith("compacted: ") for line in run.lines))
     assert len(set(identities(tmp_path, Kind.OBSERVATION))) == len(identities(tmp_path, Kind.OBSERVATION)) == 30
     with running(router, tmp_path) as again:
         assert again.service.engine.fusion.live.visits[0] == 30
@@ -68,3 +72,26 @@ def test_the_command_says_when_another_compacts(tmp_path: Path, capsys: pytest.C
     with compacting(tmp_path):
         assert main(["compact", "--archive", str(tmp_path)]) == 2
     assert capsys.readouterr().err.startswith("error: archive: ")
+
+
+def test_rounds_of_no_rows_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compact", "--archive", str(tmp_path), "--round-rows", "0"]) == 2
+    assert capsys.readouterr().err.startswith("error: round-rows: ")
+
+
+def test_a_compaction_that_fails_is_said_and_one_that_runs_is_stopped_with_the_service(tmp_path: Path) -> None:
+    engine = Engine(ServiceConfig(), tmp_path)
+    with closing(engine):
+        engine.take(
+            [Message(Kind.OBSERVATION, key("sim-001"), wire.encode(batch("sim-001", 1, now(), [0.8])), "")], now()
+        )
+        engine.flush()
+        compaction, *_ = archive_jobs(engine, ServiceConfig(), tmp_path)
+        with compacting(tmp_path), pytest.raises(InputError, match="being compacted"):
+            compaction.work(threading.Event())
+        stopped = threading.Event()
+        stopped.set()
+        assert compaction.work(stopped) is None
+        assert list((tmp_path / "inbox").glob("*.parquet"))
+        assert (compaction.work(threading.Event()) or "").startswith("compacted: 1 rows of 1 segments")
+        assert compaction.work(threading.Event()) is None

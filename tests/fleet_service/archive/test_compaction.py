@@ -191,14 +191,6 @@ def test_a_damaged_segment_is_set_aside_and_the_rest_compacted(tmp_path: Path) -
     assert {boot for boot, _ in public(tmp_path, Kind.OBSERVATION)} == {0, 2}
 
 
-def test_a_stop_ends_it_after_the_round_that_runs(tmp_path: Path) -> None:
-    fill(tmp_path, 3, ROWS)
-    stop = threading.Event()
-    stop.set()
-    assert compact(tmp_path, stop=stop) == (0, 0, 0)
-    assert len(segments.paths(tmp_path, Kind.OBSERVATION)) == 3
-
-
 def test_names_of_compacted_segments_are_not_used_again_even_if_the_clock_went_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
