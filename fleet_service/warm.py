@@ -9,6 +9,7 @@ import numpy as np
 from fleet_service.alerts import Alerts
 from fleet_service.fusion import Fusion, Observations
 from fleet_service.fusion.constants import EPOCH_NS
+from fleet_service.fusion.shape import unshaped
 from fleet_service.map_state import cell_table
 from schemas import mugrid
 
@@ -28,8 +29,8 @@ def warm_up() -> None:
 def _visits(time: int, cells: int) -> Observations:
     """One visit to each of so many cells, by two vehicles."""
     one, number, sector = np.ones(cells, np.int64), np.arange(cells), np.zeros(cells, np.int8)
-    evidence = mugrid.encode_log_likelihood(np.zeros((cells, mugrid.BINS)))
+    told = unshaped(mugrid.encode_log_likelihood(np.zeros((cells, mugrid.BINS))), np.zeros(cells))
     return Observations(
-        time * one, number, sector, (sector - 1).astype(np.int8), number % 2, one, one, number, evidence,
+        time * one, number, sector, (sector - 1).astype(np.int8), number % 2, one, one, number, *told,
         np.full((cells, 1), -1), np.zeros((cells, 1), np.float32),
     )  # fmt: skip

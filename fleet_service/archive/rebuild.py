@@ -62,7 +62,7 @@ def observations(rows: segments.Rows, vehicle: IntArray) -> Observations:
     beside = np.where(np.isnan(rows["yaw"]) | (second == first), -1, second).astype(np.int8)
     return Observations(
         rows["leave_time"] // US_STEP * US_STEP, rows["cell"], first, beside, vehicle, rows["boot"], rows["region"],
-        rows["seq"] * ROWS_PER_SEQ + rows["row"], evidence(rows, rows["told"]),
+        rows["seq"] * ROWS_PER_SEQ + rows["row"], *evidence(rows, rows["told"]),
         *places(rows["cell"], rows["latitude"], rows["yaw"], rows["position_std"]),
     )  # fmt: skip
 

@@ -80,7 +80,7 @@ def upper_shift(rng: Generator) -> float:
             who, along = rng.integers(0, vehicles, n), np.zeros(n, np.int64)
             shares = agent.shares(rng, np.zeros(n, bool))
             road: FloatArray = np.full(n, mu)
-            told = agent.tell(rng, Errors.draw(rng, vehicles), who, road, shares, agent.noise(rng, along))
+            told = agent.tell(rng, Errors.draw(rng, vehicles), who, road, 0.0 * road, shares, agent.noise(rng, along))
             fusion = Fusion(LATENESS_S)
             fusion.fold(observations(rows_of(Visits(seconds, who, along, road, along > 0, told)), who))
             slot = fusion.slots_of(CELL[:1], np.zeros(1, np.int64))

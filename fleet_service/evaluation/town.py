@@ -1,8 +1,8 @@
 """A town of roads, cell behind cell, their friction in time, and who drives where and when. Pure.
 
 Every road has stretches of one surface; most passes are unexcited, and where drivers brake or steer is a property of
-the place: a few cells hear many excited vehicles, most hear hardly any. Fixes are noisy, so that a visit is sometimes
-told of the cell before or behind.
+the place: a few cells hear many excited vehicles, most hear hardly any. Where all do the same they share an error.
+Fixes are noisy, so that a visit is sometimes told of the cell before or behind.
 """
 
 from __future__ import annotations
@@ -42,12 +42,13 @@ def cell_numbers(cells: int = CELLS) -> IntArray:
 
 @dataclass(frozen=True)
 class Town:
-    """Friction (minutes + 1, cells) at the beginning of each minute, P(a pass is excited) (cells,), and the minute of
-    each cell's change of surface (cells,), infinite without one."""
+    """Friction (minutes + 1, cells) at the beginning of each minute, P(a pass is excited) (cells,), the minute of
+    each cell's change of surface (cells,), infinite without one, and the vehicles' common error (cells,)."""
 
     mu: FloatArray
     excitement: FloatArray
     changed: FloatArray
+    common: FloatArray
 
     def at(self, seconds: FloatArray, place: IntArray) -> FloatArray:
         """Friction at a time and place, (n,)."""
@@ -71,7 +72,8 @@ def build(rng: Generator, minutes: int, changing: float) -> Town:
     classes, weights = zip(*EXCITEMENT, strict=True)
     excitement = np.repeat(rng.choice(classes, CELLS // ZONE, p=weights), ZONE)
     mu = np.clip(now + np.repeat(steps.cumsum(axis=0), STRETCH, axis=1), LEAST, MOST)
-    return Town(mu, excitement, np.ceil(change))
+    common = np.repeat(agent.COMMON * rng.spawn(1)[0].normal(size=CELLS // ZONE), ZONE)  # same towns with and without
+    return Town(mu, excitement, np.ceil(change), common)
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,8 @@ def drive(rng: Generator, town: Town, errors: Errors, minutes: float, roads_per_
     vehicle, place = np.repeat(who, LENGTH), np.repeat(rng.integers(0, ROADS, passes) * LENGTH, LENGTH) + along
     excited = rng.random(len(place)) < town.excitement[place]
     mu = town.at(seconds, place)
-    told = agent.tell(rng, errors, vehicle, mu, agent.shares(rng, excited), agent.noise(rng, along))
+    shares, noise = agent.shares(rng, excited), agent.noise(rng, along)
+    told = agent.tell(rng, errors, vehicle, mu, town.common[place], shares, noise)
     offset = rng.uniform(0.0, CELL_M, len(place)) + FIX_STD_M * rng.normal(size=len(place))
     told_at = place + np.clip(np.floor(offset / CELL_M).astype(np.int64), -1, 1)
     told_place = np.where(told_at // LENGTH == place // LENGTH, told_at, place)

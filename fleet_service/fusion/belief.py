@@ -1,11 +1,12 @@
 """One cell's belief: what time does to it, and what a vote does. Compiled; every function works on one row of 32 bins.
 
 Legend
-    p    belief: probability of each bin                                        (32,)
+    p    belief about what the fleet takes the road for: probability of each bin (32,)
     q    a belief at rest: its bins in 16 bits, the largest 65 535               (32,)
     L    likelihood of one visit, from its bytes                                (32,)
     B    bias kernel: B[i, j] = P(the vehicle takes μ_i for μ_j)                (32, 32), rows sum to 1
     L̃    B·L over its mean: the vote of a vehicle whose bias is unknown          (32,)
+    K    common kernel: K[i, j] = P(the fleet takes μ_i for μ_j)                 (32, 32), rows sum to 1
     s    strength of a vote: what part of it is new, trusted and surely here    [-]
     h    P(the road changed since), 1 - exp(-Δt / CHANGE_S)                     [-]
 
@@ -44,8 +45,18 @@ PADDED: Final = _BINS + 2 * REACH
 
 
 def bias_kernel() -> FloatArray:
-    """B, a normal of standard deviation hypot(BIAS_RELATIVE·μ, BIAS_ABSOLUTE), cut at REACH and the grid's ends."""
-    std = np.hypot(c.BIAS_RELATIVE * _CENTRES, c.BIAS_ABSOLUTE)[:, None]
+    """B, of one vehicle's own error."""
+    return _kernel(c.BIAS_RELATIVE, c.BIAS_ABSOLUTE)
+
+
+def common_kernel() -> FloatArray:
+    """K, of the error that all vehicles of a cell share."""
+    return _kernel(c.COMMON_RELATIVE, c.COMMON_ABSOLUTE)
+
+
+def _kernel(relative: float, absolute: float) -> FloatArray:
+    """A normal of standard deviation hypot(relative·μ, absolute), cut at REACH and the grid's ends."""
+    std = np.hypot(relative * _CENTRES, absolute)[:, None]
     kernel = np.exp(-0.5 * np.square((_CENTRES[None, :] - _CENTRES[:, None]) / std))
     kernel[np.abs(np.subtract.outer(np.arange(_BINS), np.arange(_BINS))) > REACH] = 0.0
     return np.asarray(kernel / kernel.sum(axis=1, keepdims=True))
@@ -62,6 +73,16 @@ def _taps() -> Float32Array:
 
 
 _TAPS: Final = _taps()
+_COMMON: Final = common_kernel().T
+
+
+def read(p: FloatArray) -> FloatArray:
+    """Belief about the road (k, 32) of beliefs about what the fleet takes it for (k, 32): K·p over its sum.
+
+    The uniform one stays uniform and a rising one rising, so that a bound's upper end stays where it is.
+    """
+    road = p @ _COMMON
+    return np.asarray(road / road.sum(axis=1, keepdims=True))
 
 
 @compiled

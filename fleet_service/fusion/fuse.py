@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.belief import PackedArray, forget, unpack
+from fleet_service.fusion.belief import PackedArray, forget, read, unpack
 from fleet_service.fusion.cells import NOBODY, NONE, SECOND, Cells, Records
 from fleet_service.fusion.stores import Stores, distinct
 from fleet_service.fusion.trust import newcomer, trusted
@@ -36,6 +36,7 @@ class Observations:
         vehicle, boot, region, place: identity; `vehicle` is a number that stands for the vehicle, `place` counts rows
             in the stream of (vehicle, boot, region).
         evidence: (n, 32) log-likelihood in steps, see `likelihoods.evidence`.
+        said: (n, 3) mean, standard deviation and P(slippery) of a value as it was told, NaN to read them in `evidence`.
         beside: (n, k) other cells in which the vehicle may have been instead, -1 where there is none.
         beside_share: (n, k) probability that it was there; what is left belongs to `cell`.
     """
@@ -49,6 +50,7 @@ class Observations:
     region: IntArray
     place: IntArray
     evidence: ByteArray
+    said: Float32Array
     beside: IntArray
     beside_share: Float32Array
 
@@ -166,13 +168,12 @@ class Fusion:
         self._weather = weather_of(self.reports)
 
     def beliefs(self, slots: IntArray, now: int) -> FloatArray:
-        """Belief of each slot, (k, 32), with what time did to it until `now` [ns]."""
-        return _beliefs(self.stores.state.belief, self.stores.state.cells, self._weather, slots, now)
+        """Belief of each slot about its road, (k, 32), with what time did to it until `now` [ns]."""
+        return read(_beliefs(self.stores.state.belief, self.stores.state.cells, self._weather, slots, now))
 
     def believed(self, slots: IntArray) -> FloatArray:
-        """Belief of each slot, (k, 32), at its last observation."""
-        packed = self.stores.state.belief[slots].astype(np.float64)
-        return np.asarray(packed / packed.sum(axis=1, keepdims=True))
+        """Belief of each slot about its road, (k, 32), at its last observation."""
+        return read(self.stores.state.belief[slots].astype(np.float64))
 
     def slots_of(self, cell: IntArray, sector: IntArray | SmallArray) -> IntArray:
         """Slot of each cell and sector, -1 where nobody was."""
@@ -227,7 +228,7 @@ class Fusion:
         self.stores.reserve(len(slots))
         left_out = absorb(
             self.stores.state, self._weather, slots, at, share, o.time, o.vehicle, o.boot, o.place, vehicle, weight,
-            o.evidence, most,
+            o.evidence, o.said, most,
         )  # fmt: skip
         return slots, left_out
 

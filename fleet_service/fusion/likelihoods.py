@@ -17,25 +17,27 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from fleet_service.fusion import constants as c
+from fleet_service.fusion.shape import Told, unshaped
 from schemas import mugrid
 from schemas.numeric import BoolArray, ByteArray, FloatArray
 
 _QUANTILE_95 = 1.6448536269514722  # of the standard normal: what lies between median and 95 %
 
 
-def evidence(columns: Mapping[str, NDArray[Any]], told: BoolArray) -> ByteArray:
-    """Log-likelihood of each visit in steps of 1/16 nat below its maximum, (n, 32).
+def evidence(columns: Mapping[str, NDArray[Any]], told: BoolArray) -> Told:
+    """Log-likelihood of each visit in steps of 1/16 nat below its maximum, (n, 32), and the values as they were told.
 
     Args:
         columns: `log_likelihood` (n, 32); `mu`, `mu_lower`, `mu_upper`, `mu_utilised`, each (n,), NaN where absent.
         told: (n,) whether the sender gave a likelihood.
 
-    A likelihood that falls towards the upper end is a value, any other a bound; see `levelled`. A posterior counts as a
-    value where `mu_utilised ≥ 0.6·mu`; otherwise, and where there is no `mu`, only "at least mu_utilised" remains.
-    A visit with none of them is flat.
+    A likelihood that falls towards the upper end is a value, any other a bound; see `shape.unshaped` and `levelled`.
+    A posterior counts as a value where `mu_utilised ≥ 0.6·mu`; otherwise, and where there is no `mu`, only "at least
+    mu_utilised" remains. A visit with none of them is flat.
     """
     sent = columns["log_likelihood"]
-    out = levelled(sent - sent.min(axis=1, keepdims=True), columns["mu_utilised"])
+    taken, said = unshaped(sent - sent.min(axis=1, keepdims=True), columns["mu_utilised"])
+    out = levelled(taken, columns["mu_utilised"])
     rest = np.flatnonzero(~told)
     if len(rest):
         mu, lower, upper, used = (
@@ -44,7 +46,7 @@ def evidence(columns: Mapping[str, NDArray[Any]], told: BoolArray) -> ByteArray:
         value = used >= c.VALUE_UTILISATION * mu  # False where either is NaN
         log_likelihood = np.where(value[:, None], posterior(mu, lower, upper), at_least(used))
         out[rest] = mugrid.encode_log_likelihood(log_likelihood)
-    return out
+    return Told(out, said)
 
 
 def levelled(steps: ByteArray, used: NDArray[Any]) -> ByteArray:

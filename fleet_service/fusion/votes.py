@@ -30,25 +30,37 @@ from fleet_service.fusion.pairs import returning
 from fleet_service.fusion.pools import GRIP, ICE, WITNESSES
 from fleet_service.fusion.weather import Weather, aged
 from schemas import mugrid
-from schemas.numeric import compiled
+from schemas.numeric import Float32Array, compiled
 
 # Rows of scratch, (3, SCRATCH) single precision: the belief, what `forget` and `spread` need, and the likelihood.
 P, PADDED, LIKELIHOOD = 0, 1, 2
 SCRATCH: Final = mugrid.BINS + 2 * REACH
 _HOUR: Final = 3600
+_GRIP_MEAN: Final = 0.5 * (c.WITNESS_USED + mugrid.UPPER)  # of "at least u" against the uniform prior
+_NO_WITNESS: Final = 0.5  # P(slippery) that is neither ice nor grip
 _FORGOTTEN: Final = int(c.FORGOTTEN_S)
 
 
 @compiled
-def voice_of(entries: Records, entry: int, scratch: Bins) -> None:
-    """Kind of an entry's vote, and what describes it; leaves its likelihood in the scratch."""
+def voice_of(entries: Records, entry: int, said: Float32Array, scratch: Bins) -> None:
+    """Kind of an entry's vote, and what describes it; leaves its likelihood in the scratch.
+
+    What was `said` (3,) is a value, and described as it was said, whatever of it was taken.
+    """
     evidence, likelihood = entries[entry].evidence, scratch[LIKELIHOOD]
-    kind = kind_of(evidence)
+    known = not math.isnan(said[0])
+    kind = VALUE if known else kind_of(evidence)
     _clear(scratch)
     spread(evidence, kind, scratch[PADDED], likelihood)
-    mean = mean_of(likelihood)
     entries[entry].kind = kind
+    if known:
+        entries[entry].mean = said[0]
+        entries[entry].std = max(said[1], np.float32(c.NOVELTY_STD))
+        entries[entry].slippery = said[2]
+        return
+    mean = mean_of(likelihood)
     entries[entry].mean = mean
+    entries[entry].slippery = 0.0 if mean >= _GRIP_MEAN else _NO_WITNESS
     if kind == VALUE:
         std, slippery = describe(likelihood, mean)
         entries[entry].std = max(std, c.NOVELTY_STD)
@@ -156,11 +168,17 @@ def fold(
     _count(cells, row, entries, entry)
     if kind == VALUE:
         cells[row].values += np.float32(strength)
-        if weight * entries[entry].share >= c.WITNESS_TRUST:
-            if entries[entry].slippery >= c.WITNESS_SHARE:
-                _witness(voices, voice, ICE, entries[entry].vehicle, time)
-            elif entries[entry].slippery <= 1.0 - c.WITNESS_SHARE:
-                _witness(voices, voice, GRIP, entries[entry].vehicle, time)
+    if weight * entries[entry].share >= c.WITNESS_TRUST:
+        if entries[entry].slippery >= c.WITNESS_SHARE:
+            _witness(voices, voice, ICE, entries[entry].vehicle, time)
+        elif entries[entry].slippery <= 1.0 - c.WITNESS_SHARE:
+            _witness(voices, voice, GRIP, entries[entry].vehicle, time)
+
+
+@compiled
+def speaks(entries: Records, entry: int) -> bool:
+    """Whether a cell needs voices for an entry: it is a value, or bears witness."""
+    return bool(entries[entry].kind == VALUE or entries[entry].slippery <= 1.0 - c.WITNESS_SHARE)
 
 
 @compiled

@@ -16,7 +16,7 @@ from fleet_service.fusion.cells import NOBODY, NONE, Records, copy_slot
 from fleet_service.fusion.pairs import chain, earlier, pair_of, remember
 from fleet_service.fusion.pools import FREE_ENTRIES, FREE_WINDOWS, VOICES, WITNESSES, State
 from fleet_service.fusion.trust import meet
-from fleet_service.fusion.votes import SCRATCH, fold, recall, respread, voice_of
+from fleet_service.fusion.votes import SCRATCH, fold, recall, respread, speaks, voice_of
 from fleet_service.fusion.weather import Weather
 from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray, compiled
 
@@ -25,7 +25,7 @@ from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray, compil
 def absorb(
     state: State, weather: Weather, slots: IntArray, rows: IntArray, share: Float32Array,
     time: IntArray, number: IntArray, boot: IntArray, place: IntArray, vehicle: IntArray, weight: Float32Array,
-    evidence: ByteArray, most: int,
+    evidence: ByteArray, said: Float32Array, most: int,
 ) -> BoolArray:  # fmt: skip
     """Take observations `rows` (k,) of a batch (n,) into the windows of `slots` (k,) with `share` (k,), and fold them.
 
@@ -53,11 +53,11 @@ def absorb(
         new.weight = weight[row]
         for i in range(evidence.shape[1]):
             new.evidence[i] = evidence[row, i]
-        voice_of(entries, entry, scratch)
+        voice_of(entries, entry, said[row], scratch)
         window = int(cells[slot].window)
         if window == NONE:
             window = _open(state, slot)
-        if new.kind == VALUE and cells[slot].voice == NONE:
+        if cells[slot].voice == NONE and speaks(entries, entry):
             _speak(state, slot)
         _link(windows, entries, window, entry)
         chain(entries, pairs, pair, entry)
@@ -94,7 +94,7 @@ def _open(state: State, slot: int) -> int:
 
 @compiled
 def _speak(state: State, slot: int) -> None:
-    """Voices for a slot that gets its first value."""
+    """Voices for a slot that gets its first value or witness."""
     voice = state.used[VOICES]
     state.used[VOICES] += 1
     state.cells[slot].voice = voice

@@ -36,7 +36,8 @@ def visits(rng: np.random.Generator, rows: int, cells: int, begin_s: float, seco
     evidence = mugrid.encode_log_likelihood(np.where((rng.random(rows) < EXCITED)[:, None], value, bound))
     return Observations(
         time_ns, cell, np.zeros(rows, np.int8), np.full(rows, -1, np.int8), vehicle, vehicle + 1, grid.region_of(cell),
-        np.arange(rows), evidence, np.full((rows, 1), -1), np.zeros((rows, 1), np.float32),
+        np.arange(rows), evidence, np.full((rows, 3), np.nan, np.float32), np.full((rows, 1), -1),
+        np.zeros((rows, 1), np.float32),
     )  # fmt: skip
 
 

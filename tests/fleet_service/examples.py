@@ -45,7 +45,8 @@ def observations(
     vehicle = np.asarray(vehicles, np.int64)
     return Observations(
         time, whole + cell, np.zeros(n, np.int8), np.full(n, second, np.int8), vehicle, vehicle * 7 + 1, whole + REGION,
-        np.arange(n), mugrid.encode_log_likelihood(log_likelihood), np.full((n, 4), -1), np.zeros((n, 4), np.float32),
+        np.arange(n), mugrid.encode_log_likelihood(log_likelihood), np.full((n, 3), np.nan, np.float32),
+        np.full((n, 4), -1), np.zeros((n, 4), np.float32),
     )  # fmt: skip
 
 
@@ -54,7 +55,7 @@ def posterior_evidence(mu: float, lower: float, upper: float, used: float) -> Fl
     names = ("mu", "mu_lower", "mu_upper", "mu_utilised")
     columns = dict(zip(names, (np.array([v]) for v in (mu, lower, upper, used)), strict=True))
     columns["log_likelihood"] = np.zeros((1, mugrid.BINS), np.uint8)
-    return mugrid.decode_log_likelihood(evidence(columns, np.array([False])))[0]
+    return mugrid.decode_log_likelihood(evidence(columns, np.array([False])).taken)[0]
 
 
 def belief(fusion: Fusion, cell: int = CELL, sector: int = 0, now: int | None = None) -> FloatArray:

@@ -78,6 +78,16 @@ def test_what_many_called_dry_takes_four_witnesses_however_sure_the_belief_is() 
     assert under == [False, False, False, True, True, True]
 
 
+def test_bounds_clear_an_alert_when_only_a_dry_road_gives_so_much_grip() -> None:
+    for used, stands in ((0.7, False), (0.5, True)):
+        fusion, alerts, _ = icy([1, 2, 3])
+        folded = fusion.fold(observations([100.0, 101.0], [4, 5], value([0.85, 0.85])))  # the belief turns
+        later = fusion.fold(observations(200.0 + np.arange(8), np.arange(6, 14), at_least(np.full(8, used))))
+        alerts.folded(folded.slots)
+        alerts.folded(later.slots)
+        assert bool(alerts.raised) is stands
+
+
 def test_what_many_called_ice_takes_four_vehicles_to_clear() -> None:
     fusion, under = called(0.2, range(20), 0.85, range(5, 11))
     assert slippery(belief(fusion)) < 0.05

@@ -142,7 +142,7 @@ def test_slopes_that_all_point_upwards_make_no_value_of_many_unexcited_visits() 
     columns = {"log_likelihood": sloping, "mu_utilised": np.full(n, 0.2, np.float32)}
     fusion = Fusion(120.0)
     o = observations(np.arange(n) * 2.0, np.arange(n), value(np.full(n, 0.5)))
-    fusion.fold(dataclasses.replace(o, evidence=evidence(columns, np.full(n, True))))
+    fusion.fold(dataclasses.replace(o, evidence=evidence(columns, np.full(n, True)).taken))
     lower, upper = interval(belief(fusion))
     assert lower < 0.3
     assert upper == pytest.approx(PRIOR_UPPER, abs=0.03)

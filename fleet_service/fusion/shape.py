@@ -1,0 +1,103 @@
+"""What a vehicle that left grip unused takes the road for. Compiled, pure.
+
+Far from the limit the grip is read from how much the tyre's curve has bent, and so from the shape that the sender
+assumes. If the shape is wrong, so is the reading, in the same direction for every vehicle that did the same; and since
+only readings that came out low look like values, what is told errs low. So a likelihood is held against each road with
+the error that a vehicle would make *there*, having used the share s = u/μ of it:
+
+    L'(μ_i) = Σ_j S_ij·L(μ_j),    S_ij ∝ exp(-½·((μ_j - μ_i)/(μ_i·σ(s_i)))²),    rows sum to 1
+    σ(s) = clip(SHAPE_SLOPE·(SHAPE_SHARE - s), 0, SHAPE_MOST)
+
+Near the limit of a road nothing changes; a road of which little was used is hardly contradicted. That is for the belief
+about the road. Whether vehicles agree, and whether one says something new, is judged by what was told: there the error
+is the same on both sides.
+
+Legend
+    u    grip used                                                  (n,)
+    L    likelihood of a visit as it was told, L' as it is taken    (n, 32)
+    σ    relative standard deviation of the reading                 [-]
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_service.fusion import constants as c
+from fleet_service.fusion.belief import SLIPPERY_SHARE
+from schemas import mugrid
+from schemas.numeric import ByteArray, Float32Array, FloatArray, compiled
+
+_USED_STEP: Final = 0.02  # half a bin; of the grip used when a kernel is looked up
+_USED_MOST: Final = mugrid.UPPER
+_LIKELIHOOD: Final = np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT)
+
+
+def shape_kernel(used: float) -> FloatArray:
+    """S of the grip used, (32, 32)."""
+    share = used / mugrid.CENTRES
+    std = mugrid.CENTRES * np.clip(c.SHAPE_SLOPE * (c.SHAPE_SHARE - share), 1e-6, c.SHAPE_MOST)
+    kernel = np.exp(-0.5 * np.square((mugrid.CENTRES[None, :] - mugrid.CENTRES[:, None]) / std[:, None]))
+    return np.asarray(kernel / kernel.sum(axis=1, keepdims=True))
+
+
+_KERNELS: Final[Float32Array] = np.stack(
+    [shape_kernel(k * _USED_STEP) for k in range(int(_USED_MOST / _USED_STEP) + 1)]
+).astype(np.float32)
+
+
+class Told(NamedTuple):
+    """Likelihoods as they are taken (n, 32) in steps, and the values as they were told (n, 3): mean, standard deviation
+    and P(slippery) against the uniform prior; NaN where nothing was taken from them."""
+
+    taken: ByteArray
+    said: Float32Array
+
+
+def unshaped(steps: ByteArray, used: NDArray[Any]) -> Told:
+    """Likelihoods (n, 32) in steps, maximum 0, after visits that used `used` (n,) of the grip, without what rests on
+    the tyre's shape alone. Bounds stay as they are, and so does everything where `used` is NaN."""
+    taken, said = steps.copy(), np.full((len(steps), 3), np.nan, np.float32)
+    _unshape(taken, np.asarray(used, np.float64), said)
+    return Told(taken, said)
+
+
+@compiled
+def _unshape(steps: ByteArray, used: FloatArray, said: Float32Array) -> None:
+    told, taken = np.empty(mugrid.BINS, np.float32), np.empty(mugrid.BINS, np.float32)
+    for n in range(len(steps)):
+        if math.isnan(used[n]) or steps[n, mugrid.BINS - 1] < c.VALUE_DROP_STEPS:
+            continue
+        kernel = _KERNELS[min(max(int(used[n] / _USED_STEP + 0.5), 0), len(_KERNELS) - 1)]
+        for j in range(mugrid.BINS):
+            told[j] = _LIKELIHOOD[steps[n, j]]
+        _say(told, said[n])
+        most = np.float32(0.0)
+        for i in range(mugrid.BINS):
+            here = np.float32(0.0)
+            for j in range(mugrid.BINS):
+                here += kernel[i, j] * told[j]
+            taken[i] = here
+            most = max(most, here)
+        for i in range(mugrid.BINS):
+            below = mugrid.STEPS_PER_NAT * math.log(most / taken[i]) if taken[i] > 0.0 else mugrid.FLOOR_STEPS
+            steps[n, i] = np.uint8(min(below + 0.5, mugrid.FLOOR_STEPS))
+
+
+@compiled
+def _say(told: Float32Array, said: Float32Array) -> None:
+    """Mean, standard deviation with the vehicle's own error, and P(slippery) of a likelihood."""
+    whole, first, second, slippery = 0.0, 0.0, 0.0, 0.0
+    for i in range(mugrid.BINS):
+        whole += told[i]
+        first += told[i] * mugrid.CENTRES[i]
+        slippery += told[i] * SLIPPERY_SHARE[i]
+    mean = first / whole
+    for i in range(mugrid.BINS):
+        second += told[i] * (mugrid.CENTRES[i] - mean) ** 2
+    said[0] = mean
+    said[1] = math.sqrt(second / whole + (c.BIAS_RELATIVE * mean) ** 2 + c.BIAS_ABSOLUTE**2)
+    said[2] = slippery / whole
