@@ -22,6 +22,7 @@ from fleet_service.evaluation.score import (
     joined,
     reliability,
     rmse,
+    safe,
     snapshots,
 )  # fmt: skip
 from schemas.numeric import BoolArray, FloatArray
@@ -109,7 +110,7 @@ def measure(seeds: range, tell: Callable[[str], None]) -> dict[str, float]:
 def _figures(fleet: Fleet, found: Found) -> dict[str, float]:
     ours, out = joined(found.ours), {}
     name = f"fusion.{fleet.name}"
-    out[f"{name}.rmse"], out[f"{name}.coverage90"] = rmse(ours), coverage(ours)
+    out[f"{name}.rmse"], out[f"{name}.coverage90"], out[f"{name}.safe95"] = rmse(ours), coverage(ours), safe(ours)
     out[f"{name}.interval_score"] = float(ours.interval.mean())
     out[f"fusion.false_ice.{fleet.name}"] = _share(found.false_ice)
     out[f"fusion.missed_ice.{fleet.name}"] = _share(found.missed_ice)

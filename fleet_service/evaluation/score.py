@@ -93,6 +93,11 @@ def coverage(s: Scores) -> float:
     return float(s.covered.mean()) if len(s.covered) else float("nan")
 
 
+def safe(s: Scores) -> float:
+    """Share of the truths above the lower end, on which the deceleration that is called safe at 95 % rests."""
+    return float((s.rank >= ALPHA / 2.0).mean()) if len(s.rank) else float("nan")
+
+
 def coverage_by_count(s: Scores) -> dict[int, float]:
     """Coverage per class of vehicle counts."""
     edges = (*COUNTS[1:], np.iinfo(np.int64).max)

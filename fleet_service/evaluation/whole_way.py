@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 from fleet_service.archive.rebuild import observations
 from fleet_service.evaluation.drive import LATENESS_S
-from fleet_service.evaluation.score import Scores, of_beliefs
+from fleet_service.evaluation.score import Scores, of_beliefs, safe
 from fleet_service.fusion import Fusion, Observations
 from fleet_service.map_state import basis_of
 from schemas import grid, wire
@@ -27,6 +27,7 @@ from schemas.numeric import FloatArray, IntArray
 OBSERVATIONS, TRUTH = "observations.parquet", "truth.parquet"
 SEVERAL: Final = 2  # vehicles of a cell that counts: the bar is the map's, and one vehicle is no map
 EXCITED: Final = 0.6
+SAME: Final = 0.02  # of friction within a cell of one surface
 
 Drive = Callable[[Path], None]  # drives and writes both files into a folder
 
@@ -57,7 +58,12 @@ def measure(drive: Drive, folder: Path) -> dict[str, float]:
     belief = fusion.beliefs(slots, int(fusion.live.time[: fusion.size].max()))
     scores = of_beliefs(belief, truth, excited(fusion, visits)[slots])
     measured = np.array(basis_of(belief, fusion.live.values[slots])) == "measured"
-    return _figures(scores, measured) | {"fusion.whole_way.observations": float(len(columns["cell"]))}
+    pure = measured & one_surface(fusion, visits)[slots]
+    return _figures(scores, measured) | {
+        "fusion.whole_way.rmse.one_surface": mean(scores.error[pure] ** 2) ** 0.5,
+        "fusion.whole_way.safe95": safe(scores),
+        "fusion.whole_way.observations": float(len(columns["cell"])),
+    }
 
 
 def _figures(scores: Scores, measured: np.ndarray[Any, Any]) -> dict[str, float]:
@@ -115,6 +121,16 @@ def joined(fusion: Fusion, visits: pa.Table) -> tuple[IntArray, FloatArray]:
     known = np.flatnonzero(count[0] > 0)
     row = (count[1] > 0).astype(np.int64)[known]
     return known, total[row, known] / count[row, known]
+
+
+def one_surface(fusion: Fusion, visits: pa.Table) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Whether all that was truly visited of a slot had one friction, (slots,)."""
+    slot = fusion.slots_of(visits["cell"].to_numpy(), visits["sector"].to_numpy().astype(np.int64))
+    mu, known = visits["mu"].to_numpy(), slot >= 0
+    least, most = np.full(fusion.size, np.inf), np.zeros(fusion.size)
+    np.minimum.at(least, slot[known], mu[known])
+    np.maximum.at(most, slot[known], mu[known])
+    return np.asarray(most - least <= SAME)
 
 
 def excited(fusion: Fusion, visits: pa.Table) -> IntArray:

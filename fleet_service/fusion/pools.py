@@ -16,7 +16,7 @@ from schemas import mugrid
 from schemas.numeric import IntArray
 
 GRIP, ICE = 0, 1  # what a witness says
-WITNESSES: Final = 4  # remembered per slot of each kind: as many as an alert ever needs
+WITNESSES: Final = 5  # remembered per slot of each kind: as many as an alert ever needs
 
 # One observation in one cell. `previous` and `following` link the slot's window in order of time, `before` and `after`
 # the entries of one vehicle in it; `pair` is the place of their pair. `number`, `boot`, `place` order equal times.

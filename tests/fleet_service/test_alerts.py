@@ -72,10 +72,10 @@ def called(mu: float, vehicles: range, then: float, others: range) -> tuple[Fusi
     return fusion, under[len(vehicles) :]
 
 
-def test_what_many_called_dry_takes_four_witnesses_however_sure_the_belief_is() -> None:
+def test_what_many_called_dry_takes_five_witnesses_however_sure_the_belief_is() -> None:
     fusion, under = called(0.85, range(20), 0.2, range(5, 11))
     assert slippery(belief(fusion)) > 0.9
-    assert under == [False, False, False, True, True, True]
+    assert under == [False, False, False, False, True, True]
 
 
 def test_bounds_clear_an_alert_when_only_a_dry_road_gives_so_much_grip() -> None:
@@ -88,10 +88,10 @@ def test_bounds_clear_an_alert_when_only_a_dry_road_gives_so_much_grip() -> None
         assert bool(alerts.raised) is stands
 
 
-def test_what_many_called_ice_takes_four_vehicles_to_clear() -> None:
+def test_what_many_called_ice_takes_five_vehicles_to_clear() -> None:
     fusion, under = called(0.2, range(20), 0.85, range(5, 11))
     assert slippery(belief(fusion)) < 0.05
-    assert under == [True, True, True, False, False, False]
+    assert under == [True, True, True, True, False, False]
 
 
 def test_who_lost_its_trust_is_no_witness_any_more_for_what_it_said_before() -> None:

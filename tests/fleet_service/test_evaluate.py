@@ -12,7 +12,7 @@ import pytest
 from fleet_service.cli import main
 from fleet_service.evaluation import agent, attacks, bars, campaign, changes, exact, fleets, rules, town
 from fleet_service.evaluation.drive import arrivals, novel, rows_of
-from fleet_service.evaluation.score import coverage, of_beliefs
+from fleet_service.evaluation.score import coverage, of_beliefs, safe
 from schemas import mugrid
 
 
@@ -66,6 +66,7 @@ def test_a_single_visit_without_bias_is_calibrated() -> None:
     belief = np.exp(told.log_likelihood - told.log_likelihood.max(axis=1, keepdims=True))
     belief /= belief.sum(axis=1, keepdims=True)
     assert coverage(of_beliefs(belief, mu, who + 1)) == pytest.approx(0.9, abs=0.015)
+    assert safe(of_beliefs(belief, mu, who + 1)) == pytest.approx(0.95, abs=0.015)
 
 
 def test_vehicles_of_one_place_share_an_error_and_more_of_them_do_not_average_it_out() -> None:

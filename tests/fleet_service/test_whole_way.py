@@ -65,3 +65,10 @@ def test_excited_vehicles_are_counted_once_per_cell() -> None:
     rows = visits((0, 1.0, 0.9), (0, 2.0, 0.9), (0, 3.0, 0.9), (1, 4.0, 0.1), (1, 5.0, 0.9))
     counts = whole_way.excited(fusion, rows)
     assert counts[fusion.slots_of(np.array([CELL, CELL + 1]), np.zeros(2, np.int64))].tolist() == [2, 1]
+
+
+def test_a_cell_of_two_surfaces_is_told_apart() -> None:
+    fusion = Fusion(120.0)
+    fusion.fold(observations([1.0, 1.0], [1, 2], value([0.5, 0.5]), cell=[CELL, CELL + 1]))
+    same = whole_way.one_surface(fusion, visits((0, 1.0, 0.9), (0, 2.0, 0.8), (1, 4.0, 0.6), (1, 5.0, 0.61)))
+    assert same[fusion.slots_of(np.array([CELL, CELL + 1]), np.zeros(2, np.int64))].tolist() == [False, True]
