@@ -79,7 +79,7 @@ CASES: Final = {
     ),
     "believable-spikes": Case(
         during("spike", "omega_fl", size=8.0) + during("spike", "ax", size=5.0), Health.OK,
-        "large innovations are trusted less",
+        "not told by all; an acceleration that jumps is refused once, a wheel that does is trusted less",
     ),
     "bias-step": Case(
         (Fault("bias", "ay", BEGINS, size=0.3),), Health.OK, "not told; the offset is a state and is learned in seconds"

@@ -70,6 +70,7 @@ class Scratch(NamedTuple):
     gain: FloatArray
     log_likelihood: FloatArray
     plain: FloatArray
+    moved: FloatArray
     predicted: FloatArray
     sums: FloatArray
     scales: FloatArray
@@ -124,6 +125,7 @@ def _wake_or_sleep(memory: Memory, design: Design, scratch: Scratch, n: int) -> 
                 visit[j] *= 1.0 - design.constants[C.UNLIKE]
             else:
                 weight[j] = visit[j] = design.sides.prior[j]
+                memory.paid[n, j] = 0.0
                 put(memory.mean[n, j], memory.all_mean[n])
                 put_square(memory.covariance[n, j], memory.all_covariance[n])
 
@@ -141,6 +143,7 @@ def _road(memory: Memory, design: Design, scratch: Scratch, n: int, metres: floa
     change_road(weight, prior, chain, hazard, leaving, drift, predicted)
     for j in range(count):
         zeta = min(hazard * prior[j] / predicted[j], 1.0)
+        memory.paid[n, j] *= 1.0 - zeta
         reinject(memory.mean[n, j], memory.covariance[n, j], zeta, memory.all_mean[n], memory.all_covariance[n])
     put(weight, predicted)
 
@@ -160,7 +163,7 @@ def _measure(memory: Memory, design: Design, scratch: Scratch, row: FloatArray, 
     nis = rows = 0.0
     for j in range(count):
         factorize(memory.covariance[n, j], scratch.root[j])
-        loglik, plain, square, used = update_node(
+        loglik, scratch.moved[j], plain, square, used = update_node(
             row, constants, design.curve, design.nominal, design.sides.pair[j], memory.mean[n, j], scratch.root[j],
             scratch.features, inflation, scratch.innovation[j], scratch.theoretical[j], scratch.room,
         )  # fmt: skip
@@ -186,7 +189,8 @@ def _measure(memory: Memory, design: Design, scratch: Scratch, row: FloatArray, 
         loss = scratch.log_likelihood[j] - best
         beyond = min(loss + constants[C.PLAUSIBLE], 0.0)
         loss = max(loss, -constants[C.PLAUSIBLE])
-        scratch.log_likelihood[j] = 0.0 if blind else max(moving * (share * loss + beyond), -constants[C.LARGEST_LOSS])
+        loss = max(moving * (share * loss + beyond), -constants[C.LARGEST_LOSS])
+        scratch.log_likelihood[j] = 0.0 if blind else loss - _owed(memory, n, j, need / (1.0 + need) * scratch.moved[j])
     recall_lost(memory.mean[n], scratch.root, memory.weight[n, :count], constants)
     reweigh(memory.weight[n, :count], scratch.log_likelihood)
     reweigh(memory.visit[n, :count], scratch.log_likelihood)
@@ -200,6 +204,18 @@ def _measure(memory: Memory, design: Design, scratch: Scratch, row: FloatArray, 
                     memory.factor[n, group], memory.actual[n, group], memory.theoretical[n, group],
                     design.inputs, design.outputs,
                 )  # fmt: skip
+
+
+@compiled
+def _owed(memory: Memory, n: int, node: int, price: float) -> float:
+    """Price [nat] of what a node has come to believe of the vehicle; what it takes back is at most what it has paid.
+
+    Tempered evidence has charged it in part only, while its state has moved by all that was measured: on gentle drives
+    a low friction would else live on a stiffness or an offset three spreads from what is known, and hardly pay.
+    """
+    owed = max(price, -memory.paid[n, node])
+    memory.paid[n, node] += owed
+    return float(owed)
 
 
 @compiled

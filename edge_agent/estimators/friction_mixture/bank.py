@@ -212,6 +212,7 @@ def new_scratch() -> Scratch:
         gain=np.zeros(8),
         log_likelihood=np.zeros(count),
         plain=np.zeros(count),
+        moved=np.zeros(count),
         predicted=np.zeros(count),
         sums=np.zeros(4),
         scales=np.zeros(2),

@@ -7,7 +7,8 @@ Legend (index `F` of a feature row)
     FORCE             F_x/F_z of a wheel [1]
     LOAD              wheel load over axle load [1]
     SIDE, SIDE_LEAK   F_y/F_z of an axle in the wheel's frame, and its derivative by the leak [1]
-    NOISE             nominal standard deviation of a residual [1]: four wheels, two axles
+    NOISE             nominal standard deviation of a residual where the curve rises [1]: four wheels, two axles
+    SLIP_NOISE        variance of the slip in it, as linear force over load [1]; half of it is in NOISE
     TELL_X, TELL_Y    what the force of an axle tells of stiffness, from 0 to 1
     UNLIKE            slip left against right of an axle beyond force and noise, in force over load [1]
 
@@ -52,7 +53,8 @@ class F(IntEnum):
     TELL_X = 42
     TELL_Y = 44
     UNLIKE = 46
-    LENGTH = 47
+    SLIP_NOISE = 47
+    LENGTH = 53
 
 
 @compiled
@@ -161,6 +163,7 @@ def _noise(
         bend = constants[C.BEND_SHARE] * features[F.FORCE + wheel] ** 2
         variance = 0.5 * white**2 + constants[C.FLOOR_X] ** 2 + features[F.NOISE + wheel] ** 2 + bend**2
         features[F.NOISE + wheel] = math.sqrt(variance * scales[0])
+        features[F.SLIP_NOISE + wheel] = white**2 * scales[0]
     for axle in range(2):
         side = features[F.SIDE + axle]
         turning = constants[C.GYRO_STD] * (row[P.TO_FRONT] if axle == 0 else row[P.TO_REAR]) / speed
@@ -173,6 +176,7 @@ def _noise(
         before[axle] = side
         variance = 0.5 * angle**2 + constants[C.FLOOR_Y] ** 2 + share**2 + bend**2 + lag**2
         features[F.NOISE + 4 + axle] = math.sqrt(variance * scales[1])
+        features[F.SLIP_NOISE + 4 + axle] = angle**2 * scales[1]
 
 
 @compiled

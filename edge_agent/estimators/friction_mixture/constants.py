@@ -144,7 +144,7 @@ CONSTANTS = (
     ),
     Constant(
         C.AXLE_PRICE,
-        0.5,
+        0.45,
         "1",
         "weight of ln det S of the axles: none favours the flexible node, all of it the saturated one",
     ),
@@ -188,7 +188,7 @@ CONSTANTS = (
         "offset and white noise of the yaw rate in a block: turns an axle's slip, most at low speed (vehicle)",
     ),
     Constant(C.FLOOR_X, 0.006, "1", "radius differences and rolling resistance, in force over load"),
-    Constant(C.FLOOR_Y, 0.006, "1", "offset of a_y, crossfall and toe, in force over load"),
+    Constant(C.FLOOR_Y, 0.008, "1", "offset of a_y, crossfall and toe, in force over load"),
     Constant(C.FORCE_SHARE, 0.04, "1", "torque gain 3 %, mass 3 %, load 3 % (vehicle)"),
     Constant(C.AXLE_SHARE, 0.03, "1", "load transfer between axles and inertia (vehicle)"),
     Constant(C.BEND_SHARE, 0.05, "1", "shape error of the tyre curve at full demand, in force over load"),

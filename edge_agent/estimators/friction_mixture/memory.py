@@ -43,7 +43,10 @@ class H(IntEnum):
     UNLIKE = 23  # 1 while the nodes of unlike sides take part
     LEFT = 24  # median, lower, upper friction under the left wheels
     RIGHT = 27
-    LENGTH = 30
+    INERTIAL_TIME = 30  # of the last sample with both accelerations [s]
+    TOLD_AX = 31  # last reading, used or refused [m/s^2]
+    TOLD_AY = 32
+    LENGTH = 33
 
 
 class G(IntEnum):
@@ -71,6 +74,7 @@ class Memory(NamedTuple):
     covariance: FloatArray  # (N, K, n, n)
     weight: FloatArray  # (N, K)
     visit: FloatArray  # (N, K) probabilities from the reference prior at the start of the visit
+    paid: FloatArray  # (N, K) price of what a node believes of the vehicle, beyond the evidence [nat]
     all_mean: FloatArray  # (N, n) moments of the mixture
     all_covariance: FloatArray  # (N, n, n)
     actual: FloatArray  # (N, 2) windowed innovation variances
@@ -98,6 +102,7 @@ def new_memory(count: int) -> Memory:
         covariance=np.zeros((count, NODES + PAIRS, STATES, STATES)),
         weight=np.zeros((count, NODES + PAIRS)),
         visit=np.zeros((count, NODES + PAIRS)),
+        paid=np.zeros((count, NODES + PAIRS)),
         all_mean=np.zeros((count, STATES)),
         all_covariance=np.zeros((count, STATES, STATES)),
         actual=np.zeros((count, 2)),

@@ -58,6 +58,7 @@ class Room(NamedTuple):
     middle: FloatArray  # (CURVED, 6)
     derivative: FloatArray  # (ACTIVE, 6)
     deviation: FloatArray  # (6, ACTIVE)
+    own: FloatArray  # (6,) variances of noise
     noise: FloatArray  # (6,)
     taken: FloatArray  # (ACTIVE,)
     point: FloatArray  # (n,)
@@ -77,6 +78,7 @@ def new_room() -> Room:
         middle=np.zeros((CURVED, ROWS)),
         derivative=np.zeros((ACTIVE, ROWS)),
         deviation=np.zeros((ROWS, ACTIVE)),
+        own=np.zeros(ROWS),
         noise=np.zeros(ROWS),
         taken=np.zeros(ACTIVE),
         point=np.zeros(STATES),
@@ -125,7 +127,7 @@ def linearize(
             slips(row, constants, mean, room.point, gained_x, gained_y, features, room.slip)
         if state == ACTIVE:
             bends(curve, pair, room.slip, features, room.bent)
-            price = sliding_price(curve, pair, features, room.slip, constants[C.FLAT])
+            price = weigh_slopes(curve, pair, features, room.slip, constants[C.FLAT], room.own)
         forces(
             curve, pair, room.point[X.LEAK_Y], room.point[X.BEND], room.point[X.GAIN], features, room.bent, room.force,
             room.at_force,
@@ -140,14 +142,36 @@ def linearize(
 
 
 @compiled
-def sliding_price(curve: Curve, pair: FloatArray, features: FloatArray, slip: FloatArray, flat: float) -> float:
-    """What wheels on the flat of the curve cost: a sliding wheel may have any slip, so its density is spread thin."""
+def weigh_slopes(
+    curve: Curve, pair: FloatArray, features: FloatArray, slip: FloatArray, flat: float, own: FloatArray
+) -> float:
+    """Fill own (6,) with the variances of the rows' noise at these slips, and return the price of sliding.
+
+    The price is what wheels on the flat of the curve cost: a sliding wheel may have any slip, so its density is spread
+    thin.
+    """
     price = 0.0
-    for wheel in range(4):
-        if not math.isnan(features[F.ROLL + wheel]):
-            slope = steepness(curve, slip[L.ALONG + wheel], slip[L.ACROSS + wheel], pair[wheel % 2])
-            price -= min(math.log(slope / flat), 0.0)
+    for axle in range(2):
+        across = 0.0
+        for wheel in range(2 * axle, 2 * axle + 2):
+            mu, g_x, g_y = pair[wheel % 2], slip[L.ALONG + wheel], slip[L.ACROSS + wheel]
+            along = steepness(curve, g_x, g_y, mu)
+            across += features[F.LOAD + wheel] * steepness(curve, g_y, g_x, mu)
+            own[wheel] = features[F.NOISE + wheel] ** 2 - unfelt(along) * features[F.SLIP_NOISE + wheel]
+            if not math.isnan(features[F.ROLL + wheel]):
+                price -= min(math.log(along / flat), 0.0)
+        own[4 + axle] = features[F.NOISE + 4 + axle] ** 2 - unfelt(across) * features[F.SLIP_NOISE + 4 + axle]
     return price
+
+
+@compiled
+def unfelt(slope: float) -> float:
+    """Share of slip noise that a residual on a curve of this slope does not feel, of the half it feels on slope 1.
+
+    Along the normal of a line of slope k, noise of the slip counts by k^2/(1 + k^2) (errors in variables). Taken for as
+    large on the flat as on the rise, it would favour nodes whose wheels slide: they do not feel it.
+    """
+    return 0.5 - slope * slope / (1.0 + slope * slope)
 
 
 @compiled
@@ -206,19 +230,19 @@ def update_node(
     innovation: FloatArray,
     theoretical: FloatArray,
     room: Room,
-) -> tuple[float, float, float, int]:
+) -> tuple[float, float, float, float, int]:
     """Cubature update of one node with R times `inflation`; mean (n,) and root (n, n) are changed.
 
     Writes innovation (6,) and its theoretical variance without the inflation (6,).
-    Returns the log-likelihood with the inflated R, the one with the plain R (rows taken as independent), the normalised
-    innovation squared with the plain R, and the number of rows.
+    Returns the log-likelihood with the inflated R, the change of `stretch`, the log-likelihood with the plain R (rows
+    taken as independent), the normalised innovation squared with the plain R, and the number of rows.
     """
     price = linearize(row, constants, curve, nominal, pair, mean, features, room)
     spread(row, constants, curve, pair, mean, root, features, room)
     plain = square = 0.0
     for r in range(ROWS):
         innovation[r] = -room.base[r]
-        own = features[F.NOISE + r] ** 2
+        own = room.own[r]
         variance = room.even[r]
         for column in range(ACTIVE):
             variance += room.deviation[r, column] ** 2
@@ -231,9 +255,20 @@ def update_node(
             plain -= 0.5 * (ratio + math.log(2.0 * math.pi * theoretical[r]))
     for r in range(ROWS):
         room.base[r] = innovation[r]
+    before = stretch(mean, nominal)
     loss, used = take_rows(constants, mean, root, room)
     keep_within(mean, constants, nominal)
-    return -loss - constants[C.SLIDING_PRICE] / inflation * price, plain, square, used
+    moved = stretch(mean, nominal) - before
+    return -loss - constants[C.SLIDING_PRICE] / inflation * price, moved, plain, square, used
+
+
+@compiled
+def stretch(mean: FloatArray, nominal: Nominal) -> float:
+    """How far what a node believes of vehicle and sensors is from their prior [nat]; mean (n,)."""
+    total = 0.0
+    for i in range(X.LN_KX, mean.shape[0]):
+        total += 0.5 * ((mean[i] - nominal.mean[i]) / nominal.std[i]) ** 2
+    return total
 
 
 @compiled

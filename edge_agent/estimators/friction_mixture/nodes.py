@@ -59,7 +59,7 @@ def change_road(
 
 @compiled
 def reweigh(w: FloatArray, log_likelihood: FloatArray) -> None:
-    """w *= exp(log_likelihood), normalised; log_likelihood (K,) with maximum 0 or below."""
+    """w *= exp(log_likelihood), normalised; log_likelihood (K,) about 0 or below."""
     total = 0.0
     for j in range(w.shape[0]):
         w[j] = max(w[j] * math.exp(log_likelihood[j]), SMALLEST)
@@ -131,16 +131,33 @@ class Sides(NamedTuple):
     share: FloatArray  # (3, PAIRS, K) of a pair's left side, right side and mean in the cells of the K nodes
 
 
+class Hat(NamedTuple):
+    """What a node stands for: a density that rises from its left neighbour to it and falls to its right neighbour."""
+
+    left: float
+    middle: float
+    right: float
+    width: float  # of its cell, the share of a uniform prior
+
+
+def hats(edges: tuple[float, ...]) -> list[Hat]:
+    """One per cell, about its middle; the outermost end at the outer edges."""
+    middles = [0.5 * (a + b) for a, b in pairwise(edges)]
+    lefts, rights = [edges[0], *middles[:-1]], [*middles[1:], edges[-1]]
+    widths = [b - a for a, b in pairwise(edges)]
+    return [Hat(*row) for row in zip(lefts, middles, rights, widths, strict=True)]
+
+
 def side_table(mu: FloatArray, prior: FloatArray, unlike: float) -> Sides:
     """All nodes, where a share `unlike` of the roads has unlike sides; mu and prior (K,)."""
     edges = np.linspace(math.sqrt(LOWER), math.sqrt(UPPER), len(mu) + 1) ** 2
     pairs, mass, share = [], [], []
-    for low, high in ((a, b) for a in pairwise(LOW) for b in pairwise(HIGH) if sum(b) > APART * sum(a)):
+    for low, high in ((a, b) for a in hats(LOW) for b in hats(HIGH) if b.middle > APART * a.middle):
+        mean = Hat._make(0.5 * (a + b) for a, b in zip(low, high, strict=True))
         for left, right in ((low, high), (high, low)):
-            mean = (0.5 * (left[0] + right[0]), 0.5 * (left[1] + right[1]))
-            pairs.append((0.5 * sum(left), 0.5 * sum(right)))
-            mass.append((low[1] - low[0]) * (high[1] - high[0]))
-            share.append([_overlap(edges, *cell) for cell in (left, right, mean)])
+            pairs.append((left.middle, right.middle))
+            mass.append(low.width * high.width)
+            share.append([_in_cells(edges, hat) for hat in (left, right, mean)])
     return Sides(
         np.vstack([np.column_stack([mu, mu]), pairs]),
         np.concatenate([(1.0 - unlike) * prior, unlike * np.array(mass) / sum(mass)]),
@@ -148,10 +165,14 @@ def side_table(mu: FloatArray, prior: FloatArray, unlike: float) -> Sides:
     )
 
 
-def _overlap(edges: FloatArray, lower: float, upper: float) -> FloatArray:
-    """Share of [lower, upper] in each cell between the edges."""
-    inside = np.minimum(edges[1:], upper) - np.maximum(edges[:-1], lower)
-    return np.asarray(np.maximum(inside, 0.0) / (upper - lower))
+def _in_cells(edges: FloatArray, hat: Hat) -> FloatArray:
+    """Share of a hat in each cell between the edges."""
+    rising = np.clip(edges - hat.left, 0.0, hat.middle - hat.left)
+    falling = np.clip(hat.right - edges, 0.0, hat.right - hat.middle)
+    whole = hat.right - hat.left
+    below = rising**2 / (hat.middle - hat.left) / whole
+    above = falling**2 / (hat.right - hat.middle) / whole
+    return np.diff(np.where(edges < hat.middle, below, 1.0 - above))
 
 
 @compiled

@@ -11,7 +11,7 @@ import math
 from edge_agent.dynamics.body import advance_velocity
 from edge_agent.dynamics.parameters import P
 from edge_agent.estimators import flags
-from edge_agent.estimators.friction_mixture.arrays import clear_rows, put, put_pair, put_square
+from edge_agent.estimators.friction_mixture.arrays import clear, clear_rows, put, put_pair, put_square
 from edge_agent.estimators.friction_mixture.constants import C, X
 from edge_agent.estimators.friction_mixture.memory import INPUTS, G, H, Memory
 from edge_agent.estimators.friction_mixture.node import Nominal
@@ -26,6 +26,8 @@ LARGEST_STEER = 1.3  # [rad]
 LARGEST_OMEGA = 500.0  # [rad/s]
 LARGEST_TORQUE = 50_000.0  # [N m]
 
+JUMP_M_S2 = 3.0  # of an accelerometer from one reading to the next; a real one is believed at the second
+HOLD_S = 0.025  # a shorter silence of an accelerometer is bridged by its last reading
 GAP_S = 0.5  # a longer silence starts the block anew
 POSITION_S = 1.5  # a longer silence of the receiver is told
 EARLY_S = 1e-6  # a block is whole although rounding made its last sample early
@@ -91,7 +93,8 @@ def start(
     for k in range(held.shape[0]):
         held[k] = 0.0
     held[H.TIME] = held[H.BLOCK_TIME] = time
-    held[H.POSITION_TIME] = -math.inf
+    held[H.POSITION_TIME] = held[H.INERTIAL_TIME] = -math.inf
+    held[H.TOLD_AX] = held[H.TOLD_AY] = math.nan
     rate = reading(sample, S.YAW_RATE)
     held[H.YAW_RATE] = held[H.START_YAW_RATE] = 0.0 if math.isnan(rate) else rate
     held[H.YAW_RATE_VAR] = 1.0 if math.isnan(rate) else YAW_STD**2
@@ -130,8 +133,11 @@ def take_sample(
     if dt > GAP_S:
         return health | flags.TIME_GAP | _bridge(memory, constants, prior, row, n, time, sample), False
     _yaw_rate(memory, row, n, dt, sample)
-    _kinematics(memory, n, dt, sample)
-    _add(memory, n, sample)
+    ax, ay = _believed(held, S.AX, H.AX, H.TOLD_AX, sample), _believed(held, S.AY, H.AY, H.TOLD_AY, sample)
+    if math.isnan(ax + ay) and not math.isnan(reading(sample, S.AX) + reading(sample, S.AY)):
+        health |= flags.OUTLIER
+    _kinematics(memory, n, time, dt, ax, ay, not math.isnan(reading(sample, S.YAW_RATE)))
+    _add(memory, n, ax, ay, sample)
     held[H.TIME] = time
     return health, time - held[H.BLOCK_TIME] >= constants[C.BLOCK] - EARLY_S
 
@@ -175,16 +181,32 @@ def _yaw_rate(memory: Memory, row: FloatArray, n: int, dt: float, sample: FloatA
 
 
 @compiled
-def _kinematics(memory: Memory, n: int, dt: float, sample: FloatArray) -> None:
-    """Velocity gained since the block began, in the axes of now: the exact solution for inputs constant over dt."""
+def _believed(held: FloatArray, channel: int, used: int, told: int, sample: FloatArray) -> float:
+    """The accelerometer's reading; NaN where it is far from both the last one that was used and the last one told."""
+    value = reading(sample, channel)
+    jumps = abs(value - held[told]) > JUMP_M_S2 and abs(value - held[used]) > JUMP_M_S2
+    held[told] = value
+    return math.nan if jumps else value
+
+
+@compiled
+def _kinematics(memory: Memory, n: int, time: float, dt: float, ax: float, ay: float, turning: bool) -> None:
+    """Velocity gained since the block began, in the axes of now: the exact solution for inputs constant over dt.
+
+    ax, ay are NaN where they are missing; `turning` is whether the yaw rate is not.
+    """
     held = memory.held[n]
     rate = held[H.YAW_RATE]
-    ax, ay = reading(sample, S.AX), reading(sample, S.AY)
+    if not math.isnan(ax + ay):
+        held[H.INERTIAL_TIME] = time
+    elif time - held[H.INERTIAL_TIME] < HOLD_S:
+        ax = held[H.AX] if math.isnan(ax) else ax
+        ay = held[H.AY] if math.isnan(ay) else ay
     leak_x, leak_y = ax, ay
     if math.isnan(ax):
         ax = leak_x = 0.0
         held[H.MISSING_AX] = LOST_AX**2
-    if math.isnan(ay) or math.isnan(reading(sample, S.YAW_RATE)):
+    if math.isnan(ay) or not turning:
         held[H.MISSING_AY] = LOST_AY**2
     if math.isnan(ay):
         ay, leak_y = rate * memory.all_mean[n, X.VX], 0.0
@@ -204,14 +226,15 @@ def _kinematics(memory: Memory, n: int, dt: float, sample: FloatArray) -> None:
 
 
 @compiled
-def _add(memory: Memory, n: int, sample: FloatArray) -> None:
+def _add(memory: Memory, n: int, ax: float, ay: float, sample: FloatArray) -> None:
     for channel in range(INPUTS):
-        value = reading(sample, channel)
+        value = ax if channel == S.AX else ay if channel == S.AY else reading(sample, channel)
         if not math.isnan(value):
             memory.sums[n, channel] += value
             memory.counts[n, channel] += 1
     for wheel in range(4):
-        memory.last_omega[n, wheel] = reading(sample, S.OMEGA + wheel)
+        omega = reading(sample, S.OMEGA + wheel)
+        memory.last_omega[n, wheel] = memory.last_omega[n, wheel] if math.isnan(omega) else omega
         if memory.counts[n, S.DELTA + wheel] > 0:
             memory.last_delta[n, wheel] = memory.sums[n, S.DELTA + wheel] / memory.counts[n, S.DELTA + wheel]
             if wheel >= 2:
@@ -227,6 +250,7 @@ def forget_vehicle(memory: Memory, nominal: Nominal, n: int) -> None:
         for j in range(i + 1):
             covariance[i, j] = covariance[j, i] = 0.0
         covariance[i, i] = nominal.std[i] ** 2
+    clear(memory.paid[n])
 
 
 @compiled

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from edge_agent.adaptation.memberships import Memberships
+from edge_agent.banks import bank_of
 from edge_agent.estimators import Estimates, create
 from schemas.errors import InputError
 from schemas.mugrid import CENTRES
@@ -241,6 +242,15 @@ def test_on_a_road_of_one_friction_the_wheels_have_it() -> None:
     said = run("fckf", t, signals, vehicle)
     assert said.mu_wheel is not None
     assert np.abs(said.mu_wheel[..., 0] - said.mu[..., None]).mean() < 0.02
+
+
+@pytest.mark.parametrize("name", ["gaining-lane-changes", "gaining-slalom"])
+def test_gaining_speed_gently_tells_no_ice(name: str) -> None:
+    """Four wheels that slide a little would explain the slip as well, with a stiffness or an offset to match."""
+    for seed in range(3):
+        t, signals, vehicle = drive(name, 0.9, seed)
+        said = bank_of("aco-fckf", [vehicle]).advance(t[:, None], signals[:, None])
+        assert said.mu_upper.min() > 0.85
 
 
 def test_creeping_after_a_hard_stop_tells_no_ice() -> None:

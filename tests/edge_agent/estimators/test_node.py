@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from edge_agent.dynamics.tyres import magic_formula
 from edge_agent.estimators.friction_mixture.constants import ACTIVE, NODES, STATES, C, constant_row
 from edge_agent.estimators.friction_mixture.curve import curve_tables, ratio_at, theta_at
-from edge_agent.estimators.friction_mixture.node import factorize, new_room, take_rows
+from edge_agent.estimators.friction_mixture.node import factorize, new_room, take_rows, unfelt
 from edge_agent.estimators.friction_mixture.nodes import node_table, projected, side_table
 from edge_agent.estimators.friction_mixture.residuals import ROWS
 
@@ -64,6 +66,26 @@ def test_the_tables_are_the_magic_formula_and_its_inverse() -> None:
 def test_far_beyond_the_table_a_spinning_wheel_still_has_the_force_of_sliding() -> None:
     curve = curve_tables(1.45, -0.1)
     assert ratio_at(curve, 1e4) * 1e4 == pytest.approx(magic_formula(1e4, 1.45, -0.1), abs=2e-3)
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.3, 1.0])
+def test_noise_of_slip_and_force_about_a_line_is_what_a_residual_is_said_to_have(slope: float) -> None:
+    rng = np.random.default_rng(0)
+    slip, force = rng.normal(0.0, 0.03, 100_000), rng.normal(0.0, 0.01, 100_000)
+    distance = (force - slope * slip) / np.hypot(1.0, slope)
+    felt = (0.5 - unfelt(slope)) * 0.03**2 + 0.01**2 / (1.0 + slope**2)
+    assert distance.var() == pytest.approx(felt, rel=0.02)
+
+
+def test_the_hats_of_unlike_sides_overlap_so_a_friction_between_two_of_them_is_held_by_both() -> None:
+    mu, prior = node_table(NODES)
+    sides = side_table(mu, prior, 0.05)
+    for side in range(2):
+        middles = np.unique(sides.pair[NODES:, side])
+        for one, next_one in pairwise(middles):
+            between = np.searchsorted(mu, 0.5 * (one + next_one))
+            held = [sides.share[side][sides.pair[NODES:, side] == place][0][between] for place in (one, next_one)]
+            assert min(held) > 0.0
 
 
 def test_unlike_sides_come_either_way_round_and_their_cells_share_out_all_they_have() -> None:
