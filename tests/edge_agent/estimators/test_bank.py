@@ -253,6 +253,26 @@ def test_gaining_speed_gently_tells_no_ice(name: str) -> None:
         assert said.mu_upper.min() > 0.85
 
 
+@pytest.mark.parametrize("size", [60.0, 5.0])
+def test_a_single_false_acceleration_is_told_refused_and_bridged(size: float) -> None:
+    t, signals, vehicle = drive("slalom", 0.3)
+    broken = signals.copy()
+    broken[200::10, [S.AX, S.AY]] += size
+    plain, said = run("fckf", t, signals, vehicle), run("fckf", t, broken, vehicle)
+    assert (said.health[200::10] & Health.OUTLIER).all()
+    assert not (said.health[201::10] & Health.OUTLIER).any()
+    assert np.abs(said.vy - plain.vy).max() < 0.05
+    assert (said.vy_std < 1.5 * plain.vy_std).all()
+
+
+def test_an_acceleration_that_jumps_and_stays_is_believed_at_the_second_reading() -> None:
+    t, signals, vehicle = drive("straight", None)
+    signals = signals.copy()
+    signals[300:, S.AX] += 5.0
+    refused = np.flatnonzero(run("fckf", t, signals, vehicle).health[:, 0] & Health.OUTLIER)
+    assert refused.tolist() == [300]
+
+
 def test_creeping_after_a_hard_stop_tells_no_ice() -> None:
     t, signals, vehicle = drive("braking", 0.85)
     said = run("fckf", t, signals, vehicle)
