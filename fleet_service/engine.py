@@ -1,6 +1,7 @@
 """The service without its network: messages in; alerts, tiles, acknowledgements and answers out.
 
-One worker calls `take`, `flush`, `tiles` and `fading`; queries come from other threads, so that a lock guards the map.
+One worker calls `take`, `begin_flush`, `written`, `flush`, `tiles` and `fading`; queries come from other threads, so
+that a lock guards the map.
 """
 
 from __future__ import annotations
@@ -121,6 +122,7 @@ class Engine:
 
     def close(self) -> None:
         """Give the archive free."""
+        self._log.close()
         self._lock_file.close()
 
     @property
@@ -194,19 +196,37 @@ class Engine:
 
         A full disk is counted and tried again at the next call; nothing of it is acknowledged.
         """
+        told = self._settled(self._log.flush)
+        if not self.failing and self._checkpoint_wanted.is_set():
+            self._checkpoint_wanted.clear()
+            with self._guard:
+                alerts = pa.Table.from_pylist([asdict(alert) for alert in self._alerts.standing])
+                self._checkpoints.put((tables_of(self.fusion) | {ALERTS: alerts}, self._heard))
+        return told
+
+    def begin_flush(self) -> list[tuple[str, bytes]]:
+        """As `flush`, but messages may be taken while segments are written; `written` gives what is acknowledged.
+
+        If a checkpoint is wanted, all of which must be on disk, it is `flush`.
+        """
+        if self._checkpoint_wanted.is_set():
+            return self.flush()
+        self._log.begin()
+        return []
+
+    def written(self) -> list[tuple[str, bytes]]:
+        """The acknowledgements to put after a flush that was begun, once it has ended."""
+        return self._settled(self._log.end) if self._log.ended else []
+
+    def _settled(self, durable: Callable[[], list[Candidate]]) -> list[tuple[str, bytes]]:
         try:
-            self._intake.settled(self._log.flush())
+            self._intake.settled(durable())
         except OSError:
             self.counts["segment_failures"] += 1
             self.failing = True
         else:
             self.failing = False
             self._tiles.settle()
-            if self._checkpoint_wanted.is_set():
-                self._checkpoint_wanted.clear()
-                with self._guard:
-                    alerts = pa.Table.from_pylist([asdict(alert) for alert in self._alerts.standing])
-                    self._checkpoints.put((tables_of(self.fusion) | {ALERTS: alerts}, self._heard))
         return self._acks.messages()
 
     def tiles(self, now: int) -> list[tuple[int, bytes]]:

@@ -1,7 +1,7 @@
 """The running service: Zenoh on one side, the engine on the other, one worker between them.
 
 subscribers ─► inbox ─► worker: take ─► alerts at once
-                                flush ─► segment on disk ─► acknowledgements
+                                flush ─► thread: segment on disk ─► acknowledgements
                                 tiles once a second
 queryables  ─► answers, in Zenoh's threads
 """
@@ -145,9 +145,10 @@ class Service:
         else:
             self._take(session, self.inbox.drain(IDLE_S, MESSAGES_PER_TURN))
         now = self._turned_at = time.monotonic()
+        self._acknowledge(session, self.engine.written())
         if now - self._flushed_at >= self._config.segment_s:
             self._flushed_at = now
-            self._settle(session)
+            self._acknowledge(session, self.engine.begin_flush())
             self.engine.overcast(self._clock.now())
         if now - self._put_at >= self._config.put_s:
             self._put_at = now
@@ -164,7 +165,7 @@ class Service:
             if not messages:
                 break
             self._take(session, messages)
-        self._settle(session)
+        self._acknowledge(session, self.engine.flush())
         self._put_tiles(session)
         self._status(time.monotonic())
 
@@ -172,8 +173,8 @@ class Service:
         if messages:
             self._put_alerts(session, self.engine.take(messages, self._clock.now(), self._clock.slack()))
 
-    def _settle(self, session: zenoh.Session) -> None:
-        for vehicle, ack in self.engine.flush():
+    def _acknowledge(self, session: zenoh.Session, acks: list[tuple[str, bytes]]) -> None:
+        for vehicle, ack in acks:
             put(session, keys.ack_key(vehicle), ack, wire.ACK_ENCODING)
 
     def _put_tiles(self, session: zenoh.Session) -> None:

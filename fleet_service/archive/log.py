@@ -1,8 +1,12 @@
-"""Rows that wait for the disk, and the order that the promise rests on: rows, fsynced segment, then settled."""
+"""Rows that wait for the disk, and the order that the promise rests on: rows, fsynced segment, then settled.
+
+Segments are written in a thread of their own, so that messages are taken meanwhile; only what `end` gives is settled.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -14,8 +18,35 @@ from schemas.wire import Kind
 Batch = TypeVar("Batch")
 
 
+class _Load(Generic[Batch]):
+    """Rows that are written together, by kind, and the batches that they are of."""
+
+    def __init__(self) -> None:
+        self.waiting: dict[Kind, list[Rows]] = {kind: [] for kind in Kind}
+        self.batches: list[Batch] = []
+
+    @property
+    def rows(self) -> int:
+        """How many are not written yet."""
+        return sum(len(part["row"]) for waiting in list(self.waiting.values()) for part in waiting)
+
+    def take(self, other: _Load[Batch]) -> None:
+        """Take over what another holds."""
+        for kind, waiting in other.waiting.items():
+            self.waiting[kind] = self.waiting[kind] + waiting
+        self.batches += other.batches
+
+    def write(self, writer: Writer) -> None:
+        """Write each kind that is not written yet, then make all of it durable."""
+        for kind, waiting in self.waiting.items():
+            if waiting:
+                writer.write(kind, {name: np.concatenate([part[name] for part in waiting]) for name in waiting[0]})
+                self.waiting[kind] = []
+        writer.sync()
+
+
 class Log(Generic[Batch]):
-    """The log of one run of one service.
+    """The log of one run of one service, for one thread; the disk's work is done in another.
 
     Args:
         root: of the archive.
@@ -24,33 +55,62 @@ class Log(Generic[Batch]):
 
     def __init__(self, root: Path, shard: str) -> None:
         self._writer = Writer(root, shard)
-        self._waiting: dict[Kind, list[Rows]] = {kind: [] for kind in Kind}
-        self._unsettled: list[Batch] = []
-        self.rows = 0  # that wait
+        self._next: _Load[Batch] = _Load()
+        self._load: _Load[Batch] = _Load()  # what was handed over
+        self._written: Future[None] | None = None
+        self._thread = ThreadPoolExecutor(1, "segments")
+
+    @property
+    def rows(self) -> int:
+        """Rows that wait."""
+        return self._next.rows + self._load.rows
 
     @property
     def unsettled(self) -> int:
         """Batches that wait."""
-        return len(self._unsettled)
+        return len(self._next.batches) + len(self._load.batches)
+
+    @property
+    def ended(self) -> bool:
+        """Whether a write was begun and has ended, one way or the other."""
+        return self._written is not None and self._written.done()
 
     def add(self, kind: Kind, rows: Rows, batches: Sequence[Batch]) -> None:
-        """Let rows wait for the next `flush`, and the batches that they are of."""
-        self._waiting[kind].append(rows)
-        self._unsettled += batches
-        self.rows += len(rows["row"])
+        """Let rows wait for the next write, and the batches that they are of."""
+        self._next.waiting[kind].append(rows)
+        self._next.batches += batches
 
-    def flush(self) -> list[Batch]:
-        """Write what waits; returns the batches that are durable by it, each once.
+    def begin(self) -> None:
+        """Hand over what waits, and what failed before; nothing happens while a write has not been ended."""
+        if self._written is None:
+            self._load.take(self._next)
+            self._next = _Load()
+            self._written = self._thread.submit(self._load.write, self._writer)
+
+    def end(self) -> list[Batch]:
+        """Wait for the write that was begun; returns the batches that are durable by it, each once.
 
         Raises:
-            OSError: the disk is full or broken; what is not durable waits for the next call.
+            OSError: the disk is full or broken; what is not durable waits for the next write.
         """
-        for kind, waiting in self._waiting.items():
-            if waiting:
-                rows = {name: np.concatenate([part[name] for part in waiting]) for name in waiting[0]}
-                self._writer.write(kind, rows)
-                self.rows -= len(rows["row"])
-                waiting.clear()
-        self._writer.sync()
-        durable, self._unsettled = self._unsettled, []
+        if self._written is None:
+            return []
+        written, self._written = self._written, None
+        written.result()
+        durable, self._load = self._load.batches, _Load()
         return durable
+
+    def flush(self) -> list[Batch]:
+        """Write all that waits; returns the batches that are durable by it, each once.
+
+        Raises:
+            OSError: as `end`.
+        """
+        durable = self.end()
+        self._next.batches[:0] = durable  # they are told with the rest, which may fail
+        self.begin()
+        return self.end()
+
+    def close(self) -> None:
+        """Let the thread go when it has written."""
+        self._thread.shutdown()

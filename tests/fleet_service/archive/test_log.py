@@ -1,0 +1,70 @@
+"""What waits for the disk: nothing is settled before it is durable, and what fails is not lost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fleet_service.archive import segments
+from fleet_service.archive.log import Log
+from schemas.wire import Kind
+from tests.fleet_service.archive.rows import identities, rows_of
+from tests.waiting import until
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Iterator[Log[str]]:
+    made: Log[str] = Log(tmp_path, "shard-0")
+    yield made
+    made.close()
+
+
+def add(log: Log[str], name: str, seed: int, kind: Kind = Kind.OBSERVATION) -> None:
+    """Three rows of a batch."""
+    log.add(kind, rows_of(kind, 3, seed), [name])
+
+
+def test_what_is_added_while_a_segment_is_written_waits_for_the_next(log: Log[str], tmp_path: Path) -> None:
+    add(log, "first", 1)
+    log.begin()
+    add(log, "second", 2)
+    log.begin()  # does nothing: the first was not ended
+    assert log.unsettled == 2
+    assert log.end() == ["first"]
+    assert (log.rows, log.unsettled) == (3, 1)
+    assert {boot for boot, _ in identities(tmp_path, Kind.OBSERVATION)} == {1}
+    log.begin()
+    until(lambda: log.ended)
+    assert log.end() == ["second"]
+    assert (log.rows, log.unsettled, log.end()) == (0, 0, [])
+    assert len(identities(tmp_path, Kind.OBSERVATION)) == 6
+
+
+def test_a_flush_settles_what_was_begun_and_what_came_since(log: Log[str]) -> None:
+    add(log, "first", 1)
+    log.begin()
+    add(log, "second", 2)
+    assert log.flush() == ["first", "second"]
+    assert log.flush() == []
+
+
+def test_what_cannot_be_written_is_not_settled_and_comes_with_the_next_each_row_once(
+    log: Log[str], tmp_path: Path
+) -> None:
+    inbox, away = (segments.folder(tmp_path, Kind.STATE), tmp_path / "away")
+    add(log, "seen", 1)
+    add(log, "state", 2, Kind.STATE)
+    inbox.rename(away)
+    log.begin()
+    with pytest.raises(OSError, match="states"):
+        log.end()
+    assert (log.rows, log.unsettled) == (3, 2)  # the observations are written, but settled with the rest
+    add(log, "later", 3)
+    with pytest.raises(OSError, match="states"):
+        log.flush()
+    away.rename(inbox)
+    assert sorted(log.flush()) == ["later", "seen", "state"]
+    assert len(identities(tmp_path, Kind.OBSERVATION)) == 6
+    assert len(identities(tmp_path, Kind.STATE)) == 3
