@@ -45,8 +45,8 @@ def answer(
                 payload = _shown(tiles.shown(tile, now), query, tile)
             else:
                 with tiles.guard:
-                    table = _selected(tiles.state, tile, query, route, now)
-                payload = _rendered(table.filter(pa.array(_asked(filtered(table), query))), query, tile)
+                    cells = _selected(tiles.state, tile, query, route, now)
+                payload = _rendered(cells, _asked(filtered(cells), query), query, tile)
             if payload is not None:
                 yield tile, payload
 
@@ -77,16 +77,17 @@ def _shown(shown: Shown, query: MapQuery, tile: int) -> bytes | None:
     keep = _asked(shown.columns, query)
     if query.format is Format.ARROW and keep.all():
         return shown.payload if len(keep) else None
-    return _rendered(shown.table.filter(pa.array(keep)), query, tile)
+    return _rendered(shown.cells, keep, query, tile)
 
 
-def _rendered(table: pa.Table, query: MapQuery, tile: int) -> bytes | None:
-    return render(table, query.format, grid.quadkey(tile, grid.TILE_ZOOM)) if table.num_rows else None
+def _rendered(cells: pa.RecordBatch, keep: BoolArray, query: MapQuery, tile: int) -> bytes | None:
+    found = cells.filter(pa.array(keep))
+    return render(found, query.format, grid.quadkey(tile, grid.TILE_ZOOM)) if found.num_rows else None
 
 
 def _selected(
     state: MapState, tile: int, query: MapQuery, route: tuple[IntArray, IntArray] | None, now: int
-) -> pa.Table:
+) -> pa.RecordBatch:
     """The cells of one tile that may be asked for; along a route in its order."""
     if route is None:
         slots = state.slots(tile)
@@ -97,7 +98,7 @@ def _selected(
     table = cell_table(state.fusion, slots, now)
     if query.basis == "borrowed":
         table = pa.concat_tables([table, borrowed(state.fusion, tile, state.slots(tile), route, now)])
-    return table
+    return pa.RecordBatch.from_arrays([column.combine_chunks() for column in table.columns], schema=table.schema)
 
 
 def _asked(columns: Mapping[str, NDArray[Any]], query: MapQuery) -> BoolArray:
@@ -135,18 +136,18 @@ def along(query: MapQuery) -> tuple[IntArray, IntArray]:
     return cell[order], sector[order]
 
 
-def render(table: pa.Table, form: Format, tile: str) -> bytes:
+def render(cells: pa.RecordBatch, form: Format, tile: str) -> bytes:
     """A tile in one of the three forms."""
     if form is Format.ARROW:
-        return arrow_stream(table)
-    cells = _plain(table)
+        return arrow_stream(cells)
+    rows = _plain(cells)
     if form is Format.JSON:
-        return json.dumps({"tile": tile, "cells": cells}, allow_nan=False).encode()
-    features = [{"type": "Feature", "geometry": _polygon(cell), "properties": cell} for cell in cells]
+        return json.dumps({"tile": tile, "cells": rows}, allow_nan=False).encode()
+    features = [{"type": "Feature", "geometry": _polygon(cell), "properties": cell} for cell in rows]
     return json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False).encode()
 
 
-def _plain(table: pa.Table) -> list[dict[str, Any]]:
+def _plain(table: pa.RecordBatch) -> list[dict[str, Any]]:
     """Rows with times as ISO 8601 text; single-precision numbers without the digits they do not have."""
     columns: dict[str, list[Any]] = {}
     for f in table.schema:

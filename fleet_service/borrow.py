@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_service.fusion import Fusion
-from fleet_service.map_state import Cells, map_table
+from fleet_service.map_state import Cells, map_batch
 from schemas import grid, mugrid, tables
 from schemas.numeric import IntArray
 
@@ -47,4 +47,4 @@ def borrowed(fusion: Fusion, tile: int, slots: IntArray, route: tuple[IntArray, 
         wanted // grid.SECTORS, wanted % grid.SECTORS, belief, ["borrowed"] * len(wanted), vehicles,
         np.zeros(len(wanted), np.int64), first, last, now,
     )  # fmt: skip
-    return map_table(cells)
+    return pa.Table.from_batches([map_batch(cells)])

@@ -12,6 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext, suppress
+from copy import deepcopy
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
@@ -83,7 +84,7 @@ class Engine:
         self.weather = WeatherDesk(root, config.name, self.fusion, self.counts)
         self._heard = since or 0  # when the last report of any kind came [ns]
         self._checkpoint_wanted = threading.Event()
-        self._checkpoints: queue.SimpleQueue[tuple[dict[str, pa.Table], int]] = queue.SimpleQueue()
+        self._checkpoints: queue.SimpleQueue[tuple[Fusion, pa.Table, int]] = queue.SimpleQueue()
         used = archived(root)  # before the observations, which it acts on
         self.fusion.weather(used if since is None else archived(root, received_after=since))
         restored = np.arange(self.fusion.size)
@@ -112,12 +113,14 @@ class Engine:
     def checkpoint(self, stop: threading.Event) -> tuple[dict[str, pa.Table], int] | None:
         """What the fusion knows, and until when everything received is in it [ns]; None if stopped meanwhile.
 
-        The worker takes it, right after a segment: then every row that is in it is on disk. Called by another thread.
+        The worker copies it, right after a segment: then every row that is in it is on disk. Called by another thread,
+        which makes tables of the copy.
         """
         self._checkpoint_wanted.set()
         while not stop.is_set():
             with suppress(queue.Empty):
-                return self._checkpoints.get(timeout=CHECKPOINT_WAIT_S)
+                fusion, alerts, heard = self._checkpoints.get(timeout=CHECKPOINT_WAIT_S)
+                return tables_of(fusion) | {ALERTS: alerts}, heard
         return None
 
     def close(self) -> None:
@@ -201,7 +204,7 @@ class Engine:
             self._checkpoint_wanted.clear()
             with self._guard:
                 alerts = pa.Table.from_pylist([asdict(alert) for alert in self._alerts.standing])
-                self._checkpoints.put((tables_of(self.fusion) | {ALERTS: alerts}, self._heard))
+                self._checkpoints.put((deepcopy(self.fusion), alerts, self._heard))
         return told
 
     def begin_flush(self) -> list[tuple[str, bytes]]:
@@ -232,7 +235,7 @@ class Engine:
     def tiles(self, now: int) -> list[tuple[int, bytes]]:
         """Tile and Arrow stream of every tile that changed since the last call, as far as it is public."""
         made = ((tile, self._tiles.make(tile, now)) for tile in self.map.take_dirty())
-        return [(tile, shown.payload) for tile, shown in made if shown.table.num_rows]
+        return [(tile, shown.payload) for tile, shown in made if shown.cells.num_rows]
 
     def whole_map(self, now: int) -> pa.Table:
         """All public cells; the lock is held for a few at a time, so that ingest goes on."""

@@ -28,6 +28,10 @@ from schemas.numeric import BoolArray, IntArray
 from schemas.wire import Kind
 
 FIRST_TIME: Final = {Kind.OBSERVATION: "enter_time", Kind.STATE: "time"}  # by which a batch is too old
+# Of a turn of the worker, so that a flood does not delay alerts, answers and segments by more than a moment. Most of
+# the work is by the record, of which 160 bytes are one.
+TURN_MESSAGES: Final = 4096
+TURN_BYTES: Final = 768 * 1024
 DAY_NS: Final = 86_400 * 10**9
 FORGET_NS: Final = 600 * 10**9  # between two looks for streams too old to matter
 
@@ -71,13 +75,15 @@ class Inbox:
         except queue.Full:
             self._counts["overload"] += 1
 
-    def drain(self, wait_s: float, most: int) -> list[Message]:
-        """What is there, at most `most`; waits up to `wait_s` for the first."""
+    def drain(self, wait_s: float) -> list[Message]:
+        """What is there, as much as a turn takes; waits up to `wait_s` for the first."""
         out: list[Message] = []
+        size = 0
         try:
             out.append(self._queue.get(timeout=wait_s) if wait_s > 0 else self._queue.get_nowait())
-            while len(out) < most:
+            while len(out) < TURN_MESSAGES and size < TURN_BYTES:
                 out.append(self._queue.get_nowait())
+                size += len(out[-1].payload)
         except queue.Empty:
             pass
         return out

@@ -128,11 +128,11 @@ def cells_at(fusion: Fusion, slots: IntArray, now: int) -> Cells:
 
 def cell_table(fusion: Fusion, slots: IntArray, now: int) -> pa.Table:
     """The cells of `slots` as they are believed at `now` [ns], in the schema of the map."""
-    return map_table(cells_at(fusion, slots, now))
+    return pa.Table.from_batches([map_batch(cells_at(fusion, slots, now))])
 
 
-def map_table(cells: Cells) -> pa.Table:
-    """Cells as a table of the map."""
+def map_batch(cells: Cells) -> pa.RecordBatch:
+    """Cells in the schema of the map."""
     latitude, longitude = grid.centre(cells.cell)
     west, south, east, north = grid.bounds(cells.cell)
     lower, middle, upper = (mugrid.quantiles(cells.belief, q) for q in (LOWER, 0.5, UPPER))
@@ -145,12 +145,13 @@ def map_table(cells: Cells) -> pa.Table:
         "safe_deceleration": GRAVITY * lower,
     }  # fmt: skip
     arrays = [pa.array(columns[f.name]).cast(f.type, safe=False) for f in tables.MAP_SCHEMA]
-    return pa.Table.from_arrays(arrays, schema=tables.MAP_SCHEMA)
+    return pa.RecordBatch.from_arrays(arrays, schema=tables.MAP_SCHEMA)
 
 
-def arrow_stream(table: pa.Table) -> bytes:
-    """A table as an Arrow stream."""
-    sink = pa.BufferOutputStream()
-    with pa.ipc.new_stream(sink, table.schema) as writer:
-        writer.write_table(table)
-    return bytes(sink.getvalue())
+def arrow_stream(cells: pa.RecordBatch) -> bytes:
+    """Cells as an Arrow stream, of one batch."""
+    return b"".join([_SCHEMA, cells.serialize(), _END])
+
+
+_SCHEMA: Final = tables.MAP_SCHEMA.serialize().to_pybytes()
+_END: Final = b"\xff\xff\xff\xff\x00\x00\x00\x00"  # a message without a head: the stream's end

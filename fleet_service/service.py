@@ -33,7 +33,6 @@ from schemas.operator import Line
 from schemas.query import MapQuery
 from schemas.wire import Alert, Kind
 
-MESSAGES_PER_TURN: Final = 512  # so that a flood does not delay alerts, answers and segments by more than a moment
 IDLE_S: Final = 0.05  # longest wait for a message; bounds how late a segment or a tile can be
 STATUS_S: Final = 5.0
 LEAVE_S: Final = 1.5  # of the three seconds in which a service is gone
@@ -143,7 +142,7 @@ class Service:
         if self.engine.full:
             stop.wait(IDLE_S)
         else:
-            self._take(session, self.inbox.drain(IDLE_S, MESSAGES_PER_TURN))
+            self._take(session, self.inbox.drain(IDLE_S))
         now = self._turned_at = time.monotonic()
         self._acknowledge(session, self.engine.written())
         if now - self._flushed_at >= self._config.segment_s:
@@ -161,7 +160,7 @@ class Service:
         """Take what is waiting, as far as LEAVE_S allows, and settle it; the rest its senders keep."""
         deadline = time.monotonic() + LEAVE_S
         while not self.engine.full and time.monotonic() < deadline:
-            messages = self.inbox.drain(0.0, MESSAGES_PER_TURN)
+            messages = self.inbox.drain(0.0)
             if not messages:
                 break
             self._take(session, messages)

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from fleet_service.map_state import MapState, arrow_stream, cells_at, map_table
+from fleet_service.map_state import MapState, arrow_stream, cells_at, map_batch
 from schemas.numeric import IntArray
 
 SHOWN_NS: Final = 1_000_000_000  # as old as a tile that is put once a second may be
@@ -26,14 +26,14 @@ class Shown(NamedTuple):
 
     Attributes:
         payload: as an Arrow stream.
-        table: the same; shares the payload's memory.
+        cells: the same; shares the payload's memory.
         columns: FILTERED as arrays (k,).
         made: when [ns].
         change: the last change of the map that is in it.
     """
 
     payload: bytes
-    table: pa.Table
+    cells: pa.RecordBatch
     columns: Mapping[str, NDArray[Any]]
     made: int
     change: int
@@ -71,9 +71,9 @@ class Tiles:
         with self.guard:
             change = self.state.change
             cells = cells_at(self.state.fusion, self._public(self.state.slots(tile)), now)
-        payload = arrow_stream(map_table(cells))
-        table = pa.ipc.open_stream(payload).read_all()
-        made = Shown(payload, table, filtered(table), now, change)
+        payload = arrow_stream(map_batch(cells))
+        batch = pa.ipc.open_stream(payload).read_next_batch()
+        made = Shown(payload, batch, filtered(batch), now, change)
         self._keep(tile, made)
         return made
 
@@ -93,6 +93,6 @@ class Tiles:
         self._held -= len(kept.payload) if kept else 0
 
 
-def filtered(table: pa.Table) -> dict[str, NDArray[Any]]:
+def filtered(cells: pa.RecordBatch) -> dict[str, NDArray[Any]]:
     """The columns by which a question chooses cells."""
-    return {name: table[name].to_numpy() for name in FILTERED}
+    return {name: cells[name].to_numpy() for name in FILTERED}

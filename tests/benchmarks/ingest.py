@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.engine import Engine
-from fleet_service.ingest import Message
+from fleet_service.ingest import TURN_BYTES, TURN_MESSAGES, Message
 from schemas import grid, keys, mugrid, wire
 from schemas.config import ServiceConfig
 from schemas.decoding import decode_many
@@ -33,7 +33,6 @@ from tests.faults.load import visits
 
 VEHICLES: Final = 1000
 CELLS_ACROSS: Final = 200
-TURN: Final = 512  # messages that the service takes at once
 FLUSH: Final = 20_000  # messages between two segments
 COUNTS: Final = {10: 16_384, 1: 65_536}  # messages of a round, by records in each
 MESSAGE: Final = wire.MESSAGES[Kind.OBSERVATION]
@@ -70,10 +69,15 @@ def rates(records: int) -> tuple[tuple[float, float], float, float]:
 
 
 def _decoding_s(sent: list[Message], decode: Callable[[list[Message]], object]) -> float:
-    began = time.process_time()
-    for at in range(0, len(sent), TURN):
-        decode(sent[at : at + TURN])
+    turn, began = turn_of(sent), time.process_time()
+    for at in range(0, len(sent), turn):
+        decode(sent[at : at + turn])
     return time.process_time() - began
+
+
+def turn_of(sent: list[Message]) -> int:
+    """Messages that the service takes at once."""
+    return min(TURN_BYTES // len(sent[0].payload), TURN_MESSAGES)
 
 
 def _bare(sent: list[Message]) -> list[NDArray[Any]]:
@@ -116,13 +120,15 @@ def messages(
 
 def _take(sent: list[Message], records: int) -> tuple[float, float]:
     with tempfile.TemporaryDirectory() as folder, closing(Engine(ServiceConfig(), Path(folder))) as engine:
+        turn = turn_of(sent)
         gc.collect()
         gc.freeze()  # as the service does when it starts: the messages of a benchmark are no garbage to look for
         wall, cpu = time.perf_counter(), time.process_time()
-        for at in range(0, len(sent), TURN):
-            engine.take(sent[at : at + TURN], time.time_ns())
-            if at % FLUSH >= FLUSH - TURN:
-                engine.flush()
+        for at in range(0, len(sent), turn):
+            engine.take(sent[at : at + turn], time.time_ns())
+            engine.written()
+            if at % FLUSH >= FLUSH - turn:
+                engine.begin_flush()
         engine.flush()
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         gc.unfreeze()

@@ -34,7 +34,7 @@ from tests.faults.processes import Part
 from tests.waiting import until
 
 ROWS: Final = 10
-BURST: Final = 8_000  # messages in each region
+BURST: Final = 4_000  # messages in each region
 TURN: Final = 512  # messages that an engine takes at once
 VEHICLES: Final = 100  # of each region
 ROUNDS: Final = 3

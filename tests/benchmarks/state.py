@@ -28,7 +28,7 @@ from tests.benchmarks.fusion import CELLS, START, filled
 from tests.benchmarks.ingest import messages
 from tests.faults.processes import Part
 
-SPAN_S: Final = 600.0  # in which every cell was visited once
+SPAN_S: Final = 86_400.0  # in which every cell was visited three times
 TURN: Final = 100  # messages of ten
 SINCE: Final = 10_000  # messages after the last checkpoint: 100 000 observations
 RESTARTS: Final = 3
@@ -41,7 +41,7 @@ def state() -> list[Figure]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         root = folder / "archive"
-        fusion, _ = filled(CELLS, 1, SPAN_S)
+        fusion, _ = filled(CELLS, 3, SPAN_S)
         checkpoints.save(root, tables_of(fusion) | {ALERTS: pa.table({})}, now)
         del fusion
         with closing(Engine(ServiceConfig(), root)) as engine:

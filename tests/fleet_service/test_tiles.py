@@ -37,7 +37,7 @@ def test_an_unchanged_tile_is_shown_again_for_a_second_and_then_made_anew(state:
     first = made.shown(TILE, NOW)
     assert made.shown(TILE, NOW + tiles.SHOWN_NS) is first
     later = made.shown(TILE, NOW + tiles.SHOWN_NS + 1)
-    assert later.table["age_s"][0].as_py() > first.table["age_s"][0].as_py()
+    assert later.cells["age_s"][0].as_py() > first.cells["age_s"][0].as_py()
     assert made.shown(TILE, NOW - 1) is not later  # the clock jumped back
 
 
