@@ -63,7 +63,7 @@ def _visited(tiles: Tiles, route: tuple[IntArray, IntArray] | None, only: int | 
 
 def _near(tiles: list[int], query: MapQuery) -> list[int]:
     """Those that the box touches."""
-    if query.bbox is None or not tiles:
+    if query.bbox is None or len(tiles) < 2:  # of one its cells are asked
         return tiles
     found = np.array(tiles)
     west, south, east, north = grid.bounds(found, grid.TILE_ZOOM)
