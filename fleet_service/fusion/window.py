@@ -18,10 +18,10 @@ from fleet_service.fusion.pools import FREE_ENTRIES, FREE_WINDOWS, VOICES, WITNE
 from fleet_service.fusion.trust import meet
 from fleet_service.fusion.votes import SCRATCH, fold, recall, respread, speaks, voice_of
 from fleet_service.fusion.weather import Weather
-from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray, compiled
+from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray, compiled, released
 
 
-@compiled
+@released
 def absorb(
     state: State, weather: Weather, slots: IntArray, rows: IntArray, share: Float32Array,
     time: IntArray, number: IntArray, boot: IntArray, place: IntArray, vehicle: IntArray, weight: Float32Array,
@@ -120,7 +120,7 @@ def _refold(state: State, weather: Weather, window: int, scratch: Bins) -> None:
     windows[window].stale = 0
 
 
-@compiled
+@released
 def settle(
     state: State, weather: Weather, peers: Records, names: Records, open_windows: IntArray, before: int
 ) -> None:  # fmt: skip
