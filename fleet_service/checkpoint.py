@@ -6,11 +6,10 @@ written here.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from fleet_service.fusion import Fusion
@@ -37,6 +36,15 @@ def _listed(column: NDArray[Any]) -> pa.Array[Any]:
     return pa.LargeListArray.from_arrays(pa.array([0, len(column)], pa.int64()), pa.array(column))
 
 
+def _unlisted(column: pa.ChunkedArray[Any]) -> NDArray[Any]:
+    """The column that a list holds; a view, where Arrow's own way to an array looks for another library first."""
+    values = cast("pa.LargeListArray[Any]", column.combine_chunks()).flatten()
+    if pa.types.is_boolean(values.type):
+        return np.asarray(values)
+    data = np.frombuffer(memoryview(values.buffers()[1] or b""), values.type.to_pandas_dtype())
+    return data[values.offset : values.offset + len(values)]
+
+
 def fusion_from(tables: dict[str, pa.Table], lateness_s: float) -> Fusion:
     """The fusion that was; it goes on as the one that `tables_of` was given would have.
 
@@ -45,10 +53,7 @@ def fusion_from(tables: dict[str, pa.Table], lateness_s: float) -> Fusion:
     """
     if any((table.schema.metadata or {}).get(_KEY) != VERSION.encode() for table in tables.values()):
         raise InputError("checkpoint", f"is not of version {VERSION}", "replay the archive instead")
-    image = {
-        name: {key: np.asarray(pc.list_flatten(table[key].combine_chunks())) for key in table.column_names}
-        for name, table in tables.items()
-    }
+    image = {name: {key: _unlisted(table[key]) for key in table.column_names} for name, table in tables.items()}
     try:
         return fusion_of(image, lateness_s)
     except (KeyError, ValueError) as error:

@@ -12,7 +12,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext, suppress
-from copy import deepcopy
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
@@ -50,7 +49,7 @@ from schemas.wire import Alert, Kind
 WAITING_ROWS = 1_000_000
 ALERTS = "alerts"  # table of a checkpoint
 CHECKPOINT_WAIT_S = 0.2  # between two looks whether the service stops
-SNAPSHOT_SLOTS = 20_000  # at once: the lock is held for 40 ms
+SNAPSHOT_SLOTS = 20_000  # at once: the lock is held for 40 ms, and little memory is needed
 
 
 class Engine:
@@ -84,12 +83,12 @@ class Engine:
         self.weather = WeatherDesk(root, config.name, self.fusion, self.counts)
         self._heard = since or 0  # when the last report of any kind came [ns]
         self._checkpoint_wanted = threading.Event()
-        self._checkpoints: queue.SimpleQueue[tuple[Fusion, pa.Table, int]] = queue.SimpleQueue()
+        self._checkpoints: queue.SimpleQueue[tuple[dict[str, pa.Table], int]] = queue.SimpleQueue()
         used = archived(root)  # before the observations, which it acts on
         self.fusion.weather(used if since is None else archived(root, received_after=since))
-        restored = np.arange(self.fusion.size)
+        restored = np.array_split(np.arange(self.fusion.size), self.fusion.size // SNAPSHOT_SLOTS + 1)
         rest = replay(root, self.fusion, Since(received=since))  # first of all: it sets damaged files aside
-        for slots in chain([restored], (folded.slots for folded in rest)):
+        for slots in chain(restored, (folded.slots for folded in rest)):
             self._alerts.folded(slots)
             self.map.changed(slots)
         self.seen = restore_streams(root, streams)
@@ -113,14 +112,12 @@ class Engine:
     def checkpoint(self, stop: threading.Event) -> tuple[dict[str, pa.Table], int] | None:
         """What the fusion knows, and until when everything received is in it [ns]; None if stopped meanwhile.
 
-        The worker copies it, right after a segment: then every row that is in it is on disk. Called by another thread,
-        which makes tables of the copy.
+        The worker takes it, right after a segment: then every row that is in it is on disk. Called by another thread.
         """
         self._checkpoint_wanted.set()
         while not stop.is_set():
             with suppress(queue.Empty):
-                fusion, alerts, heard = self._checkpoints.get(timeout=CHECKPOINT_WAIT_S)
-                return tables_of(fusion) | {ALERTS: alerts}, heard
+                return self._checkpoints.get(timeout=CHECKPOINT_WAIT_S)
         return None
 
     def close(self) -> None:
@@ -204,7 +201,7 @@ class Engine:
             self._checkpoint_wanted.clear()
             with self._guard:
                 alerts = pa.Table.from_pylist([asdict(alert) for alert in self._alerts.standing])
-                self._checkpoints.put((deepcopy(self.fusion), alerts, self._heard))
+                self._checkpoints.put((tables_of(self.fusion) | {ALERTS: alerts}, self._heard))
         return told
 
     def begin_flush(self) -> list[tuple[str, bytes]]:
