@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import logging
 import os
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
+from importlib.abc import MetaPathFinder
 from typing import Any, Literal, TextIO
 
 Form = Literal["text", "json"]
@@ -25,6 +27,21 @@ class Line(str):
         return line
 
     values: dict[str, object]
+
+
+def without_pandas() -> None:
+    """Keep Arrow from loading pandas, where that is installed, into a process that lives long and never needs it.
+
+    Arrow looks whether what it is handed is a data frame: half a second, and 57 MB for good. For good means this
+    process, so that only a program's own start may call it.
+    """
+    sys.meta_path.insert(0, _WithoutPandas())
+
+
+class _WithoutPandas(MetaPathFinder):
+    def find_spec(self, fullname: str, path: object, target: object = None) -> None:  # noqa: ARG002 as finders have it
+        if fullname == "pandas":
+            raise ModuleNotFoundError("pandas is kept out of this process", name=fullname)
 
 
 def tell(line: str, stream: TextIO) -> None:

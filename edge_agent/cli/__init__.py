@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 BAD_INPUT: Final = 2
+LIVE: Final = ("run", "fleet")  # commands that drive for hours
 
 
 class Command(NamedTuple):
@@ -51,7 +52,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
     from schemas.errors import InputError
+    from schemas.operator import without_pandas
 
+    if argv is None and chosen in LIVE:
+        without_pandas()
     try:
         return int(args.run(args))
     except InputError as error:

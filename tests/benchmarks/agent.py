@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 from edge_agent.backfill import backfill, tasks_of
@@ -18,7 +20,7 @@ from schemas.vehicle import load_vehicle
 from tests.benchmarks.measure import median_s
 from tests.faults.processes import stage
 
-EDGE = (sys.executable, "-c", "import sys; from edge_agent.cli import main; sys.exit(main(sys.argv[1:]))")
+EDGE = (sys.executable, "-c", "import sys; from edge_agent.cli import main; sys.exit(main())")
 FIRST = """import sys
 from pathlib import Path
 from edge_agent.banks import bank_of
@@ -28,6 +30,7 @@ bank = bank_of("aco-fckf", [load_vehicle(Path(sys.argv[2]))])
 block = next(read_log(Path(sys.argv[1])).blocks(0))
 bank.advance(block.t[:1], block.signals[:1])
 """
+LOOK_S = 0.05
 LIVE_S = 20.0
 START_S = 5.0  # of a run that only pays for its start
 FLEET, FLEET_RATE_HZ, FLEET_S = 100, 50, 20.0
@@ -76,12 +79,26 @@ def used(folder: Path, endpoint: str, *words: str) -> tuple[float, float]:
     config.write_text(json.dumps({"zenoh": {"connect": [endpoint]}, "spool": str(folder / "spool.sqlite")}))
     with (folder / "out").open("w+") as out:
         process = subprocess.Popen([*EDGE, *words, "--config", str(config)], stdout=out, stderr=subprocess.DEVNULL)
-        _, _, cost = os.wait4(process.pid, 0)
+        peak, cost = watched(process.pid)
         out.seek(0)
         counted = json.loads(out.read().splitlines()[-1])
     if counted["unsettled"]:
         raise ArithmeticError(f"{counted['unsettled']} batches were left unsettled")
-    return cost.ru_utime + cost.ru_stime, cost.ru_maxrss / 1024
+    return cost.ru_utime + cost.ru_stime, peak
+
+
+def watched(pid: int) -> tuple[float, resource.struct_rusage]:
+    """Peak resident memory [MB] of a process, looked at until it ends, and what it used.
+
+    The peak that the system tells at the end counts from the fork on, when the memory was still that of its parent.
+    """
+    peak, gone, status = 0.0, 0, Path(f"/proc/{pid}/status")
+    while not gone:
+        found = [int(line.split()[1]) for line in status.read_text().splitlines() if line.startswith("VmHWM")]
+        peak = max([peak, *(kilobytes * 1024 / 1e6 for kilobytes in found)])
+        time.sleep(LOOK_S)
+        gone, _, cost = os.wait4(pid, os.WNOHANG)
+    return peak, cost
 
 
 def live(folder: Path, endpoint: str) -> list[Figure]:

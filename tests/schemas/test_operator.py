@@ -14,3 +14,12 @@ def test_a_full_disk_behind_the_output_does_not_end_the_process() -> None:
         assert subprocess.run([sys.executable, "-c", TALK], stderr=full, check=False).returncode == 7
     heard = subprocess.run([sys.executable, "-c", TALK], capture_output=True, text=True, check=False)
     assert heard.stderr == "hello\n" * 3
+
+
+def test_arrow_reads_and_hands_out_numbers_where_pandas_is_kept_out() -> None:
+    words = (
+        "import sys; from schemas.operator import without_pandas; without_pandas(); import pyarrow as pa, numpy as np\n"
+        "assert pa.array([1.5, None]).to_numpy(zero_copy_only=False)[0] == 1.5\n"
+        "assert pa.array(np.array([2])).to_pylist() == [2]; assert 'pandas' not in sys.modules"
+    )
+    assert subprocess.run([sys.executable, "-W", "error", "-c", words], check=False).returncode == 0
