@@ -52,10 +52,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
     from schemas.errors import InputError
-    from schemas.operator import without_pandas
+    from schemas.operator import lean
 
     if argv is None and chosen in LIVE:
-        without_pandas()
+        lean()
     try:
         return int(args.run(args))
     except InputError as error:
