@@ -76,9 +76,20 @@ def slippery(p: FloatArray) -> float:
 
 
 def batch(
-    vehicle: str, seq: int, now: int, mu: Sequence[float], /, *, told: bool = True, used: float = 0.5, **changed: object
+    vehicle: str,
+    seq: int,
+    now: int,
+    mu: Sequence[float],
+    /,
+    *,
+    told: bool = True,
+    used: float | None = None,
+    **changed: object,
 ) -> Batch:
-    """A batch of visits in one cell, one second apart and ending at `now`; `changed` overrides its columns."""
+    """A batch of visits in one cell, one second apart and ending at `now`; `changed` overrides its columns.
+
+    Without `used` they used all of the grip: less says little of it.
+    """
     n = len(mu)
     leave = now - np.arange(n)[::-1] * SECOND
     columns: dict[str, np.ndarray] = {  # type: ignore[type-arg]
@@ -86,7 +97,7 @@ def batch(
         "longitude": np.full(n, LONGITUDE), "cell": np.full(n, CELL), "sector": np.zeros(n, np.int8),
         "yaw": np.zeros(n, np.float32), "position_std": np.ones(n, np.float32), "speed": np.full(n, 15.0, np.float32),
         "mu": np.array(mu, np.float32), "mu_lower": np.array(mu, np.float32) - 0.1,
-        "mu_upper": np.array(mu, np.float32) + 0.1, "mu_utilised": np.full(n, used, np.float32),
+        "mu_upper": np.array(mu, np.float32) + 0.1, "mu_utilised": np.array(mu) if used is None else np.full(n, used),
     }  # fmt: skip
     if told:
         columns["log_likelihood"] = mugrid.encode_log_likelihood(value(mu))
