@@ -103,7 +103,9 @@ def test_slippery_drives_become_a_slippery_map_that_survives_a_restart(system: S
     excited = [cell for cell in cells if cell["basis"] == "measured"]
     assert excited
     assert max(abs(float(str(cell["mu"])) - ICE) for cell in excited) <= 0.06
-    assert min(float(str(cell["p_slippery"])) for cell in excited) >= 0.8
+    slippery = {cell["vehicles"]: float(str(cell["p_slippery"])) for cell in sorted(excited, key=_most_slippery_first)}
+    assert slippery[2] >= 0.75  # the least of the cells that two passed, and of those that all three did
+    assert slippery[3] >= 0.85
     rows = archived(system.folder)
     assert len(set(rows)) == len(rows)
     system.stop()
@@ -113,6 +115,10 @@ def test_slippery_drives_become_a_slippery_map_that_survives_a_restart(system: S
         found = again[cell["cell"], cell["sector"]]
         assert found["vehicles"] == cell["vehicles"]
         assert found["mu"] == pytest.approx(cell["mu"], abs=0.01)  # a second or two of forgetting
+
+
+def _most_slippery_first(cell: dict[str, object]) -> float:
+    return -float(str(cell["p_slippery"]))
 
 
 def archived(folder: Path) -> list[tuple[object, ...]]:
