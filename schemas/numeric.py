@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import ParamSpec, TypeAlias, TypeVar, cast
+from typing import Any, ParamSpec, TypeAlias, TypeVar, cast
 
 import numba
 import numpy as np
@@ -49,11 +49,23 @@ def released(function: Callable[P, R]) -> Callable[P, R]:
     return _compile(function, nogil=True)
 
 
-def _compile(function: Callable[P, R], *, nogil: bool = False, forceinline: bool = False) -> Callable[P, R]:
+def lean(function: Callable[P, R]) -> Callable[P, R]:
+    """`released`, without counting references to arrays: two locked additions for each array at each call.
+
+    For functions that make no array and return none, so that all they touch belongs to the caller; what they call must
+    be lean too.
+    """
+    return _compile(function, nogil=True, references=False)
+
+
+def _compile(
+    function: Callable[P, R], *, nogil: bool = False, forceinline: bool = False, references: bool = True
+) -> Callable[P, R]:  # fmt: skip
     if "NUMBA_CACHE_DIR" not in os.environ:
         numba.config.CACHE_DIR = _kernel_cache(function.__module__.partition(".")[0])  # type: ignore[attr-defined]
-    kernel = numba.njit(cache=True, error_model="numpy", nogil=nogil, forceinline=forceinline)(function)
-    kernel._cache = _Cache(function)  # type: ignore[attr-defined, no-untyped-call] # no public way
+    options: dict[str, Any] = {"nogil": nogil, "forceinline": forceinline, "_nrt": references}
+    kernel = numba.njit(cache=True, error_model="numpy", **options)(function)
+    kernel._cache = _Cache(function)  # type: ignore[no-untyped-call] # no public way
     return cast(Callable[P, R], kernel)
 
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from fleet_service.fusion import constants as c
 from schemas import mugrid
-from schemas.numeric import ByteArray, Float32Array, FloatArray, compiled
+from schemas.numeric import ByteArray, Float32Array, FloatArray, lean
 
 PackedArray = NDArray[np.uint16]
 Bins = NDArray[np.floating[Any]]
@@ -85,7 +85,7 @@ def read(p: FloatArray) -> FloatArray:
     return np.asarray(road / road.sum(axis=1, keepdims=True))
 
 
-@compiled
+@lean
 def total(p: Bins) -> float:
     """Sum of 32 numbers, in four strands: a single one waits for itself."""
     a, b, d, e = p[0], p[1], p[2], p[3]
@@ -97,7 +97,7 @@ def total(p: Bins) -> float:
     return (a + b) + (d + e)  # type: ignore[no-any-return]
 
 
-@compiled
+@lean
 def unpack(belief: PackedArray, row: int, p: Bins) -> None:
     """p of a belief at rest."""
     whole = 0
@@ -108,7 +108,7 @@ def unpack(belief: PackedArray, row: int, p: Bins) -> None:
         p[i] = np.float32(belief[row, i]) * scale
 
 
-@compiled
+@lean
 def pack(p: Bins, belief: PackedArray, row: int) -> None:
     """Put a belief at rest; it need not be normalised. Rounding keeps a rising one rising and a uniform one uniform."""
     a, b = p[0], p[1]
@@ -120,7 +120,7 @@ def pack(p: Bins, belief: PackedArray, row: int) -> None:
         belief[row, i] = np.uint16(np.float32(p[i]) * scale + np.float32(0.5))
 
 
-@compiled
+@lean
 def mix(p: Bins, change: float, prior: Float32Array) -> None:
     """p ← (1 - h)·p + h·prior, in place."""
     h = np.float32(change)
@@ -128,7 +128,7 @@ def mix(p: Bins, change: float, prior: Float32Array) -> None:
         p[i] += h * (prior[i] - p[i])
 
 
-@compiled
+@lean
 def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded: Bins) -> None:
     """Let time pass: diffusion over `drift_s` with reflecting ends, then the hazard of a change over `change_s`.
 
@@ -149,7 +149,7 @@ def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded
         mix(p, -math.expm1(-change_s / c.CHANGE_S), prior)
 
 
-@compiled
+@lean
 def doubt(p: Bins, change_s: float, power: float, prior: Float32Array) -> None:
     """Make up what `forget` over `change_s` lacks to CHANGE_LEAST, for a value of which `power` is new. In place."""
     lacking = c.CHANGE_LEAST * power + math.expm1(-max(change_s, 0.0) / c.CHANGE_S)
@@ -157,7 +157,7 @@ def doubt(p: Bins, change_s: float, power: float, prior: Float32Array) -> None:
         mix(p, lacking, prior)
 
 
-@compiled
+@lean
 def kind_of(evidence: ByteArray) -> int:
     """VALUE where the likelihood falls towards the upper end by more than senders differ; else BOUND."""
     least = np.uint8(255)
@@ -166,7 +166,7 @@ def kind_of(evidence: ByteArray) -> int:
     return VALUE if evidence[_BINS - 1] >= int(least) + c.VALUE_DROP_STEPS else BOUND
 
 
-@compiled
+@lean
 def spread(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> None:
     """L̃ of a visit into `out` (32), mean 1. The fall of a BOUND above its maximum is noise and is levelled.
 
@@ -190,7 +190,7 @@ def spread(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> None:
         out[i] *= scale
 
 
-@compiled
+@lean
 def vote(p: Bins, spread_likelihood: Bins, strength: float) -> None:
     """p ← p·(s·L̃ + 1 - s), in place and not normalised."""
     s, rest = np.float32(strength), np.float32(1.0 - strength)
@@ -198,7 +198,7 @@ def vote(p: Bins, spread_likelihood: Bins, strength: float) -> None:
         p[i] *= s * spread_likelihood[i] + rest
 
 
-@compiled
+@lean
 def mean_of(likelihood: Bins) -> float:
     """Mean of a likelihood of mean 1 against the uniform prior."""
     first = 0.0
@@ -207,7 +207,7 @@ def mean_of(likelihood: Bins) -> float:
     return first / _BINS
 
 
-@compiled
+@lean
 def describe(likelihood: Bins, mean: float) -> tuple[float, float]:
     """Standard deviation about `mean`, and P(slippery), of a likelihood of mean 1 against the uniform prior."""
     second, slippery = 0.0, 0.0

@@ -62,9 +62,9 @@ REVISIT_S: Final = 20.0
 # ... and so many visits of one vehicle to one cell are kept for the window; more are archived and not fused. Six visits
 # of their own fit into it (REVISIT_S), and their votes would be worth nothing.
 WAITING_MOST: Final = 32
-# So long a vehicle's visits to a cell are remembered, to the hour: by then its vote counts whole again (1 - e⁻⁶), and
-# memory is the vehicles of a quarter of a day and not of a year.
-FORGOTTEN_S: Final = 6 * 3600.0
+# So long a vehicle's visits to a cell are remembered, to the hour: by then 95 % of its vote count again (1 - e⁻³), and
+# memory is the vehicles of an eighth of a day and not of a year.
+FORGOTTEN_S: Final = 3 * 3600.0
 # For a lower bound, "something else" is this much more grip used.
 NOVELTY_UTILISED: Final = 0.10
 

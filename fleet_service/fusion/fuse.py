@@ -211,7 +211,8 @@ class Fusion:
             self._epoch = self._epoch + 1 if self.waiting else epoch
             before = self._epoch * c.EPOCH_NS - self._lateness_ns
             stores = self.stores
-            settle(stores.state, self._weather, stores.peers, stores.names, stores.open_windows(), before)
+            for due in stores.due_windows(before):
+                settle(stores.state, self._weather, stores.peers, stores.names, due, before)
             stores.forget_pairs(before // SECOND)
             weights = self.trusts[-1][1]
             joined = np.full(stores.vehicles - len(weights), newcomer(False), np.float32)

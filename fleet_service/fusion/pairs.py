@@ -8,12 +8,12 @@ from fleet_service.fusion.belief import VALUE
 from fleet_service.fusion.cells import NONE, SECOND, Records
 from fleet_service.fusion.pools import PAIRS
 from fleet_service.fusion.table import pair_place
-from schemas.numeric import BoolArray, IntArray, compiled
+from schemas.numeric import BoolArray, IntArray, compiled, lean
 
 _FIBONACCI = np.uint64(0x9E3779B97F4A7C15)  # 2⁶⁴ over the golden ratio: its multiples lie far apart
 
 
-@compiled
+@lean
 def earlier(entries: Records, a: int, b: int) -> bool:
     """Whether entry `a` is folded before `b`: by time, then by identity."""
     if entries[a].time != entries[b].time:
@@ -25,7 +25,7 @@ def earlier(entries: Records, a: int, b: int) -> bool:
     return bool(entries[a].place < entries[b].place)
 
 
-@compiled
+@lean
 def pair_of(pairs: Records, used: IntArray, slot: int, vehicle: int) -> int:
     """Place of a pair; makes it where there is none."""
     pair = pair_place(pairs, slot, vehicle)
@@ -40,7 +40,7 @@ def pair_of(pairs: Records, used: IntArray, slot: int, vehicle: int) -> int:
     return pair
 
 
-@compiled
+@lean
 def chain(entries: Records, pairs: Records, pair: int, entry: int) -> None:
     """Put an entry among those of its vehicle in its window."""
     pairs[pair].waiting += 1
@@ -58,7 +58,7 @@ def chain(entries: Records, pairs: Records, pair: int, entry: int) -> None:
         entries[after].before = entry
 
 
-@compiled
+@lean
 def remember(entries: Records, pairs: Records, entry: int) -> None:
     """What an entry said becomes what its vehicle said before the checkpoint; later ones stand alone."""
     pair, kind = int(entries[entry].pair), int(entries[entry].kind)
@@ -94,7 +94,7 @@ def moved(entries: Records, old: Records, new: Records, stay: BoolArray) -> IntA
     return gone[:count]
 
 
-@compiled
+@lean
 def returning(number: int) -> np.uint64:
     """The bit of `Cells.returned` that a vehicle has."""
     return np.uint64(1) << ((np.uint64(number) * _FIBONACCI) >> np.uint64(58))

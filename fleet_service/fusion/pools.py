@@ -23,17 +23,18 @@ WITNESSES: Final = 5  # remembered per slot of each kind: as many as an alert ev
 # `mean`, `std`, `slippery` describe the vote; `power`, `last_mean`, `last_std`, `spent`, `fresh` say what the same
 # vehicle had said before.
 ENTRY: Final = np.dtype(
-    [("previous", "i4"), ("following", "i4"), ("before", "i4"), ("after", "i4"), ("pair", "i4"), ("slot", "i4"),
-     ("vehicle", "i4"), ("kind", "i1"), ("fresh", "i1"), ("time", "i8"), ("number", "i8"), ("boot", "i8"),
-     ("place", "i8"), ("weight", "f4"), ("share", "f4"), ("mean", "f4"), ("std", "f4"), ("slippery", "f4"),
-     ("power", "f4"), ("last_mean", "f4"), ("last_std", "f4"), ("spent", "f4"), ("evidence", "u1", (mugrid.BINS,))],
+    [("previous", "i4"), ("following", "i4"), ("before", "i4"), ("after", "i4"), ("pair", "i4"), ("vehicle", "i4"),
+     ("kind", "i1"), ("fresh", "i1"), ("weight", "f4"), ("time", "i8"), ("number", "i8"), ("boot", "i8"),
+     ("place", "i8"), ("share", "f4"), ("mean", "f4"), ("std", "f4"), ("slippery", "f4"), ("power", "f4"),
+     ("last_mean", "f4"), ("last_std", "f4"), ("spent", "f4"), ("evidence", "u1", (mugrid.BINS,))],
     align=True,
 )  # fmt: skip
-# The window of a slot: its first and last entry; `stale` says that the live row waits to be folded anew; the witnesses
-# as they were before the checkpoint. A window that is not in use has slot NONE.
+# The window of a slot: its first and last entry, the first one's time, how many are values; `stale` says that the live
+# row waits to be folded anew; the witnesses as they were before the checkpoint. A window that is not in use has slot
+# NONE.
 WINDOW: Final = np.dtype(
-    [("slot", "i4"), ("head", "i4"), ("tail", "i4"), ("stale", "i4"), ("witness", "i4", (2, WITNESSES)),
-     ("witnessed", "u4", (2, WITNESSES))]
+    [("slot", "i4"), ("head", "i4"), ("tail", "i4"), ("stale", "i4"), ("first", "i8"), ("values", "i4"),
+     ("witness", "i4", (2, WITNESSES)), ("witnessed", "u4", (2, WITNESSES))]
 )  # fmt: skip
 # What a vehicle last said in a cell before the checkpoint: a hash table of (slot, vehicle). `last` is the newest of
 # the pair's `waiting` entries in the window. Columns are the kinds BOUND and VALUE; `time` [s] is 0 where it said

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.cells import CELL, NONE, Cells, Int32Array, Records, cells_of, no_beliefs
+from fleet_service.fusion.cells import CELL, NONE, Cells, Int32Array, Records, cells_of, no_beliefs, rows_of_lines
 from fleet_service.fusion.pairs import mark_returned, moved
 from fleet_service.fusion.pools import (
     ENTRY,
@@ -73,11 +73,17 @@ class Stores:
         """Entries in use."""
         return len(self.state.free_entries) - int(self.state.used[FREE_ENTRIES])
 
-    def open_windows(self) -> IntArray:
-        """Windows in use, in an order that does not depend on who came first."""
-        slot = self.state.windows["slot"]
-        used = np.flatnonzero(slot != NONE)
-        return np.asarray(used[np.argsort(self.state.cells["key"][slot[used]])])
+    def due_windows(self, before: int) -> tuple[IntArray, IntArray]:
+        """Windows with entries before `before` [ns]: those without a value, and those with one in the order of cells.
+
+        Values that pass the checkpoint meet others, which is what reputation is made of; so their order may not depend
+        on who came first. All else is done in the order of memory.
+        """
+        windows = self.state.windows
+        due = np.flatnonzero((windows["slot"] != NONE) & (windows["first"] < before))
+        quiet = windows["values"][due] == 0
+        talking = due[~quiet]
+        return due[quiet], talking[np.argsort(self.state.cells["key"][windows["slot"][talking]])]
 
     def slots_of(self, keys: IntArray) -> IntArray:
         """Slot of each key, NONE where there is none."""
@@ -181,7 +187,7 @@ Array = TypeVar("Array", bound=NDArray[Any])
 
 
 def _longer(old: Array, rows: int) -> Array:
-    new = np.zeros((rows, *old.shape[1:]), old.dtype)
+    new = rows_of_lines(rows, old.dtype, *old.shape[1:])
     new[: len(old)] = old
     return new  # type: ignore[return-value] # of the very type of `old`
 

@@ -9,12 +9,12 @@ import numpy as np
 
 from fleet_service.fusion.belief import PackedArray
 from fleet_service.fusion.cells import NONE, Int32Array, Records, begin
-from schemas.numeric import IntArray, compiled
+from schemas.numeric import IntArray, compiled, lean
 
 LEAST: Final = 1024  # places of a new table; a power of two, so that a mask finds the place
 
 
-@compiled
+@lean
 def _mixed(key: int | np.int64) -> np.uint64:
     """Every bit of the key moves the place: mixing steps of the splitmix64 generator."""
     h = np.uint64(key)
@@ -23,7 +23,7 @@ def _mixed(key: int | np.int64) -> np.uint64:
     return h ^ (h >> np.uint64(31))
 
 
-@compiled
+@lean
 def locate(table: Int32Array, rows: Records, key: int) -> int:
     """Place of the row with `key`, or the free place where it belongs."""
     mask = len(table) - 1
@@ -79,7 +79,7 @@ def fill(table: Int32Array, rows: Records, used: int) -> None:
         table[locate(table, rows, rows[row].key)] = row
 
 
-@compiled
+@lean
 def pair_place(pairs: Records, slot: int, vehicle: int) -> int:
     """Place of a pair in a table that holds the pairs themselves, or the free place (slot NONE) where it belongs."""
     mask = len(pairs) - 1
