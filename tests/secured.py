@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -102,9 +103,10 @@ class Network:
         """Wait until what is put at one router comes out at the other, both ways."""
         for first, second in (ROUTERS, ROUTERS[::-1]):
             with self.session(SERVICE, first) as here, self.session(SERVICE, second) as there:
-                subscriber = here.declare_subscriber(PROBE, lambda sample: None)
-                publisher = there.declare_publisher(PROBE)
-                until(lambda publisher=publisher: publisher.matching_status.matching)  # type: ignore[misc]
+                arrived = threading.Event()
+                subscriber = here.declare_subscriber(PROBE, lambda _, arrived=arrived: arrived.set())
+                # a put each time: a publisher from before the link may never hear that it matches
+                until(lambda there=there, arrived=arrived: there.put(PROBE, b"") or arrived.is_set())  # type: ignore[misc]
                 subscriber.undeclare()
 
 
