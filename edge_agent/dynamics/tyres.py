@@ -40,13 +40,6 @@ def magic_formula_inverse(rho: float, c: float) -> float:
 
 
 @compiled
-def dugoff(theta: float) -> float:
-    """Dugoff curve: theta up to one half, then 1 - 1/(4*theta); odd in theta; it has no falling branch."""
-    size = abs(theta)
-    return theta if size <= 0.5 else math.copysign(1.0 - 0.25 / size, theta)
-
-
-@compiled
 def brush(theta: float) -> float:
     """Brush curve with parabolic pressure: theta - theta|theta|/3 + theta^3/27 up to 3, then 1; odd in theta."""
     size = min(abs(theta), 3.0)
@@ -79,7 +72,7 @@ def combined_dugoff(
 ) -> tuple[float, float]:
     """(Fx, Fy) [N] of one wheel in its own frame by similarity with the Dugoff curve; arguments as `combined_magic`.
 
-    Up to half the grip, theta <= 1/2, that is K*slip itself.
+    The curve is theta up to one half, where the force is K*slip itself, then 1 - 1/(4*theta); it has no falling branch.
     """
     grip = max(mu * load, 0.0)
     free_x, free_y = stiffness_x * slip_x, stiffness_y * slip_y

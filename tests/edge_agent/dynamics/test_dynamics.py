@@ -31,9 +31,13 @@ def test_a_tyre_curve_starts_with_slope_one_and_peaks_at_one(c: float, e: float)
 
 
 def test_the_dugoff_curve_is_smooth_where_its_pieces_meet_and_odd() -> None:
+    def dugoff(theta: float) -> float:
+        return tyres.combined_dugoff(theta, 0.0, 1.0, 1.0, 1.0, 1.0)[0]
+
     step = 1e-7
-    assert tyres.dugoff(0.5 + step) - tyres.dugoff(0.5 - step) == pytest.approx(2 * step, rel=1e-5)
-    assert tyres.dugoff(-3.0) == -tyres.dugoff(3.0)
+    assert dugoff(0.5 + step) - dugoff(0.5 - step) == pytest.approx(2 * step, rel=1e-5)
+    assert dugoff(-3.0) == -dugoff(3.0)
+    assert dugoff(3.0) == pytest.approx(1.0 - 1.0 / 12.0)
 
 
 def test_the_inverse_of_the_curve_undoes_it_and_knows_no_slip_beyond_the_peak() -> None:
