@@ -34,6 +34,7 @@ from fleet_service.map_state import cell_table
 from schemas import figures
 from schemas.figures import Figure
 from schemas.wire import Kind
+from tests.benchmarks.contract import size_of
 from tests.benchmarks.past import past
 from tests.fleet_service.analytics.agreement import differs
 from tests.fleet_service.archive.readers import READERS, by_spark
@@ -81,12 +82,12 @@ def archive(root: Path, rows: int) -> list[Figure]:
     """Rows per second of compaction, bytes of an observation."""
     tell(f"writing {rows:,} observations")
     synthetic.write(root, World(rows, DAYS))
-    inbox = sum(path.stat().st_size for path in segments.paths(root, Kind.OBSERVATION))
+    inbox = size_of(segments.paths(root, Kind.OBSERVATION))
     began = time.process_time()
     done = compact(root)
     spent = time.process_time() - began
     tell(f"compacted into {done.files} files")
-    size = sum(path.stat().st_size for path in (root / "observations").rglob("*.parquet"))
+    size = size_of((root / "observations").rglob("*.parquet"))
     return [
         Figure("archive.compaction_rows_per_s", done.rows / spent, "rows per CPU second", 400_000, "more"),
         Figure("archive.bytes_per_observation", size / done.rows, "bytes", 60),

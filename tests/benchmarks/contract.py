@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-import io
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final
 
-import pyarrow as pa
-import pyarrow.parquet as pq
-
-from schemas import tables, wire
+from fleet_service.analytics import synthetic
+from fleet_service.analytics.synthetic import World
+from fleet_service.archive import segments
+from fleet_service.archive.compaction import compact
+from schemas import wire
 from schemas.decoding import decode_many
 from schemas.figures import Figure
-from schemas.wire import Batch, Columns, Kind
+from schemas.wire import Batch, Kind
 from tests.benchmarks.fabricated import visits
-from tests.benchmarks.measure import median_s
+from tests.benchmarks.measure import SEED, median_s
+
+WORLD: Final = World(500_000, days=1, seed=SEED)
 
 
 def contract() -> list[Figure]:
@@ -28,20 +34,24 @@ def contract() -> list[Figure]:
         Figure("bench.wire.encode_us", encoding / (repeat * rows) * 1e6, "us per observation"),
         Figure("bench.wire.decode_us", decoding / (repeat * rows) * 1e6, "us per observation"),
         Figure("bench.bytes.wire", len(payload) / rows, "bytes per observation", 160),
-        Figure("bench.bytes.parquet_inbox", parquet_bytes(visits(50_000, 1000, 10_000)), "bytes per observation"),
+        *parquet_bytes(),
     ]
 
 
-def parquet_bytes(columns: Columns) -> float:
-    """Bytes per observation of a segment, zstd, in the order of arrival."""
-    arrays, fields = [], []
-    for field in tables.OBSERVATION:
-        values = columns[field.name]
-        array = (
-            pa.array(list(map(bytes, values)), field.type) if values.ndim == 2 else pa.array(values).cast(field.type)
-        )
-        arrays.append(array)
-        fields.append(pa.field(field.name, field.type))
-    buffer = io.BytesIO()
-    pq.write_table(pa.table(arrays, schema=pa.schema(fields)), buffer, compression="zstd")
-    return len(buffer.getvalue()) / len(columns["cell"])
+def parquet_bytes() -> list[Figure]:
+    """Bytes per observation of an archive, as its service writes it and compacted."""
+    with tempfile.TemporaryDirectory() as name:
+        root = Path(name)
+        synthetic.write(root, WORLD)
+        inbox = size_of(segments.paths(root, Kind.OBSERVATION))
+        rows = compact(root).rows
+        compacted = size_of((root / "observations").rglob("*.parquet"))
+    return [
+        Figure("bench.bytes.parquet", compacted / rows, f"bytes per observation, {rows} compacted", 60),
+        Figure("bench.bytes.parquet_inbox", inbox / rows, "bytes per observation, before"),
+    ]
+
+
+def size_of(paths: Iterable[Path]) -> int:
+    """Bytes of files."""
+    return sum(path.stat().st_size for path in paths)
