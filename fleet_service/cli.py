@@ -18,7 +18,7 @@ from fleet_service.analytics import cli as analytics_cli
 from fleet_service.archive import cli as archive_cli
 from fleet_service.enrolment import command
 from schemas.errors import InputError
-from schemas.operator import lean, log_as, teller
+from schemas.operator import keep_small, log_as, teller
 
 SWITCH_S = 0.0005  # after which a busy worker lets an answer go first; ten times that is Python's own
 LEAVE_AT_LAST_S = 2.7  # after a signal; the process is to be gone within 3 s
@@ -32,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = _parser().parse_args(argv)
     if argv is None and arguments.command is _run:
-        lean()
+        keep_small()
     try:
         return int(arguments.command(arguments))
     except InputError as error:

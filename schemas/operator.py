@@ -29,7 +29,7 @@ class Line(str):
     values: dict[str, object]
 
 
-def lean() -> None:
+def keep_small() -> None:
     """Keep from a process that lives long what its libraries would do for others; call it at its very start.
 
     Arrow loads pandas, where that is installed, to look whether what it is handed is a data frame: half a second, and

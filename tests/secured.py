@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import zenoh
@@ -104,10 +105,24 @@ class Network:
         for first, second in (ROUTERS, ROUTERS[::-1]):
             with self.session(SERVICE, first) as here, self.session(SERVICE, second) as there:
                 arrived = threading.Event()
-                subscriber = here.declare_subscriber(PROBE, lambda _, arrived=arrived: arrived.set())
+                subscriber = here.declare_subscriber(PROBE, partial(_note, arrived))
                 # a put each time: a publisher from before the link may never hear that it matches
-                until(lambda there=there, arrived=arrived: there.put(PROBE, b"") or arrived.is_set())  # type: ignore[misc]
+                until(partial(_heard, there, arrived))
                 subscriber.undeclare()
+
+    def close(self) -> None:
+        """Stop every router that runs."""
+        for router in list(self.routers):
+            self.stop(router)
+
+
+def _note(arrived: threading.Event, _: zenoh.Sample) -> None:
+    arrived.set()
+
+
+def _heard(there: zenoh.Session, arrived: threading.Event) -> bool:
+    there.put(PROBE, b"")
+    return arrived.is_set()
 
 
 @contextmanager
@@ -116,7 +131,7 @@ def network(folder: Path, *, guarded: bool = True, fleet: Enrolment | None = Non
     registry(folder).enrol(fleet or enrolment())
     running = Network(folder, guarded)
     with ExitStack() as stack:
-        stack.callback(lambda: [running.stop(router) for router in list(running.routers)])
+        stack.callback(running.close)
         for router in ROUTERS:
             running.start(router)
         running.linked()

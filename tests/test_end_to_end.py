@@ -18,7 +18,7 @@ from schemas import mugrid
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.transport import open_session
 from schemas.wire import Kind
-from tests.waiting import until
+from tests.waiting import matched, until
 
 VEHICLES = ("anna", "bert", "cleo")
 ICE = 0.25
@@ -142,7 +142,7 @@ def test_garbage_is_refused_and_the_service_goes_on(system: System) -> None:
     assert session is not None
     with session:
         publisher = session.declare_publisher("gripmap/v1/obs/1200/320/230/mallory")
-        until(lambda: publisher.matching_status.matching)
+        matched(publisher)
         publisher.put(b"\xff\x00garbage", encoding=zenoh.Encoding("application/protobuf"))
         errors = [r.err.payload.to_string() for r in session.get("gripmap/v1/map/**?bbox=1,2,3") if r.err is not None]
         assert errors

@@ -6,6 +6,8 @@ import threading
 import time
 from collections.abc import Callable
 
+import zenoh
+
 PATIENCE_S = 30.0
 
 
@@ -20,3 +22,8 @@ def until(condition: Callable[[], object], patience_s: float = PATIENCE_S) -> No
         if time.monotonic() > deadline:
             raise TimeoutError(f"not within {patience_s} s: {condition}")
         pause.wait(0.005)
+
+
+def matched(asker: zenoh.Publisher | zenoh.Querier) -> None:
+    """Return as soon as somebody listens, or answers."""
+    until(lambda: asker.matching_status.matching)  # type: ignore[attr-defined]  # the stubs call it a bool

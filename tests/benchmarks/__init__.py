@@ -2,4 +2,4 @@
 
 import os
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the service and the agent have it: `schemas.operator.lean`
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as service and agent have it: `schemas.operator.keep_small`

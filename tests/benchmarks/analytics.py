@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import geoparquet_validator
 import numpy as np
@@ -68,13 +69,13 @@ def stations(folder: Path) -> Path:
     hours = np.arange(DAYS * 24)
     names = np.repeat([f"station-{k}" for k in range(5)], len(hours))
     place = np.repeat(np.arange(5), len(hours))
-    table = pa.table({
+    columns: dict[str, Any] = {
         "station": names, "time": (np.tile(hours, 5) * 3600 + START_NS // 10**9).astype("datetime64[s]"),
         "latitude": 57.6 + 0.1 * place, "longitude": 11.9 + 0.1 * place,
-        "temperature": np.tile(5.0 - 8.0 * synthetic.night(hours * 3600.0), 5) + 0.1 * place,
-    })  # fmt: skip
+        "temperature": np.tile(5.0 - 8.0 * synthetic.night(np.asarray(hours * 3600.0, float)), 5) + 0.1 * place,
+    }  # fmt: skip
     path = folder / "stations.csv"
-    pacsv.write_csv(table, path)
+    pacsv.write_csv(pa.table(columns), path)
     return path
 
 
@@ -177,8 +178,8 @@ def _different(root: Path, readings: Path) -> int:
         if question.name == "replay":  # asks no engine
             continue
         options = Options(at=HALF, stations=readings, say=lambda _: None)
-        answers = [question.ask(Engine(name, root, PART), options) for name in ("duckdb", "spark")]
-        said = differs(*answers, question)
+        one, other = (question.ask(Engine(name, root, PART), options) for name in ("duckdb", "spark"))
+        said = differs(one, other, question)
         tell(f"{question.name}: {said or 'the engines agree'}")
         count += said is not None
     return count

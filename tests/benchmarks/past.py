@@ -22,6 +22,7 @@ from fleet_service.service import Service
 from schemas import grid, keys
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.figures import Figure
+from schemas.numeric import FloatArray, IntArray
 from schemas.transport import open_session
 from tests.waiting import until
 
@@ -48,7 +49,7 @@ def past(root: Path, tell: Callable[[str], None]) -> list[Figure]:
     ]
 
 
-def _beliefs(engine: Engine) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[type-arg]
+def _beliefs(engine: Engine) -> tuple[IntArray, FloatArray]:
     fusion = engine.fusion
     slots = np.arange(fusion.size)
     order = np.lexsort((fusion.sector[slots], fusion.cell[slots]))
@@ -58,7 +59,7 @@ def _beliefs(engine: Engine) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[t
 END = START_NS + WORLD.days * DAY_S * 10**9
 
 
-def _largest(before: tuple[np.ndarray, np.ndarray], after: tuple[np.ndarray, np.ndarray]) -> float:  # type: ignore[type-arg]
+def _largest(before: tuple[IntArray, FloatArray], after: tuple[IntArray, FloatArray]) -> float:
     if len(before[0]) != len(after[0]) or (before[0] != after[0]).any():
         return 1.0
     return float(np.abs(before[1] - after[1]).max())

@@ -31,7 +31,7 @@ from schemas.transport import open_session
 from schemas.wire import Kind
 from tests.benchmarks.ingest import messages
 from tests.faults.processes import Part
-from tests.waiting import until
+from tests.waiting import matched
 
 ROWS: Final = 10
 BURST: Final = 4_000  # messages in each region
@@ -129,8 +129,7 @@ def services_s(bursts: Sequence[Sequence[Message]], services: int) -> list[float
 
 def _part(folder: Path, endpoint: str, number: int, share: list[str]) -> Part:
     name = f"shard-{number}"
-    settings = {"connect": [endpoint]}
-    config = ServiceConfig(name=name, regions=share, queue_batches=4 * BURST, zenoh=ZenohSettings(**settings))
+    config = ServiceConfig(name=name, regions=share, queue_batches=4 * BURST, zenoh=ZenohSettings(connect=[endpoint]))
     path = folder / f"{name}.json"
     path.write_text(config.model_dump_json(include={"name", "regions", "queue_batches", "zenoh"}))
     words = ("-m", "fleet_service.cli", "run", "--archive", str(folder / name), "--config", str(path))
@@ -150,7 +149,7 @@ def _send(session: zenoh.Session, burst: Sequence[Message]) -> float:
     subscriber = session.declare_subscriber(f"{keys.ROOT}/ack/*", hear)
     for key in {message.key for message in burst}:
         publisher = session.declare_publisher(key)
-        until(lambda publisher=publisher: publisher.matching_status.matching)
+        matched(publisher)
         publisher.undeclare()
     began = time.perf_counter()
     for message in burst:

@@ -144,7 +144,7 @@ def test_every_configuration_is_for_a_name_on_the_list() -> None:
 def test_what_the_units_start_works_together_and_leaves_in_time(site: Site) -> None:
     """Certificates, two routers, service, agent, reader; then each is stopped as systemd would."""
     etc = site.root / "etc"
-    enrol = [BIN / "fleet-service", "certs", "--fleet", etc / "fleet.json", "--out", etc / "certs"]
+    enrol = [str(BIN / "fleet-service"), "certs", "--fleet", str(etc / "fleet.json"), "--out", str(etc / "certs")]
     subprocess.run(enrol, check=True, stdout=subprocess.DEVNULL)
     running: list[subprocess.Popen[bytes]] = []
     with ExitStack() as stack:
@@ -162,6 +162,10 @@ def test_what_the_units_start_works_together_and_leaves_in_time(site: Site) -> N
             lines = fetch(f"{site.address}/metrics")[2].splitlines() if listening() else []
             return sum(float(line.split()[-1]) for line in lines if line.startswith("gripmap_rows_total"))
 
+        def cells() -> int:
+            shown = ask(load(etc / "reader.json", ServiceConfig).zenoh, {"format": "arrow"}).table
+            return shown.num_rows if shown else 0
+
         def listening() -> bool:
             assert all(process.poll() is None for process in running), "a part ended before its time"
             with socket.socket() as probe:
@@ -169,11 +173,11 @@ def test_what_the_units_start_works_together_and_leaves_in_time(site: Site) -> N
 
         until(rows, START_S)
         assert fetch(f"{site.address}/healthz")[0] == 200
-        until(lambda: ask(load(etc / "reader.json", ServiceConfig).zenoh, {"format": "arrow"}).table.num_rows, START_S)
+        until(cells, START_S)
         for process in reversed(running):
             began = time.monotonic()
             process.send_signal(signal.SIGTERM)
-            assert process.wait(timeout=10.0) == 0, f"{process.args} after {time.monotonic() - began:.1f} s"
+            assert process.wait(timeout=10.0) == 0, f"{process.args!r} after {time.monotonic() - began:.1f} s"
     said = [json.loads(line) for line in (site.root / "gripmap-service.log").read_text().splitlines()]
     assert said[0]["event"] == "ready"
     assert said[-1]["event"] == "status"

@@ -15,7 +15,7 @@ from schemas import config
 from schemas.config import AgentConfig, ServiceConfig, ZenohSettings
 from schemas.errors import InputError
 from schemas.transport import open_session
-from tests.waiting import until
+from tests.waiting import matched
 
 
 def test_clients_of_a_router_hear_each_other() -> None:
@@ -30,7 +30,7 @@ def test_clients_of_a_router_hear_each_other() -> None:
                 "gripmap/v1/map/test", lambda query: query.reply(query.key_expr, "here")
             )
             querier = first.declare_querier("gripmap/v1/map/test")
-            until(lambda: querier.matching_status.matching)
+            matched(querier)
             assert [reply.ok.payload.to_string() for reply in querier.get() if reply.ok] == ["here"]
             queryable.undeclare()
 

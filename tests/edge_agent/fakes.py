@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 import pyarrow as pa
@@ -20,7 +20,11 @@ from schemas.config import AgentConfig
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S
 
+if TYPE_CHECKING:
+    from edge_agent.estimators import Estimates
+
 LATITUDE, LONGITUDE = 57.70, 11.97
+Lengths: TypeAlias = NDArray[np.floating[Any]]
 METRE = 1.0 / 111_320.0  # degrees of latitude
 START_NS = 1_767_225_600_000_000_000  # 2026-01-01
 
@@ -42,7 +46,8 @@ class MadeUp:
 
     def part(self, rows: slice) -> MadeUp:
         """The same for some samples."""
-        return MadeUp(*(None if (v := getattr(self, f.name)) is None else v[rows] for f in fields(self)))
+        cut = {f.name: v[rows] for f in fields(self) if (v := getattr(self, f.name)) is not None}
+        return replace(self, **cut)
 
 
 def estimates(samples: int, vehicles: int, seed: int = 0, mu: float | None = None, used: float = 0.1) -> MadeUp:
@@ -51,11 +56,12 @@ def estimates(samples: int, vehicles: int, seed: int = 0, mu: float | None = Non
     middle = rng.uniform(0.1, 1.0, shape) if mu is None else np.full(shape, mu)
     health = rng.integers(0, 4, shape).astype(np.int32)
     evidence = -rng.exponential(2.0, (*shape, mugrid.BINS))
-    motion = [rng.normal(10.0, 1.0, shape) for _ in range(4)]
-    return MadeUp(*motion, middle, middle - 0.05, middle + 0.05, np.full(shape, used), health, evidence)
+    vx, vy, yaw_rate, sideslip = (rng.normal(10.0, 1.0, shape) for _ in range(4))
+    lower, upper, gripped = middle - 0.05, middle + 0.05, np.full(shape, used)
+    return MadeUp(vx, vy, yaw_rate, sideslip, middle, lower, upper, gripped, health, evidence)
 
 
-def ground(east: FloatArray, north: FloatArray, yaw: FloatArray, *, rate_hz: float = 10.0, fix_every: int = 1) -> Block:
+def ground(east: Lengths, north: Lengths, yaw: Lengths, *, rate_hz: float = 10.0, fix_every: int = 1) -> Block:
     """A block of vehicles at (east, north) [m] heading for yaw, shape (T, N), with a fix every few samples."""
     shape = east.shape
     t = np.repeat(np.arange(shape[0])[:, None] / rate_hz, shape[1], axis=1)
@@ -97,7 +103,8 @@ class Watch:
     def step(self, block: Block, told: MadeUp) -> tuple[Located, Records, Records]:
         """One block."""
         self.track, located = locate(self.track, block.t, block.signals)
-        self.open, observations, states = observe(self.open, block.time, located, told, self.config)
+        said = cast("Estimates", told)  # which has more, of what nobody reads here
+        self.open, observations, states = observe(self.open, block.time, located, said, self.config)
         return located, observations, states
 
 
@@ -115,7 +122,7 @@ def a_log(samples: int) -> dict[str, Any]:
     return {"t": np.arange(samples) / 100.0} | columns
 
 
-def _written(**changes: object) -> Callable[[Path], None]:
+def _written(**changes: object) -> Callable[[Path], object]:
     """Writes a log of five samples with some columns replaced, or left out where the change is None."""
 
     def write(path: Path) -> None:
@@ -127,7 +134,7 @@ def _written(**changes: object) -> Callable[[Path], None]:
 
 _LOST = np.full(5, np.nan)
 # what is wrong with a log -> how to write such a one, and the error that it gives
-BAD_LOGS: dict[str, tuple[Callable[[Path], None], str]] = {
+BAD_LOGS: dict[str, tuple[Callable[[Path], object], str]] = {
     "no such file": (lambda path: None, "^log: .* does not exist; give"),
     "empty file": (lambda path: path.write_bytes(b""), "^log: .* is not a Parquet file .*; write the log as Parquet"),
     "not Parquet": (lambda path: path.write_text("t,ax\n0,1\n"), "^log: .* is not a Parquet file"),

@@ -134,6 +134,7 @@ def test_the_loop_ends_after_its_duration() -> None:
 
 
 def test_the_truth_is_that_of_the_cells_the_vehicles_were_in(tmp_path_factory: pytest.TempPathFactory) -> None:
+    import pyarrow as pa
     import pyarrow.parquet as pq
 
     recorder = TruthRecorder(("sim-001", "sim-002", "sim-003"))
@@ -143,7 +144,7 @@ def test_the_truth_is_that_of_the_cells_the_vehicles_were_in(tmp_path_factory: p
     truth = pq.read_table(path)
     assert set(truth["vehicle"].to_pylist()) == set(recorder.names)
     mine = truth.filter([name == "sim-001" for name in truth["vehicle"].to_pylist()])
-    enter, leave = (np.array(mine[name].cast("int64")) for name in ("enter_time", "leave_time"))
+    enter, leave = (np.array(mine[name].cast(pa.int64())) for name in ("enter_time", "leave_time"))
     whole = joined(parts)
     assert enter[0] == whole.time[0, 0]
     assert leave[-1] == whole.time[-1, 0]

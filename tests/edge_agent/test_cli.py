@@ -53,7 +53,7 @@ def config(folder: Path, router: Router) -> list[str]:
 
 
 def counts(output: Output) -> dict[str, float]:
-    return json.loads(output.readouterr().out.splitlines()[-1])
+    return dict(json.loads(output.readouterr().out.splitlines()[-1]))
 
 
 def test_simulate_writes_a_log_with_truth_and_the_vehicle_file(drive: Path) -> None:

@@ -174,7 +174,7 @@ def test_waiting_time_and_rows_of_a_batch_change_the_batches(flush_s: float, row
 @pytest.mark.parametrize("change", [{"seed": 5}, {"rate": 100.0}, {"scenario": "demo"}], ids=lambda c: next(iter(c)))
 def test_seed_rate_and_scenario_of_a_live_drive_change_it(change: dict[str, object]) -> None:
     usual = recorded(seconds=1.0)[0]
-    other = recorded(seconds=1.0, **change)[0]  # type: ignore[arg-type]
+    other = recorded(seconds=1.0, **change)[0]
     assert usual.signals.shape != other.signals.shape or not np.array_equal(
         usual.signals, other.signals, equal_nan=True
     )

@@ -47,7 +47,7 @@ def opens(ground: Ground, name: str, router: str = ROUTERS[1], **changed: object
         return False
 
 
-def issued(ground: Ground, name: str, folder: Path, *, days_ago: float = 0.0, days: float = 5.0) -> dict[str, object]:
+def issued(ground: Ground, name: str, folder: Path, *, days_ago: float = 0.0, days: float = 5.0) -> dict[str, Any]:
     """TLS entries with a certificate that the fleet's own authority issued at some time."""
     authority = ca.read(ground.folder / "authority" / "ca")
     assert authority is not None
@@ -66,8 +66,8 @@ def stranger(ground: Ground) -> Path:
 @attempt
 def certificate_of_another_authority(ground: Ground) -> bool:
     folder = stranger(ground)
-    own = {"connect_certificate": str(folder / "shard-0.pem"), "connect_private_key": str(folder / "shard-0.key")}
-    return opens(ground, SERVICE, **own)
+    certificate, private = str(folder / "shard-0.pem"), str(folder / "shard-0.key")
+    return opens(ground, SERVICE, connect_certificate=certificate, connect_private_key=private)
 
 
 @attempt

@@ -80,7 +80,12 @@ class CrashDisk:
     @contextmanager
     def mounted(self) -> Iterator[None]:
         """All operations on the folder go through here inside the block."""
-        calls = {"fsync": self._fsync, "rename": self._rename, "replace": self._rename, "open": self._open}
+        calls: dict[str, Callable[..., Callable[..., object]]] = {
+            "fsync": self._fsync,
+            "rename": self._rename,
+            "replace": self._rename,
+            "open": self._open,
+        }
         calls |= {"unlink": self._unlink, "remove": self._unlink, "mkdir": self._mkdir}
         patches = [mock.patch.object(os, name, call(getattr(os, name))) for name, call in calls.items()]
         patches.append(mock.patch.object(Path, "open", self._path_open(Path.open)))
@@ -155,7 +160,7 @@ class CrashDisk:
         disk = self
 
         class Raw(io.FileIO):
-            def write(self, data: bytes) -> int:
+            def write(self, data: bytes) -> int:  # type: ignore[override]  # nobody hands it anything else
                 disk._operate(needs_room=True)
                 return super().write(data)
 
@@ -167,7 +172,7 @@ class CrashDisk:
             raw = Raw(path, "w")
             if new:
                 disk._changed(path, disk._new(path))
-            file = io.BufferedWriter(raw)
+            file = io.BufferedWriter(raw)  # type: ignore[type-var]  # for that reason
             return file if "b" in mode else io.TextIOWrapper(file, encoding="utf-8")
 
         return open_

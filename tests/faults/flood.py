@@ -149,12 +149,12 @@ def _service(folder: Path, running: Network) -> subprocess.Popen[bytes]:
     file, log = folder / "service.json", folder / "service.log"
     file.write_text(config.model_dump_json())
     command = [
-        Path(sys.executable).with_name("fleet-service"),
+        str(Path(sys.executable).with_name("fleet-service")),
         "run",
         "--config",
-        file,
+        str(file),
         "--archive",
-        folder / "archive",
+        str(folder / "archive"),
     ]
     with log.open("wb") as out:
         process = subprocess.Popen(command, stdout=out, stderr=out)
@@ -222,7 +222,7 @@ def _without(folder: Path, honest: Sequence[Honest], seconds: float, now: int) -
 def _difference(found: pa.Table, expected: pa.Table, honest: Sequence[Honest]) -> float:
     """The largest difference of mu over the cells of the honest vehicles; NaN if one is missing."""
     driven = {int(sent.columns["cell"][0]) for one in honest for sent, _ in one.sent.values()}
-    mu = [dict(zip(table["cell"].to_pylist(), table["mu"].to_pylist(), strict=True)) for table in (found, expected)]
+    mu = [{row["cell"]: float(row["mu"]) for row in table.to_pylist()} for table in (found, expected)]
     if not driven <= mu[0].keys() & mu[1].keys():
         return float("nan")
     return max(abs(mu[0][cell] - mu[1][cell]) for cell in driven)

@@ -20,7 +20,7 @@ from schemas import keys, wire
 from schemas.config import ServiceConfig
 from tests.fleet_service.examples import SECOND, TILE, batch, key
 from tests.secured import READER, ROUTERS, SERVICE, VEHICLES, Network, settings
-from tests.waiting import until
+from tests.waiting import matched, until
 
 HONEST, ROGUE = VEHICLES
 RESEND_S = 0.5  # after a restart of the routers
@@ -112,7 +112,7 @@ def ground(network: Network) -> Iterator[Ground]:
             found = Ground(network, service, stack)
             # only a service is told who answers; the second router is the one further away
             querier = found.open(SERVICE, ROUTERS[1]).declare_querier(keys.map_key(TILE))
-            until(lambda: querier.matching_status.matching)
+            matched(querier)
             querier.undeclare()
             yield found
     finally:

@@ -26,6 +26,7 @@ from edge_agent.publisher import Publisher
 from edge_agent.spool import Draft, Held, Spool, Stream
 from schemas import grid, mugrid
 from schemas.config import AgentConfig, ZenohSettings
+from schemas.numeric import IntArray
 from schemas.wire import Columns, Kind, column_types
 
 BLOCK_S = 0.1
@@ -67,7 +68,7 @@ class WatchedSpool(Spool):
         return super().settle(stream, told)
 
 
-def visits(rng: np.random.Generator, vehicle: np.ndarray, now: int, cells_across: int) -> Records:  # type: ignore[type-arg]
+def visits(rng: np.random.Generator, vehicle: IntArray, now: int, cells_across: int) -> Records:
     """One made-up visit per element of `vehicle` (n,), all just left; now [ns]."""
     n = len(vehicle)
     columns: Columns = {}
@@ -105,13 +106,18 @@ def drive(plan: Plan, publisher: Publisher, quiet: threading.Event) -> tuple[int
     return late, longest
 
 
+def _set(*events: threading.Event) -> None:
+    for event in events:
+        event.set()
+
+
 def main(path: str) -> int:
     """Run one generator."""
     plan = Plan(**json.loads(Path(path).read_text()))
     quiet, leave = threading.Event(), threading.Event()
     signal.signal(signal.SIGUSR1, lambda *_: quiet.set())
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: (leave.set(), quiet.set()))
+        signal.signal(number, lambda *_: _set(leave, quiet))
     spool = WatchedSpool(Path(plan.spool), capacity_bytes=round(plan.capacity_mb * 1e6))
     config = AgentConfig(zenoh=ZenohSettings(connect=[plan.endpoint]), flush_s=plan.flush_s)
     publisher = Publisher(plan.names, spool, config, "load")

@@ -109,7 +109,7 @@ def _states() -> Any:  # noqa: ANN401
     return state
 
 
-def _at(place: int, rows: int) -> dict[str, list[float]]:
+def _at(place: int, rows: int) -> dict[str, Any]:
     """Columns of a batch some cells to the east."""
     longitude = LONGITUDE + 2e-4 * place
     return {"longitude": [longitude] * rows, "cell": [int(grid.cell_of(LATITUDE, longitude))] * rows}

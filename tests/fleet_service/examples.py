@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fleet_service.fusion import Fusion, Observations, evidence
 from fleet_service.fusion.belief import SLIPPERY_SHARE
@@ -19,23 +21,24 @@ TILE = int(grid.tile_of(CELL))
 START = 1_700_000_000 * 10**9  # ns
 SECOND = 10**9
 STD = 0.06  # of a good visit's value
+Numbers: TypeAlias = Sequence[float] | NDArray[np.floating[Any]] | NDArray[np.integer[Any]]
 
 
-def value(mu: Sequence[float] | FloatArray, std: float = STD) -> FloatArray:
+def value(mu: Numbers, std: float = STD) -> FloatArray:
     """Log-likelihoods of visits that saw μ, (n, 32)."""
-    return -0.5 * np.square((mugrid.CENTRES - np.asarray(mu, float)[:, None]) / std)
+    return np.asarray(-0.5 * np.square((mugrid.CENTRES - np.asarray(mu, float)[:, None]) / std))
 
 
-def at_least(used: Sequence[float] | FloatArray) -> FloatArray:
+def at_least(used: Numbers) -> FloatArray:
     """Log-likelihoods of visits that only used so much, (n, 32)."""
     return np.where(np.asarray(used, float)[:, None] > mugrid.CENTRES, -8.0, 0.0)
 
 
 def observations(
-    seconds: Sequence[float] | FloatArray,
-    vehicles: Sequence[int] | FloatArray,
+    seconds: Numbers,
+    vehicles: Numbers,
     log_likelihood: FloatArray,
-    cell: int | Sequence[int] = CELL,
+    cell: int | Numbers = CELL,
     second: int = -1,
 ) -> Observations:
     """Visits at START + seconds; place in the stream follows the order."""
@@ -44,8 +47,9 @@ def observations(
     time = START + (np.asarray(seconds, float) * SECOND).astype(np.int64)
     vehicle = np.asarray(vehicles, np.int64)
     return Observations(
-        time, whole + cell, np.zeros(n, np.int8), np.full(n, second, np.int8), vehicle, vehicle * 7 + 1, whole + REGION,
-        np.arange(n), mugrid.encode_log_likelihood(log_likelihood), np.full((n, 3), np.nan, np.float32),
+        time, whole + np.asarray(cell, np.int64), np.zeros(n, np.int8), np.full(n, second, np.int8), vehicle,
+        vehicle * 7 + 1, whole + REGION, np.arange(n),
+        mugrid.encode_log_likelihood(log_likelihood), np.full((n, 3), np.nan, np.float32),
         np.full((n, 4), -1), np.zeros((n, 4), np.float32),
     )  # fmt: skip
 
@@ -53,16 +57,16 @@ def observations(
 def posterior_evidence(mu: float, lower: float, upper: float, used: float) -> FloatArray:
     """Log-likelihood (32,) of a sender without one."""
     names = ("mu", "mu_lower", "mu_upper", "mu_utilised")
-    columns = dict(zip(names, (np.array([v]) for v in (mu, lower, upper, used)), strict=True))
+    columns: dict[str, NDArray[Any]] = dict(zip(names, (np.array([v]) for v in (mu, lower, upper, used)), strict=True))
     columns["log_likelihood"] = np.zeros((1, mugrid.BINS), np.uint8)
-    return mugrid.decode_log_likelihood(evidence(columns, np.array([False])).taken)[0]
+    return np.asarray(mugrid.decode_log_likelihood(evidence(columns, np.array([False])).taken)[0])
 
 
 def belief(fusion: Fusion, cell: int = CELL, sector: int = 0, now: int | None = None) -> FloatArray:
     """Belief of one cell (32,) at its last observation, or at `now`."""
     slot = fusion.slots_of(np.array([cell]), np.array([sector]))
     assert slot[0] >= 0, "nobody was there"
-    return fusion.beliefs(slot, int(fusion.live.time[slot[0]]) if now is None else now)[0]
+    return np.asarray(fusion.beliefs(slot, int(fusion.live.time[slot[0]]) if now is None else now)[0])
 
 
 def interval(p: FloatArray) -> tuple[float, float]:
@@ -92,7 +96,7 @@ def batch(
     """
     n = len(mu)
     leave = now - np.arange(n)[::-1] * SECOND
-    columns: dict[str, np.ndarray] = {  # type: ignore[type-arg]
+    columns: dict[str, NDArray[Any]] = {
         "enter_time": leave - SECOND, "leave_time": leave, "latitude": np.full(n, LATITUDE),
         "longitude": np.full(n, LONGITUDE), "cell": np.full(n, CELL), "sector": np.zeros(n, np.int8),
         "yaw": np.zeros(n, np.float32), "position_std": np.ones(n, np.float32), "speed": np.full(n, 15.0, np.float32),

@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -67,6 +68,11 @@ NEIGHBOUR = int(grid.neighbours(CELL)[0])
 FAR = int(grid.cell_of(LATITUDE, 12.02))
 
 
+def one(column: str, values: list[float]) -> dict[str, Any]:
+    """A column to be changed."""
+    return {column: values}
+
+
 @pytest.mark.parametrize(
     ("column", "values", "rule"),
     [
@@ -93,7 +99,7 @@ FAR = int(grid.cell_of(LATITUDE, 12.02))
 def test_a_bad_value_is_refused_with_its_row_and_a_reason(
     desk: Desk, column: str, values: list[float], rule: str
 ) -> None:
-    assert desk.take(message(batch("sim-001", 1, NOW - SECOND, [0.8, 0.7], **{column: values}))) == 0
+    assert desk.take(message(batch("sim-001", 1, NOW - SECOND, [0.8, 0.7], **one(column, values)))) == 0
     assert desk.counts == {f"refused.{rule}": 1}
     ((seq, row, reason),) = desk.rejected()
     assert (seq, row) == (1, 0)
@@ -112,7 +118,7 @@ def test_a_bad_value_is_refused_with_its_row_and_a_reason(
     ],
 )
 def test_what_is_absent_or_just_beside_is_let_in(desk: Desk, column: str, values: list[float]) -> None:
-    assert desk.take(message(batch("sim-001", 1, NOW - SECOND, [0.8, 0.7], **{column: values}))) == 2
+    assert desk.take(message(batch("sim-001", 1, NOW - SECOND, [0.8, 0.7], **one(column, values)))) == 2
 
 
 def test_a_bad_batch_among_good_ones_is_refused_alone(desk: Desk) -> None:

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pyarrow as pa
@@ -52,7 +53,7 @@ def test_query_prints_a_table_or_json_and_writes_files(
     assert ask(router, "--format", "json", "--out", str(tmp_path / "a.json")) == 0
     assert json.loads((tmp_path / "a.json").read_text())["tiles"][0]["cells"][0]["vehicles"] == 3
     assert ask(router, "--out", str(tmp_path / "a.arrow")) == 0
-    with pa.OSFile(str(tmp_path / "a.arrow")) as file:
+    with pa.OSFile(str(tmp_path / "a.arrow"), "rb") as file:
         assert pa.ipc.open_stream(file).read_all()["cell"].to_pylist() == [CELL]
 
 
@@ -97,9 +98,9 @@ def test_run_and_watch_as_processes_from_start_to_signal(
 ) -> None:
     config = tmp_path / "service.json"
     config.write_text(json.dumps({"zenoh": {"connect": router.connect}, "put_s": 0.1}))
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    run = subprocess.Popen([*COMMAND, "run", "--config", config, "--archive", tmp_path / "archive"], **pipes)
-    watch = subprocess.Popen([*COMMAND, "watch", "--config", config, "--bbox", "11,57,13,59"], **pipes)
+    begin = partial(subprocess.Popen[str], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    run = begin([*COMMAND, "run", "--config", str(config), "--archive", str(tmp_path / "archive")])
+    watch = begin([*COMMAND, "watch", "--config", str(config), "--bbox", "11,57,13,59"])
     with run, watch:
         assert run.stdout is not None
         assert watch.stdout is not None

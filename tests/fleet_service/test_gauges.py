@@ -18,7 +18,7 @@ from schemas.wire import Kind
 from tests.fleet_service.conftest import running
 from tests.fleet_service.examples import SECOND, batch, key
 from tests.schemas.test_monitor import fetch
-from tests.waiting import until
+from tests.waiting import matched, until
 
 
 def test_a_service_shows_what_it_took_refused_and_keeps_waiting(
@@ -28,7 +28,7 @@ def test_a_service_shows_what_it_took_refused_and_keeps_waiting(
         address = run.lines[0].split(", ")[-1]
         assert address.startswith("http://127.0.0.1:")
         publisher = session.declare_publisher(key("sim-001"))
-        until(lambda: publisher.matching_status.matching)
+        matched(publisher)
         for seq, speed in ((1, 15.0), (2, 999.0)):
             sent = batch("sim-001", seq, time.time_ns() - SECOND, [0.8], speed=[speed])
             session.put(key("sim-001"), wire.encode(sent), encoding=wire.ENCODING[Kind.OBSERVATION])

@@ -14,12 +14,13 @@ from fleet_service.acks import Acks
 from fleet_service.limits import LEAST_BYTES, Limits
 from schemas import wire
 from schemas.config import ServiceConfig, ZenohSettings
+from schemas.decoding import Head
 from schemas.errors import InputError
 from schemas.wire import Kind
 from tests.fleet_service.conftest import running
 from tests.fleet_service.examples import SECOND, batch, key
 from tests.secured import enrolment
-from tests.waiting import until
+from tests.waiting import matched, until
 
 RATE, BURST = 10_000.0, 50_000.0
 
@@ -82,7 +83,8 @@ def test_names_that_are_made_up_share_one_bucket_and_do_not_fill_the_memory(monk
 def test_an_acknowledgement_is_never_larger_than_its_receiver_reads() -> None:
     acks, sent = Acks(), [batch("sim-001", seq, 0, [0.8]) for seq in range(1, 3001, 2)]
     for one in sent:
-        acks.rejected("sim-001", one, 0, "x" * 120)
+        head = Head(one.kind, one.vehicle, one.boot, one.region, one.seq, one.first_held, one.estimator)
+        acks.rejected("sim-001", head, 0, "x" * 120)
     for seq in range(5001, 9001, 2):
         acks.durable("sim-001", (sent[0].boot, sent[0].kind, sent[0].region), seq)
     messages = acks.messages()
@@ -102,7 +104,7 @@ def test_a_service_listens_to_those_on_its_list_and_drops_without_an_answer_what
         heard: list[bytes] = []
         session.declare_subscriber("gripmap/v1/ack/*", lambda sample: heard.append(sample.payload.to_bytes()))
         publisher = session.declare_publisher(key("car-1"))
-        until(lambda: publisher.matching_status.matching)
+        matched(publisher)
         for name in ("car-2", "car-1"):
             for seq in range(1, 101):
                 sent = batch(name, seq, time.time_ns() - SECOND, [0.8])

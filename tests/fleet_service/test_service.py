@@ -9,6 +9,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -21,7 +22,7 @@ from schemas.config import ZenohSettings
 from schemas.wire import Batch, Kind
 from tests.fleet_service.conftest import Running, running
 from tests.fleet_service.examples import CELL, LATITUDE, LONGITUDE, REGION, SECOND, TILE, batch, key
-from tests.waiting import until
+from tests.waiting import matched, until
 
 VEHICLES = ("sim-001", "sim-002", "sim-003")
 
@@ -47,10 +48,10 @@ class Fleet:
         for region in regions or (REGION,):
             for name in (keys.observation_key(region, "sim-000"), keys.state_key(region, "sim-000")):
                 publisher = self.session.declare_publisher(name)
-                until(lambda publisher=publisher: publisher.matching_status.matching)
+                matched(publisher)
                 publisher.undeclare()
             querier = self.session.declare_querier(keys.map_key(region << 8))
-            until(lambda querier=querier: querier.matching_status.matching)
+            matched(querier)
             querier.undeclare()
         return self
 
@@ -348,7 +349,7 @@ def test_the_service_shows_that_it_lives_and_takes_it_back(
 def test_two_services_share_the_world_and_a_query_gets_both(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path
 ) -> None:
-    far = {"latitude": [-33.9], "longitude": [18.4], "cell": [int(grid.cell_of(-33.9, 18.4))]}
+    far: dict[str, Any] = {"latitude": [-33.9], "longitude": [18.4], "cell": [int(grid.cell_of(-33.9, 18.4))]}
     region = int(grid.region_of(far["cell"][0]))
     here, there = (f"{keys.chunks(place, 10).split('/')[0]}/*/*" for place in (REGION, region))
     with (

@@ -23,7 +23,7 @@ from schemas.weather import Report
 from schemas.wire import Kind
 from tests.fleet_service.conftest import Running
 from tests.fleet_service.examples import REGION, SECOND, batch, key
-from tests.waiting import until
+from tests.waiting import matched, until
 
 
 def test_a_report_survives_the_wire_and_what_is_left_out_is_unknown() -> None:
@@ -50,7 +50,7 @@ def test_a_report_that_breaks_a_rule_is_refused_by_name(report: Report, field: s
         weather.decode(weather.encode(report))
 
 
-def file(path: Path, **columns: list[Any]) -> Path:
+def file(path: Path, **columns: object) -> Path:
     pq.write_table(pa.table(columns), path)
     return path
 
@@ -116,7 +116,7 @@ def test_a_running_service_takes_weather_over_its_key(
     service: Running, session: zenoh.Session, start: Callable[..., Any]
 ) -> None:
     publisher = session.declare_publisher(keys.weather_key(REGION))
-    until(lambda: publisher.matching_status.matching)
+    matched(publisher)
     publisher.put(weather.encode(Report(time.time_ns(), precipitation=2.0)), encoding=wire.WEATHER_ENCODING)
     publisher.put(weather.encode(Report(5, precipitation=2.0)), encoding=wire.WEATHER_ENCODING)
     counts = service.service.engine.counts

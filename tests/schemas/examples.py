@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas import grid, wire
 from schemas.wire import Alert, Batch, Kind, StreamAck
@@ -15,7 +18,7 @@ DATA = Path(__file__).parent / "data"
 def batch(kind: Kind, rows: int = 3) -> Batch:
     """A batch whose every column has values of its own."""
     rng = np.random.default_rng(7)
-    columns = {}
+    columns: dict[str, NDArray[Any]] = {}
     for name, dtype in wire.column_types(kind).items():
         if name == "log_likelihood":
             columns[name] = rng.integers(0, 256, (rows, 32)).astype(np.uint8)
@@ -48,7 +51,7 @@ def alert() -> Alert:
     )
 
 
-MESSAGES = {
+MESSAGES: dict[str, Callable[[], bytes]] = {
     "observation_batch": lambda: wire.encode(batch(Kind.OBSERVATION)),
     "state_batch": lambda: wire.encode(batch(Kind.STATE)),
     "ack": lambda: wire.encode_ack(*acknowledgement()),

@@ -81,7 +81,7 @@ def test_channels_have_the_order_that_the_indices_say() -> None:
 def test_every_column_has_a_unit_and_a_meaning() -> None:
     for schema in (tables.MAP_SCHEMA, tables.ESTIMATES_SCHEMA, tables.OBSERVATION_ARCHIVE, tables.STATE_ARCHIVE):
         assert len(set(schema.names)) == len(schema.names)
-        assert all(field.metadata[b"unit"] and field.metadata[b"meaning"] for field in schema)
+        assert all(field.metadata and field.metadata[b"unit"] and field.metadata[b"meaning"] for field in schema)
 
 
 def test_a_vehicle_file_is_read(tmp_path: Path) -> None:

@@ -18,6 +18,11 @@ def covariance(n: int, seed: int) -> FloatArray:
     return np.asarray(a @ a.T + 0.1 * np.eye(n))
 
 
+def root_of(cov: FloatArray) -> FloatArray:
+    """Its lower triangular factor."""
+    return np.asarray(np.linalg.cholesky(cov), np.float64)
+
+
 System = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 """f, q, h and the standard deviations of the measurement."""
 
@@ -33,7 +38,7 @@ def textbook(mean: FloatArray, cov: FloatArray, system: System, z: FloatArray) -
 
 @pytest.mark.parametrize("beta", [0.1, 0.5, 0.83])
 def test_share_then_fuse_is_the_identity(beta: float) -> None:
-    root, mean = np.linalg.cholesky(covariance(5, 0)), np.arange(5.0)
+    root, mean = root_of(covariance(5, 0)), np.arange(5.0)
     first, second, work = np.empty((5, 5)), np.empty((5, 5)), np.empty((10, 10))
     share(root, beta, first)
     share(root, 1.0 - beta, second)
@@ -46,8 +51,8 @@ def test_share_then_fuse_is_the_identity(beta: float) -> None:
 def test_fusing_adds_information() -> None:
     p, q = covariance(4, 1), covariance(4, 2)
     x, y = np.array([1.0, 2.0, 3.0, 4.0]), np.array([1.5, 1.0, 3.0, 5.0])
-    mean, root = x.copy(), np.linalg.cholesky(p)
-    fuse(mean, root, y, np.linalg.cholesky(q), np.empty((8, 8)))
+    mean, root = x.copy(), root_of(p)
+    fuse(mean, root, y, root_of(q), np.empty((8, 8)))
     information = np.linalg.inv(p) + np.linalg.inv(q)
     assert root @ root.T == pytest.approx(np.linalg.inv(information), abs=1e-12)
     expected = np.linalg.solve(information, np.linalg.solve(p, x) + np.linalg.solve(q, y))
@@ -60,7 +65,7 @@ def test_a_federated_filter_that_counts_shared_rows_half_is_the_one_kalman_filte
     f, h = np.eye(n) + 0.1 * rng.normal(size=(n, n)), rng.normal(size=(2, n))
     q, noise = 0.05 * covariance(n, 4), np.array([0.2, 0.3])
     mean, cov = np.ones(n), covariance(n, 5)
-    x, root, rule = mean.copy(), np.linalg.cholesky(cov), cubature(n)
+    x, root, rule = mean.copy(), root_of(cov), cubature(n)
     for _ in range(10):
         z = rng.normal(size=2)
         mean, cov = textbook(mean, cov, (f, q, h, noise), z)
@@ -80,7 +85,7 @@ def _federated_turn(
         own, own_root, points = np.empty(n), np.empty((n, n)), np.empty((2 * n, n))
         share(root, part, own_root)
         axis_points(mean, own_root, xi, points)
-        predict(np.ascontiguousarray(points @ f.T), weight, weight, np.linalg.cholesky(q / part), own, own_root, work)
+        predict(np.ascontiguousarray(points @ f.T), weight, weight, root_of(q / part), own, own_root, work)
         innovation, std = z - h @ own, noise * np.array([1.0, np.sqrt(2.0)])
         if sub == 1:
             innovation[0] = np.nan
@@ -91,7 +96,7 @@ def _federated_turn(
 
 
 def test_points_by_singular_values_have_the_moments_of_the_state() -> None:
-    rule, root, mean = cubature(4), np.linalg.cholesky(covariance(4, 6)), np.arange(4.0)
+    rule, root, mean = cubature(4), root_of(covariance(4, 6)), np.arange(4.0)
     points = np.empty((8, 4))
     axis_points(mean, root, rule.xi, points)
     assert rule.w_mean @ points == pytest.approx(mean, abs=1e-12)
@@ -100,7 +105,7 @@ def test_points_by_singular_values_have_the_moments_of_the_state() -> None:
 
 
 def test_points_by_singular_values_lie_on_the_axes_of_the_ellipsoid() -> None:
-    root = np.linalg.cholesky(covariance(3, 7))
+    root = root_of(covariance(3, 7))
     points = np.empty((6, 3))
     axis_points(np.zeros(3), root, cubature(3).xi, points)
     gram = points[:3] @ points[:3].T
@@ -109,14 +114,14 @@ def test_points_by_singular_values_lie_on_the_axes_of_the_ellipsoid() -> None:
 
 def test_a_downdate_takes_a_column_away() -> None:
     cov, column = covariance(5, 8), 0.2 * np.random.default_rng(9).normal(size=5)
-    root = np.linalg.cholesky(cov)
+    root = root_of(cov)
     assert downdate(root, column, np.empty(5))
     assert root @ root.T == pytest.approx(cov - np.outer(column, column), abs=1e-12)
     assert np.array_equal(root, np.tril(root))
 
 
 def test_a_downdate_that_would_leave_no_covariance_refuses_and_changes_nothing() -> None:
-    root = np.linalg.cholesky(covariance(3, 10))
+    root = root_of(covariance(3, 10))
     before = root.copy()
     assert not downdate(root, 1.0001 * root[:, 0], np.empty(3))
     assert np.array_equal(root, before)
@@ -124,7 +129,7 @@ def test_a_downdate_that_would_leave_no_covariance_refuses_and_changes_nothing()
 
 def _measured(seed: int, noise: float) -> tuple[tuple[FloatArray, ...], tuple[int, float, float, bool]]:
     rng = np.random.default_rng(seed)
-    root, mean = np.linalg.cholesky(covariance(4, seed)), rng.normal(size=4)
+    root, mean = root_of(covariance(4, seed)), rng.normal(size=4)
     h, innovation = rng.normal(size=(3, 4)), rng.normal(size=3)
     innovation[1] = np.nan
     args = (root.copy(), np.ascontiguousarray(h @ root), innovation, np.full(3, noise), np.empty((12, 12)))
@@ -147,12 +152,12 @@ def test_a_filter_that_updates_by_downdates_is_the_textbook_filter_on_a_linear_s
     f, h, q = 0.9 * np.eye(n) + 0.05 * rng.normal(size=(n, n)), rng.normal(size=(3, n)), 0.01 * covariance(n, 22)
     noise, rule = np.array([0.2, 0.3, 0.4]), cubature(n)
     mean, cov = np.ones(n), covariance(n, 23)
-    x, root, points, work = mean.copy(), np.linalg.cholesky(cov), np.empty((2 * n, n)), np.empty((20, 40))
+    x, root, points, work = mean.copy(), root_of(cov), np.empty((2 * n, n)), np.empty((20, 40))
     for _ in range(50):
         z = rng.normal(size=3)
         mean, cov = textbook(mean, cov, (f, q, h, noise), z)
         sigma_points(x, root, rule.xi, points)
-        predict(np.ascontiguousarray(points @ f.T), rule.w_mean, rule.w_cov, np.linalg.cholesky(q), x, root, work)
+        predict(np.ascontiguousarray(points @ f.T), rule.w_mean, rule.w_cov, root_of(q), x, root, work)
         told = update_by_downdate(x, root, root.copy(), np.ascontiguousarray(h @ root), z - h @ x, noise, work)
         assert not told[3]
         assert x == pytest.approx(mean, abs=1e-12)

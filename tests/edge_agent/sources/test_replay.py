@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from edge_agent.sources.replay import read_log
+from edge_agent.sources.replay import Log, read_log
 from schemas.errors import InputError
 from schemas.signals import CHANNELS, S, per_wheel
 from tests.edge_agent.fakes import BAD_LOGS, a_log
@@ -18,7 +19,7 @@ from tests.edge_agent.fakes import BAD_LOGS, a_log
 NS = 1_000_000_000
 
 
-def read(tmp_path: Path, columns: dict[str, object]) -> object:
+def read(tmp_path: Path, columns: dict[str, Any]) -> Log:
     path = tmp_path / "log.parquet"
     pq.write_table(pa.table(columns), path)
     return read_log(path)
@@ -72,7 +73,7 @@ MOMENTS = 1_767_225_600 * NS + np.array([0, 10, 25]) * 10_000_000
     ],
     ids=["ns UTC", "us", "int64 ns", "float s"],
 )
-def test_a_timestamp_gives_seconds_from_its_first_and_the_time_of_day(tmp_path: Path, column: pa.Array) -> None:
+def test_a_timestamp_gives_seconds_from_its_first_and_the_time_of_day(tmp_path: Path, column: pa.Array[Any]) -> None:
     columns = {name: c for name, c in a_log(3).items() if name != "t"} | {"timestamp": column}
     log = read(tmp_path, columns)
     assert np.allclose(log.t, [0.0, 0.1, 0.25], atol=1e-6)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal, TypeAlias
+
 import numpy as np
 import pyarrow as pa
 
@@ -10,6 +12,7 @@ from fleet_service.analytics.questions import Question
 
 # Sums are added in another order. Everything else (percentiles, counts, times) is exact in both.
 RELATIVE, ABSOLUTE = 1e-9, 1e-9
+Order: TypeAlias = list[tuple[str, Literal["ascending", "descending"]]]
 
 
 def differs(one: pa.Table, other: pa.Table, question: Question) -> str | None:
@@ -17,7 +20,9 @@ def differs(one: pa.Table, other: pa.Table, question: Question) -> str | None:
     if one.schema.names != other.schema.names or one.num_rows != other.num_rows:
         return f"{one.num_rows} rows of {one.schema.names}, {other.num_rows} of {other.schema.names}"
     keys = ["day", "cell", "sector", "onset", "vehicle", "period", "basis", "age_h", "temperature", "frame"]
-    by = [(name, "ascending") for name in keys if name in one.schema.names]
+    by: list[tuple[str, Literal["ascending", "descending"]]] = [
+        (name, "ascending") for name in keys if name in one.schema.names
+    ]
     one, other = (ordered(table, question).sort_by(by) for table in (one, other))
     for name in one.schema.names:
         a, b = one[name].to_pylist(), other[name].to_pylist()

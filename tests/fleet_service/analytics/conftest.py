@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -65,14 +66,15 @@ def rows(archive: Path) -> pd.DataFrame:
 def stations(archive: Path) -> Path:
     """Hourly readings of two stations."""
     hours = np.arange(WORLD.days * 24)
-    table = pa.table({
+    inland = 5.0 - 8.0 * synthetic.night(np.asarray(hours * 3600.0, float))
+    columns: dict[str, Any] = {
         "station": np.repeat(["inland", "coast"], len(hours)),
         "time": (np.tile(hours, 2) * 3600 + START_NS // 10**9).astype("datetime64[s]"),
         "latitude": np.repeat([57.70, 57.71], len(hours)), "longitude": np.repeat([11.99, 13.9], len(hours)),
-        "temperature": np.concatenate([5.0 - 8.0 * synthetic.night(hours * 3600.0), np.full(len(hours), 40.0)]),
-    })  # fmt: skip
+        "temperature": np.concatenate([inland, np.full(len(hours), 40.0)]),
+    }  # fmt: skip
     path = archive.parent / "stations.csv"
-    pacsv.write_csv(table, path)
+    pacsv.write_csv(pa.table(columns), path)
     return path
 
 

@@ -20,6 +20,7 @@ from fleet_service.fusion import Fusion
 from fleet_service.map_state import cell_table
 from schemas import grid
 from schemas.errors import InputError
+from tests.fleet_service.analytics.agreement import Order
 from tests.fleet_service.analytics.conftest import HOUR_NS, PART, WORLD, visited
 
 Ask = Callable[..., pa.Table]
@@ -66,7 +67,7 @@ def test_touching_cells_of_one_sector_are_one_stretch() -> None:
         "slippery": [4, 2, 4, 4, 4], "mu_sum": [1.0, 0.5, 1.0, 1.0, 1.0], "witnesses": [2] * 5,
     })  # fmt: skip
     found = stretches(table)
-    assert sorted(found["cells"].to_pylist()) == [1, 1, 3]
+    assert sorted(found["cells"].to_numpy().tolist()) == [1, 1, 3]
     row = found.to_pylist()[found["cells"].to_pylist().index(3)]
     assert (row["exposure"], row["values"], row["share_slippery"], row["mu"]) == (15, 12, pytest.approx(10 / 12), 0.25)
     assert stretches(table.slice(0, 0)).num_rows == 0
@@ -216,7 +217,7 @@ def test_the_map_of_a_box_is_that_box_of_the_map(asked: Ask) -> None:
     whole = asked("replay", at=at)
     part = asked("replay", at=at, part=Part(PART.since, PART.until, (west, 57.0, east, 58.0)))
     inside = (whole["east"].to_numpy() > west) & (whole["west"].to_numpy() < east)
-    order = [("cell", "ascending"), ("sector", "ascending")]
+    order: Order = [("cell", "ascending"), ("sector", "ascending")]
     assert 100 < part.num_rows < whole.num_rows
     assert part.sort_by(order).equals(whole.filter(pa.array(inside)).sort_by(order))
 
@@ -224,9 +225,9 @@ def test_the_map_of_a_box_is_that_box_of_the_map(asked: Ask) -> None:
 def test_a_day_of_replay_has_a_frame_per_step_within_the_box(asked: Ask) -> None:
     part = Part(START_NS, START_NS + 12 * HOUR_NS, (11.9, 57.6, 11.985, 57.8))
     found = asked("replay", part=part, step_s=3 * 3600.0)
-    frames = sorted(set(found["frame"].cast(pa.int64()).to_pylist()))
+    frames = np.unique(found["frame"].cast(pa.int64()).to_numpy()).tolist()
     assert frames == [(START_NS + hour * HOUR_NS) // 1000 for hour in (3, 6, 9, 12)]
-    assert max(found["west"].to_pylist()) < 11.985
+    assert found["west"].to_numpy().max() < 11.985
 
 
 @pytest.mark.parametrize(
@@ -256,4 +257,4 @@ def test_a_box_and_times_leave_other_rows_out(asked: Ask, rows: pd.DataFrame) ->
         & rows["longitude"].between(11.97, 11.98, inclusive="left")
         & rows["latitude"].between(57.69, 57.72, inclusive="left")
     ]
-    assert 0 < sum(found["observations"].to_pylist()) == len(inside) < len(rows)
+    assert 0 < found["observations"].to_numpy().sum() == len(inside) < len(rows)

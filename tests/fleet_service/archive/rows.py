@@ -57,7 +57,5 @@ def fill(root: Path, segments: int, count: int, seed: int = 0) -> Writer:
 def identities(root: Path, kind: Kind) -> list[tuple[int, int]]:
     """(boot, seq) of all rows that a reader sees, sorted."""
     return sorted(
-        pair
-        for table in reading.read(root, kind, ["boot", "seq"])
-        for pair in zip(table["boot"].to_pylist(), table["seq"].to_pylist(), strict=True)
+        (row["boot"], row["seq"]) for table in reading.read(root, kind, ["boot", "seq"]) for row in table.to_pylist()
     )

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
-from fleet_service.archive import checkpoints, rebuild
+from fleet_service.archive import checkpoints, reading
 from fleet_service.archive.compaction import compact
 from fleet_service.engine import Engine
 from fleet_service.ingest import Message
@@ -56,15 +57,15 @@ def beliefs(engine: Engine, at: int) -> FloatArray:
 def folded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Rows of each call of a replay's reading."""
     rows: list[int] = []
-    read: Callable[..., object] = rebuild.reading.read
+    read: Callable[..., Iterable[pa.Table]] = reading.read
 
-    def counted(root: Path, kind: Kind, columns: list[str], *more: object) -> list[object]:
-        found = list(read(root, kind, columns, *more))  # type: ignore[call-overload]
+    def counted(root: Path, kind: Kind, columns: list[str], *more: object) -> list[pa.Table]:
+        found = list(read(root, kind, columns, *more))
         if "log_likelihood" in columns:
             rows.append(sum(table.num_rows for table in found))
         return found
 
-    monkeypatch.setattr(rebuild.reading, "read", counted)
+    monkeypatch.setattr(reading, "read", counted)
     return rows
 
 

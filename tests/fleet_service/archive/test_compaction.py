@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import shutil
 import threading
+import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from time import time_ns
+from typing import Literal
 
 import numpy as np
 import pyarrow as pa
@@ -42,7 +44,7 @@ def public(root: Path, kind: Kind) -> list[tuple[int, int]]:
 
 def test_compacted_rows_are_the_rows_of_the_inbox(tmp_path: Path) -> None:
     fill(tmp_path, SEGMENTS, ROWS)
-    by = [("boot", "ascending"), ("seq", "ascending")]
+    by: list[tuple[str, Literal["ascending", "descending"]]] = [("boot", "ascending"), ("seq", "ascending")]
     before = {kind: pa.concat_tables(reading.read(tmp_path, kind)).sort_by(by) for kind in Kind}
     done = compact(tmp_path)
     assert done == (2 * SEGMENTS * ROWS, 2 * SEGMENTS, 2 * 2 * 2)
@@ -65,7 +67,7 @@ def test_files_lie_by_date_and_zone_and_are_sorted_by_cell_and_time(tmp_path: Pa
     for path in found:
         file = pq.ParquetFile(path)
         assert file.schema_arrow.equals(tables.OBSERVATION_ARCHIVE)
-        assert file.schema_arrow.field("speed").metadata[b"unit"] == b"m/s"
+        assert (file.schema_arrow.field("speed").metadata or {})[b"unit"] == b"m/s"
         table = file.read()
         order = list(zip(table["cell"].to_pylist(), table["leave_time"].to_pylist(), strict=True))
         assert order == sorted(order)
@@ -93,7 +95,7 @@ def operations(monkeypatch: pytest.MonkeyPatch, die_at: int) -> list[str]:
         monkeypatch.setattr(Path, name, counted(name, getattr(Path, name)))
     monkeypatch.setattr(os, "fsync", counted("fsync", lambda _: None))  # a dead process needs no disk that syncs
     monkeypatch.setattr(files, "write_synced", counted("write", files.write_synced))
-    monkeypatch.setattr(compaction, "write_synced", counted("write", compaction.write_synced))
+    monkeypatch.setattr(compaction, "write_synced", counted("write", files.write_synced))
     return seen
 
 
@@ -196,7 +198,7 @@ def test_names_of_compacted_segments_are_not_used_again_even_if_the_clock_went_b
 ) -> None:
     fill(tmp_path, 1, ROWS)
     compact(tmp_path)
-    monkeypatch.setattr(segments.time, "time", lambda: 1.0)
+    monkeypatch.setattr(time, "time", lambda: 1.0)
     Writer(tmp_path, "shard-0").write(Kind.OBSERVATION, rows_of(Kind.OBSERVATION, ROWS, 1))
     assert len(identities(tmp_path, Kind.OBSERVATION)) == 2 * ROWS
     compact(tmp_path)

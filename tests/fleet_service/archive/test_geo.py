@@ -48,7 +48,7 @@ def test_a_snapshot_is_geoparquet_that_an_independent_validator_accepts(tmp_path
     assert snapshots.time_of(path) == START
     kept = pq.read_table(path, partitioning=None)
     assert kept.schema.names == [*tables.MAP_ARCHIVE.names, "geometry", "bbox"]
-    assert kept["cell"].to_pylist() == sorted(table["cell"].to_pylist())
+    assert kept["cell"].to_pylist() == np.sort(table["cell"].to_numpy()).tolist()
     assert kept.schema.field("mu").metadata == tables.MAP_SCHEMA.field("mu").metadata
 
 

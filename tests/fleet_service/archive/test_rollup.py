@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,9 @@ from fleet_service.archive.segments import nanoseconds
 from schemas import mugrid, tables
 from schemas.wire import Kind
 from tests.fleet_service.archive.rows import fill
+
+# other columns are added up
+JOIN: dict[str, Callable[..., Any]] = {"mu_min": min, "mu_max": max, "utilised_max": max, "vehicle_bits": np.bitwise_or}
 
 
 def merged(root: Path) -> dict[tuple[int, int, int], dict[str, Any]]:
@@ -31,8 +35,7 @@ def merged(root: Path) -> dict[tuple[int, int, int], dict[str, Any]]:
             known = out.setdefault(key, row)
             if known is not row:
                 for name, value in row.items():
-                    join = {"mu_min": min, "mu_max": max, "utilised_max": max, "vehicle_bits": np.bitwise_or}
-                    known[name] = join.get(name, np.add)(known[name], value)
+                    known[name] = JOIN.get(name, np.add)(known[name], value)
     return out
 
 

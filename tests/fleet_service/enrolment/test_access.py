@@ -19,7 +19,7 @@ from tests.faults.attempts import ATTEMPTS
 from tests.faults.ground import HONEST, Ground, ground
 from tests.fleet_service.examples import key
 from tests.secured import ROUTERS, SERVICE, Network, enrolment, network, registry, settings
-from tests.waiting import until
+from tests.waiting import matched, until
 
 # What does not depend on the routers: clients and service look for themselves.
 HELD_WITHOUT_ROUTERS = {
@@ -118,7 +118,7 @@ def test_a_session_takes_a_renewed_certificate_when_it_connects_again(running: N
         assert heard(honest, HONEST, service)
         much_later = Registry(running.folder, Terms(renew_days=364.9), datetime.now(UTC))
         for step in ("next", "switch", "drop"):
-            much_later.enrol(enrolment(), step)  # type: ignore[arg-type]
+            much_later.enrol(enrolment(), step)
         for router in ROUTERS:
             running.stop(router)
         for router in ROUTERS:  # they trust only the new authority, so that the old certificates are worth nothing
@@ -155,6 +155,6 @@ def test_a_declared_publisher_of_a_vehicle_is_told_that_somebody_listens(running
             f"{keys.ROOT}/obs/*/*/*/*", lambda sample: received.append(sample.payload.to_bytes())
         )
         publisher = vehicle.declare_publisher(key(HONEST))
-        until(lambda: publisher.matching_status.matching)
+        matched(publisher)
         publisher.put(b"here")
         until(lambda: received)

@@ -21,7 +21,7 @@ def driven(private: int = 0) -> Fusion:
         who = np.concatenate([rng.choice(HONEST, 12), LIARS, np.repeat(LIARS, private)])
         cells = np.concatenate([rng.integers(0, 4, 12 + len(LIARS)), 100 + rng.integers(0, 4, private * len(LIARS))])
         mu = np.where(who < 100, 0.8 + 0.05 * rng.normal(size=len(who)), 0.25)
-        fusion.fold(observations(60.0 * minute + np.sort(rng.random(len(who))), who, value(mu), cell=cells))  # type: ignore[arg-type]
+        fusion.fold(observations(60.0 * minute + np.sort(rng.random(len(who))), who, value(mu), cell=cells))
     return fusion
 
 

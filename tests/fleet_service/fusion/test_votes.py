@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from fleet_service.fusion import Fusion, evidence
 from fleet_service.fusion import constants as c
@@ -139,7 +141,7 @@ def test_a_bound_tells_nothing_above_the_grip_used_and_a_value_stays_as_it_is(st
 def test_slopes_that_all_point_upwards_make_no_value_of_many_unexcited_visits() -> None:
     n = 60
     sloping = mugrid.encode_log_likelihood(np.tile(np.linspace(-2.0, 0.0, 32), (n, 1)))
-    columns = {"log_likelihood": sloping, "mu_utilised": np.full(n, 0.2, np.float32)}
+    columns: dict[str, NDArray[Any]] = {"log_likelihood": sloping, "mu_utilised": np.full(n, 0.2, np.float32)}
     fusion = Fusion(120.0)
     o = observations(np.arange(n) * 2.0, np.arange(n), value(np.full(n, 0.5)))
     fusion.fold(dataclasses.replace(o, evidence=evidence(columns, np.full(n, True)).taken))
