@@ -17,7 +17,7 @@ from google.protobuf.descriptor import FieldDescriptor
 from numpy.typing import NDArray
 
 from schemas import mugrid
-from schemas.numeric import BoolArray, ByteArray, IntArray, compiled
+from schemas.numeric import BoolArray, ByteArray, IntArray, lean
 from schemas.wire import MAX_ROWS, MESSAGES, NEEDED, Kind, column_types
 
 NUMBERS: Final = ("boot", "region", "seq", "first_held")
@@ -106,7 +106,7 @@ def gather(data: ByteArray, walked: Walked, column: int, kind: Kind, into: NDArr
         _unpack(data, begins, counts, walked.sizes, into)
 
 
-@compiled
+@lean
 def _varint(data: ByteArray, at: int, end: int) -> tuple[int, int]:
     """A number and where it ends; -1 where it is none of at most 64 bits."""
     value, shift = 0, 0
@@ -122,7 +122,7 @@ def _varint(data: ByteArray, at: int, end: int) -> tuple[int, int]:
     return 0, -1
 
 
-@compiled
+@lean
 def _walk(data: ByteArray, ends: IntArray, layout: _Layout, first: int, strict: bool, out: Walked) -> None:
     at = 0
     for k in range(len(ends)):
@@ -143,7 +143,7 @@ def _walk(data: ByteArray, ends: IntArray, layout: _Layout, first: int, strict: 
         out.understood[k], out.sizes[k], at = fine, n, end
 
 
-@compiled
+@lean
 def _field(
     data: ByteArray, at: int, end: int, role: int, wire: int, layout: _Layout, strict: bool, out: Walked, k: int
 ) -> int:  # fmt: skip
@@ -185,16 +185,17 @@ def _field(
     return at + length
 
 
-@compiled
+@lean
 def _copy(data: ByteArray, begins: IntArray, lengths: IntArray, rooms: IntArray, into: ByteArray) -> None:
     to = 0
     for k in range(len(begins)):
-        for place in range(lengths[k]):
-            into[to + place] = data[begins[k] + place]
+        sent, room = data[begins[k] : begins[k] + lengths[k]], into[to : to + lengths[k]]
+        for place in range(len(room)):  # of slices, so that many bytes are copied at once
+            room[place] = sent[place]
         to += rooms[k]
 
 
-@compiled
+@lean
 def _unpack(data: ByteArray, begins: IntArray, counts: IntArray, sizes: IntArray, into: IntArray) -> None:
     to = 0
     for k in range(len(begins)):
