@@ -8,10 +8,10 @@ from typing import Final
 import numpy as np
 
 from fleet_service.fusion import Fusion
-from fleet_service.fusion.belief import SLIPPERY_SHARE
+from fleet_service.fusion.belief import SLIPPERY_SHARE, common_kernel
 from fleet_service.fusion.pools import GRIP, ICE, WITNESSES
 from schemas import grid, mugrid
-from schemas.numeric import BoolArray, IntArray
+from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.wire import Alert
 
 RAISE_ABOVE: Final = 0.9  # P(slippery)
@@ -20,6 +20,8 @@ CLEAR_BELOW: Final = 0.05
 FADE_BELOW: Final = 0.5  # ... but when nobody confirms it, it ends as soon as it is less likely than not
 LEAST_WITNESSES: Final = 2  # distinct vehicles that said so themselves: one liar, or one bad sensor, moves nothing
 WITNESS_NS: Final = 3600 * 10**9  # ... within the hour; older ice belongs to an older road
+# Of a belief about what the fleet takes the road for: how much of the road it stands for is slippery, and is at all.
+_SLIPPERY_AND_WHOLE: Final = common_kernel().T @ np.stack([SLIPPERY_SHARE, np.ones_like(SLIPPERY_SHARE)], axis=1)
 
 
 class Alerts:
@@ -52,20 +54,25 @@ class Alerts:
 
     def folded(self, slots: IntArray) -> list[Alert]:
         """Alerts that the cells just folded into raise or clear."""
-        fusion = self._fusion
-        time = fusion.live.time[slots]
-        slippery = fusion.believed(slots) @ SLIPPERY_SHARE
+        time, slippery = self._fusion.live.time[slots], self._slippery(slots)
+        standing = np.isin(slots, np.fromiter(self._standing, np.int64, len(self._standing)))
         out = []
-        for k in np.flatnonzero(slippery > RAISE_ABOVE).tolist():
-            if int(slots[k]) not in self._standing and self._spoken(slots[k : k + 1], ICE, GRIP, int(time[k]))[0]:
-                reason = f"P(mu < 0.4) = {slippery[k]:.2f} > {RAISE_ABOVE}"
-                self._standing[int(slots[k])] = self._alert(int(slots[k]), int(time[k]), True, reason)
-                out.append(self._standing[int(slots[k])])
-        low = slippery < CLEAR_BELOW
-        for slot, when in zip(slots[low].tolist(), time[low].tolist(), strict=True) if self._standing else ():
-            if slot in self._standing and self._spoken(np.array([slot]), GRIP, ICE, when)[0]:
-                out.append(self._clear(slot, when, "later visits found grip"))
-        return out
+        for k in np.flatnonzero((slippery > RAISE_ABOVE) & ~standing).tolist():
+            slot, when = int(slots[k]), int(time[k])
+            if self._spoken(slots[k : k + 1], ICE, GRIP, when)[0]:
+                self._standing[slot] = self._alert(slot, when, True, f"P(mu < 0.4) = {slippery[k]:.2f} > {RAISE_ABOVE}")
+                out.append(self._standing[slot])
+        gripping = np.flatnonzero((slippery < CLEAR_BELOW) & standing).tolist()
+        return out + [
+            self._clear(int(slots[k]), int(time[k]), "later visits found grip")
+            for k in gripping
+            if self._spoken(slots[k : k + 1], GRIP, ICE, int(time[k]))[0]
+        ]
+
+    def _slippery(self, slots: IntArray) -> FloatArray:
+        """P(slippery) of each slot's road at its last observation, without the rest of what is believed of it."""
+        slippery, whole = (self._fusion.live.belief[slots].astype(np.float64) @ _SLIPPERY_AND_WHOLE).T
+        return np.asarray(slippery / whole)
 
     def _spoken(self, slots: IntArray, side: int, other: int, time: int) -> BoolArray:
         """Whether enough witnesses of one side spoke: as many as of the other within the hour, within limits.

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.belief import SLIPPERY_SHARE
+from fleet_service.fusion.stores import distinct
 from schemas import grid, mugrid, tables
 from schemas.numeric import Float32Array, FloatArray, IntArray
 
@@ -47,7 +48,7 @@ class MapState:
         """Note cells that were folded into."""
         self._index()
         self.change += 1
-        tiles = np.unique(tile_of(self.fusion, slots)).tolist()
+        tiles = distinct(tile_of(self.fusion, slots)).tolist()
         self._dirty.update(tiles)
         self._changed.update(dict.fromkeys(tiles, self.change))
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fleet_service.alerts import Alerts
+from fleet_service.alerts import RAISE_ABOVE, Alerts
 from fleet_service.fusion import Fusion
+from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.fusion.pools import ICE
 from tests.fleet_service.examples import CELL, SECOND, START, at_least, belief, observations, slippery, value
 
@@ -27,6 +28,19 @@ def test_the_second_vehicle_raises_the_alert_and_it_is_raised_once() -> None:
     _, alerts, raised = icy([1, 2, 3, 4])
     assert raised == [False, True, False, False]
     assert alerts.raised == {0}
+
+
+def test_an_alert_is_judged_by_what_is_believed_of_the_road() -> None:
+    fusion, cells = Fusion(120.0), np.arange(40)
+    for vehicle in range(3):
+        fusion.fold(
+            observations(20.0 * vehicle + cells / 4, cells * 9 + vehicle, value(cells / 40 + 0.1), CELL + cells)
+        )
+    alerts, slots = Alerts(fusion), np.arange(fusion.size)
+    believed = fusion.believed(slots) @ SLIPPERY_SHARE
+    told = {alert.cell: float(alert.reason.split()[4]) for alert in alerts.folded(slots)}
+    assert told == {int(c): round(float(p), 2) for c, p in zip(fusion.cell, believed, strict=True) if p > RAISE_ABOVE}
+    assert 0 < len(told) < fusion.size
 
 
 def test_one_vehicle_with_many_unexcited_witnesses_raises_nothing() -> None:
