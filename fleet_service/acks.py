@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Final
 
+from fleet_service.streams import BatchId, Stream
 from schemas.decoding import Head
 from schemas.wire import Kind, StreamAck, encode_ack
 
@@ -19,14 +20,16 @@ class Acks:
     """What is to be told to whom."""
 
     def __init__(self) -> None:
-        self._durable: dict[str, dict[AckedStream, set[int]]] = defaultdict(lambda: defaultdict(set))
+        self._durable: dict[Stream, list[int]] = defaultdict(list)
         self._rejected: dict[str, dict[AckedStream, list[tuple[int, int, str]]]] = defaultdict(
             lambda: defaultdict(list)
         )
 
-    def durable(self, vehicle: str, stream: AckedStream, seq: int) -> None:
-        """The batch is on disk."""
-        self._durable[vehicle][stream].add(seq)
+    def durable(self, batches: Iterable[BatchId]) -> None:
+        """The batches are on disk."""
+        durable = self._durable
+        for stream, seq in batches:
+            durable[stream].append(seq)
 
     def rejected(self, vehicle: str, batch: Head, row: int, reason: str) -> None:
         """The batch was refused for good."""
@@ -34,13 +37,16 @@ class Acks:
 
     def messages(self) -> list[tuple[str, bytes]]:
         """Vehicle and `Ack` bytes of everything gathered; starts anew."""
+        told: dict[str, dict[AckedStream, list[int]]] = {vehicle: {} for vehicle in self._rejected}
+        for stream, seqs in self._durable.items():
+            told.setdefault(stream.vehicle, {}).setdefault(stream.key[1:], []).extend(seqs)
         out = []
-        for vehicle in sorted(self._durable.keys() | self._rejected.keys()):
-            durable, rejected = self._durable[vehicle], self._rejected[vehicle]
+        for vehicle, durable in sorted(told.items()):
+            rejected = self._rejected.get(vehicle, {})
             streams = [
                 part
                 for stream in sorted(durable.keys() | rejected.keys())
-                for part in _parts(stream, ranges(durable.get(stream, set())), tuple(rejected.get(stream, ())))
+                for part in _parts(stream, ranges(durable.get(stream, ())), tuple(rejected.get(stream, ())))
             ]
             out += [
                 (vehicle, encode_ack(vehicle, streams[at : at + STREAMS_PER_ACK]))
@@ -60,10 +66,13 @@ def _parts(
         yield StreamAck(*stream, durable[some], rejected[some])
 
 
-def ranges(numbers: set[int]) -> tuple[tuple[int, int], ...]:
-    """Runs of consecutive numbers, both ends included."""
+def ranges(numbers: Iterable[int]) -> tuple[tuple[int, int], ...]:
+    """Runs of consecutive numbers, each of which may come more than once; both ends included."""
+    ordered = sorted(set(numbers))
+    if ordered and ordered[-1] - ordered[0] == len(ordered) - 1:  # as most often
+        return ((ordered[0], ordered[-1]),)
     out: list[tuple[int, int]] = []
-    for n in sorted(numbers):
+    for n in ordered:
         if out and out[-1][1] == n - 1:
             out[-1] = (out[-1][0], n)
         else:

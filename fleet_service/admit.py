@@ -34,7 +34,7 @@ _TOPIC: Final = {Kind.OBSERVATION: "obs", Kind.STATE: "state"}
 
 
 class Range(NamedTuple):
-    """A column must lie in [least, most]; NaN is 'absent' where `optional`."""
+    """A column must lie in [least, most]; NaN, which is neither below nor above, is 'absent' where `optional`."""
 
     column: str
     least: float
@@ -119,8 +119,11 @@ _HEAD_RULES: Final = (
 
 def _first(broken: Sequence[NDArray[np.bool_]]) -> IntArray:
     """Index of the first that is broken of each, -1 where none is."""
-    stacked = np.stack(broken)
-    return np.where(stacked.any(axis=0), stacked.argmax(axis=0), -1)
+    out = np.full(len(broken[0]), -1)
+    for index in reversed(range(len(broken))):
+        if broken[index].any():
+            out[broken[index]] = index
+    return out
 
 
 @lru_cache(1024)
@@ -163,8 +166,7 @@ def _broken_ranges(kind: Kind, columns: Columns) -> tuple[list[NDArray[np.bool_]
     broken, rules = [], []
     for column, least, most, optional in RANGES[kind]:
         values = columns[column]
-        inside = (values >= least) & (values <= most)
-        broken.append(~(inside | np.isnan(values)) if optional and values.dtype.kind == "f" else ~inside)
+        broken.append((values < least) | (values > most) if optional else ~((values >= least) & (values <= most)))
         rules.append(Refusal(column, 0, f"{column}: lies outside [{least:g}, {most:g}]; correct it at the source"))
     return broken, rules
 
@@ -177,11 +179,14 @@ def _cell_of(columns: Columns) -> IntArray:
 def _broken_observation(columns: Columns, clock: Clock) -> list[tuple[NDArray[np.bool_], str, str]]:
     enter, leave, cell = columns["enter_time"], columns["leave_time"], columns["cell"]
     at = _cell_of(columns)
-    elsewhere = (at != cell) & ~(grid.neighbours(at) == cell[:, None]).any(axis=1)
+    elsewhere = at != cell
+    beside = np.flatnonzero(elsewhere)
+    if len(beside):
+        elsewhere[beside] = ~(grid.neighbours(at[beside]) == cell[beside, None]).any(axis=1)
     with np.errstate(invalid="ignore"):  # an infinite yaw is out of range anyway
         turned = np.cos(columns["yaw"] - columns["sector"] * (np.pi / 2)) < np.cos(YAW_TOLERANCE)
     mu, lower, upper = columns["mu"], columns["mu_lower"], columns["mu_upper"]
-    no_peak = columns["told"] & (columns["log_likelihood"] != 0).all(axis=1)
+    no_peak = columns["told"] & (columns["log_likelihood"].min(axis=1) > 0)
     return [
         (_untimely(enter, leave, clock), "time", "leave_time: too old or in the future; set the clock"),
         ((leave < enter) | (leave - enter > MAX_VISIT_NS), "time", "leave_time: before or long after enter_time; mend"),

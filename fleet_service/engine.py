@@ -31,9 +31,9 @@ from fleet_service.archive.rebuild import Since, observations, replay, restore_s
 from fleet_service.checkpoint import fusion_from, tables_of
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.weather import Reports
-from fleet_service.ingest import Admitted, Candidate, Intake, Message
+from fleet_service.ingest import Admitted, Intake, Message
 from fleet_service.map_state import MapState, cell_table
-from fleet_service.streams import Streams
+from fleet_service.streams import BatchId, Streams
 from fleet_service.tiles import Tiles
 from fleet_service.warm import warm_up
 from fleet_service.weather import WeatherDesk, archived
@@ -79,7 +79,7 @@ class Engine:
         self._acks = Acks()
         streams = Streams()
         self._intake = Intake(streams, Pseudonyms(root / "keys"), self.counts, self._acks)
-        self._log: Log[Candidate] = Log(root, config.name)
+        self._log: Log[BatchId] = Log(root, config.name)
         self.weather = WeatherDesk(root, config.name, self.fusion, self.counts)
         self._heard = since or 0  # when the last report of any kind came [ns]
         self._checkpoint_wanted = threading.Event()
@@ -159,12 +159,10 @@ class Engine:
         out: list[Alert] = []
         self._heard = max(self._heard, now)
         for kind, admitted in self._intake.admit(messages, clock).items():
-            if not admitted.candidates:
-                continue
             if kind is Kind.OBSERVATION:
                 out += self._fuse(admitted)
             self.counts[kind] += len(admitted.rows["row"])
-            self._log.add(kind, admitted.rows, admitted.candidates)
+            self._log.add(kind, admitted.rows, admitted.batches)
         return out
 
     def _fuse(self, admitted: Admitted) -> list[Alert]:
@@ -218,7 +216,7 @@ class Engine:
         """The acknowledgements to put after a flush that was begun, once it has ended."""
         return self._settled(self._log.end) if self._log.ended else []
 
-    def _settled(self, durable: Callable[[], list[Candidate]]) -> list[tuple[str, bytes]]:
+    def _settled(self, durable: Callable[[], list[BatchId]]) -> list[tuple[str, bytes]]:
         try:
             self._intake.settled(durable())
         except OSError:

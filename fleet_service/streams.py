@@ -17,20 +17,24 @@ from schemas.wire import Kind
 # Batches above the first that is missing: an agent sends old ones first, so that it has some hundreds after an outage.
 MAX_GAPS: Final = 1 << 16
 _NONE: Final[frozenset[int]] = frozenset()
+StreamKey = tuple[int, int, Kind, int]  # number of the vehicle's pseudonym, boot, kind, region
 
 
 class Stream:
     """Which batches of one stream were admitted.
 
     Attributes:
+        key: its name.
+        vehicle: enrolled name of the sender; empty until it is heard.
         low: every seq up to here is settled, or will never come.
         seen: the admitted ones above.
         newest: time of the newest admitted batch's first record [ns].
     """
 
-    __slots__ = ("low", "newest", "seen")
+    __slots__ = ("key", "low", "newest", "seen", "vehicle")
 
-    def __init__(self) -> None:
+    def __init__(self, key: StreamKey) -> None:
+        self.key, self.vehicle = key, ""
         self.low, self.newest = 0, 0
         self.seen: set[int] | frozenset[int] = _NONE
 
@@ -49,7 +53,8 @@ class Stream:
             if not isinstance(self.seen, set):
                 self.seen = set()
             self.seen.add(seq)
-        self.newest = max(self.newest, time)
+        if time > self.newest:
+            self.newest = time
         return True
 
     def raise_to(self, first_held: int) -> None:
@@ -72,7 +77,7 @@ class Stream:
                 self.seen = _NONE
 
 
-StreamKey = tuple[int, int, Kind, int]  # number of the vehicle's pseudonym, boot, kind, region
+BatchId = tuple[Stream, int]  # and seq
 
 
 class Streams:
@@ -84,7 +89,7 @@ class Streams:
     def __getitem__(self, key: StreamKey) -> Stream:
         stream = self._streams.get(key)
         if stream is None:
-            stream = self._streams[key] = Stream()
+            stream = self._streams[key] = Stream(key)
         return stream
 
     def __len__(self) -> int:

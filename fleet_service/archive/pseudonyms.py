@@ -13,7 +13,11 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fleet_service.archive.files import sync_directory
+from schemas.numeric import IntArray
 
 KEY_BYTES: Final = 32
 _DIGEST_BYTES: Final = 8  # 64 bits: a collision among 10⁶ vehicles has probability 3e-8
@@ -24,6 +28,11 @@ _DAY_NS: Final = 86_400_000_000_000
 def number(pseudonym: str) -> int:
     """A pseudonym as a signed 64-bit number."""
     return int.from_bytes(bytes.fromhex(pseudonym), signed=True)
+
+
+def texts(numbers: IntArray) -> NDArray[np.bytes_]:
+    """The pseudonyms (n,) that `number` makes these of."""
+    return np.frombuffer(numbers.astype(">i8").tobytes().hex().encode(), f"S{2 * _DIGEST_BYTES}")
 
 
 class Pseudonyms:

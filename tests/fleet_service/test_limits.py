@@ -12,6 +12,7 @@ import zenoh
 from fleet_service import limits
 from fleet_service.acks import Acks
 from fleet_service.limits import LEAST_BYTES, Limits
+from fleet_service.streams import Stream
 from schemas import wire
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.decoding import Head
@@ -85,13 +86,14 @@ def test_an_acknowledgement_is_never_larger_than_its_receiver_reads() -> None:
     for one in sent:
         head = Head(one.kind, one.vehicle, one.boot, one.region, one.seq, one.first_held, one.estimator)
         acks.rejected("sim-001", head, 0, "x" * 120)
-    for seq in range(5001, 9001, 2):
-        acks.durable("sim-001", (sent[0].boot, sent[0].kind, sent[0].region), seq)
+    stream = Stream((1, sent[0].boot, sent[0].kind, sent[0].region))
+    stream.vehicle = "sim-001"
+    acks.durable((stream, seq) for seq in range(5001, 9001, 2))
     messages = acks.messages()
-    told = [stream for _, payload in messages for stream in wire.decode_ack(payload)[1]]
+    told = [part for _, payload in messages for part in wire.decode_ack(payload)[1]]
     assert max(len(payload) for _, payload in messages) <= wire.MAX_BYTES
-    assert [seq for stream in told for seq, _, _ in stream.rejected] == list(range(1, 3001, 2))
-    assert [first for stream in told for first, _ in stream.durable] == list(range(5001, 9001, 2))
+    assert [seq for part in told for seq, _, _ in part.rejected] == list(range(1, 3001, 2))
+    assert [first for part in told for first, _ in part.durable] == list(range(5001, 9001, 2))
 
 
 def test_a_service_listens_to_those_on_its_list_and_drops_without_an_answer_what_is_too_much(

@@ -11,12 +11,13 @@ from fleet_service import streams
 from fleet_service.streams import Stream, Streams
 from schemas.wire import Kind
 
+KEY = (1, 5, Kind.STATE, 7)
 STEPS = st.lists(st.tuples(st.integers(1, 60), st.integers(1, 60)), max_size=80)
 
 
 @given(STEPS)
 def test_a_stream_knows_exactly_what_was_admitted_or_never_comes(steps: list[tuple[int, int]]) -> None:
-    stream, admitted, floor = Stream(), set(), 0
+    stream, admitted, floor = Stream(KEY), set(), 0
     for seq, held in steps:
         floor = max(floor, min(held, seq) - 1)
         stream.raise_to(min(held, seq))
@@ -29,7 +30,7 @@ def test_a_stream_knows_exactly_what_was_admitted_or_never_comes(steps: list[tup
 
 
 def test_a_stream_without_gaps_is_one_number() -> None:
-    stream = Stream()
+    stream = Stream(KEY)
     for seq in range(1, 5001):
         assert stream.admit(seq)
     assert (stream.low, len(stream.seen)) == (5000, 0)
@@ -37,7 +38,7 @@ def test_a_stream_without_gaps_is_one_number() -> None:
 
 def test_no_seq_however_far_ahead_takes_more_room_than_one_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(streams, "MAX_GAPS", 3)
-    stream = Stream()
+    stream = Stream(KEY)
     assert [stream.admit(2**62 - k) for k in range(4)] == [True, True, True, False]
     assert not stream.admitted(2**62 - 3)
     assert stream.admit(1)

@@ -17,7 +17,7 @@ import pytest
 
 from fleet_service.archive import reading, segments
 from fleet_service.archive.files import lock
-from fleet_service.archive.pseudonyms import Pseudonyms, number
+from fleet_service.archive.pseudonyms import Pseudonyms, number, texts
 from fleet_service.engine import Engine
 from fleet_service.ingest import Message
 from schemas import tables, wire
@@ -178,6 +178,13 @@ def test_other_tools_read_the_segments(engine: Engine, tmp_path: Path) -> None:
         assert db.execute(query, [pattern]).fetchone() == (4, 2, 2, pytest.approx(0.7, abs=1e-3))
     (path,) = segments.paths(tmp_path, Kind.OBSERVATION)
     assert list(pd.read_parquet(path).columns) == tables.OBSERVATION_ARCHIVE.names
+
+
+def test_a_pseudonym_is_its_number_and_its_number_is_the_pseudonym(tmp_path: Path) -> None:
+    names = [Pseudonyms(tmp_path).of(f"sim-{k:03}", 0) for k in range(50)]
+    numbers = np.array([number(name) for name in names])
+    assert (numbers < 0).any(), "numbers of either sign are shown"
+    assert texts(numbers).astype(str).tolist() == names
 
 
 def test_a_pseudonym_holds_for_its_month_and_across_restarts_and_not_beyond(tmp_path: Path) -> None:
