@@ -73,11 +73,36 @@ def _near(tiles: list[int], query: MapQuery) -> list[int]:
 
 
 def _shown(shown: Shown, query: MapQuery, tile: int) -> bytes | None:
-    """What a query asks for of a tile as it is shown: most often all of it, as it lies there."""
-    keep = _asked(shown.columns, query)
-    if query.format is Format.ARROW and keep.all():
-        return shown.payload if len(keep) else None
-    return _rendered(shown.cells, keep, query, tile)
+    """What a query asks for of a tile as it is shown: most often all of it, as it lies there, or a run of its lines.
+
+    Every step that lets go of the interpreter may wait for it again behind whoever is busy, ten times as long as it
+    takes; so cells are compared one by one only where it must be.
+    """
+    begin, end = _lines(shown, query)
+    if begin >= end:
+        return None
+    if not _all(shown, query):
+        part = {name: column[begin:end] for name, column in shown.columns.items()}
+        return _rendered(shown.cells.slice(begin, end - begin), _asked(part, query), query, tile)
+    if end - begin == len(shown.cells) and query.format is Format.ARROW:
+        return shown.payload
+    return render(shown.cells.slice(begin, end - begin), query.format, grid.quadkey(tile, grid.TILE_ZOOM))
+
+
+def _lines(shown: Shown, query: MapQuery) -> tuple[int, int]:
+    """First and last of the cells whose lines touch the box."""
+    if query.bbox is None:
+        return 0, len(shown.cells)
+    _, south, _, north = query.bbox
+    columns = shown.columns
+    return int(columns["north"].searchsorted(south, "right")), int(columns["south"].searchsorted(north, "left"))
+
+
+def _all(shown: Shown, query: MapQuery) -> bool:
+    """Whether a query wants all cells of the lines that touch its box."""
+    vehicles, east, west = shown.common
+    touched = query.bbox is None or (east > query.bbox[0] and west < query.bbox[2])
+    return touched and query.min_vehicles <= vehicles
 
 
 def _rendered(cells: pa.RecordBatch, keep: BoolArray, query: MapQuery, tile: int) -> bytes | None:

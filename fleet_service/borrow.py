@@ -44,7 +44,7 @@ def borrowed(fusion: Fusion, tile: int, slots: IntArray, route: tuple[IntArray, 
     np.minimum.at(first, group, fusion.live.first[lender])
     np.maximum.at(last, group, fusion.live.time[lender])
     cells = Cells(
-        wanted // grid.SECTORS, wanted % grid.SECTORS, belief, ["borrowed"] * len(wanted), vehicles,
+        wanted // grid.SECTORS, wanted % grid.SECTORS, belief, None, vehicles,
         np.zeros(len(wanted), np.int64), first, last, now,
     )  # fmt: skip
     return pa.Table.from_batches([map_batch(cells)])

@@ -13,7 +13,7 @@ from fleet_service.fusion import Fusion
 from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.fusion.stores import distinct
 from schemas import grid, mugrid, tables
-from schemas.numeric import Float32Array, FloatArray, IntArray
+from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray
 
 CountArray = NDArray[np.integer[Any]]
 LOWER, UPPER = 0.05, 0.95  # of the interval
@@ -95,21 +95,23 @@ def tile_of(fusion: Fusion, slots: IntArray) -> IntArray:
     return grid.tile_of(fusion.live.key[slots] // grid.SECTORS)
 
 
-def basis_of(belief: FloatArray, values: Float32Array) -> list[str]:
-    """`measured` or `bound` of each belief (k, 32), given how many votes with a value it had (k,)."""
-    upper = mugrid.quantiles(belief, UPPER)
-    width = upper - mugrid.quantiles(belief, LOWER)
-    measured = (values > 0) & ((upper < PRIOR_UPPER - MEASURED_DROP) | (width < MEASURED_WIDTH * PRIOR_WIDTH))
-    return ["measured" if is_so else "bound" for is_so in measured.tolist()]
+def measured(lower: FloatArray, upper: FloatArray, values: Float32Array) -> BoolArray:
+    """Whether a value, and not only bounds, made beliefs what they are: (k,), of the interval's ends and how many votes
+    with a value there were (k,)."""
+    narrow = upper - lower < MEASURED_WIDTH * PRIOR_WIDTH
+    return np.asarray((values > 0) & ((upper < PRIOR_UPPER - MEASURED_DROP) | narrow))
 
 
 class Cells(NamedTuple):
-    """What a fusion knows of cells: columns (k,) and beliefs (k, 32), read at `now` [ns]."""
+    """What a fusion knows of cells: columns (k,) and beliefs (k, 32), read at `now` [ns].
+
+    `values` are the votes with a value; None where all is borrowed.
+    """
 
     cell: IntArray
     sector: IntArray
     belief: FloatArray
-    basis: list[str]
+    values: Float32Array | None
     vehicles: CountArray
     observations: CountArray
     first: IntArray
@@ -122,7 +124,7 @@ def cells_at(fusion: Fusion, slots: IntArray, now: int) -> Cells:
     belief, live = fusion.beliefs(slots, now), fusion.live
     key = live.key[slots]
     return Cells(
-        key // grid.SECTORS, key % grid.SECTORS, belief, basis_of(belief, live.values[slots]), live.vehicles[slots],
+        key // grid.SECTORS, key % grid.SECTORS, belief, live.values[slots], live.vehicles[slots],
         live.visits[slots], live.first[slots], live.time[slots], now,
     )  # fmt: skip
 
@@ -137,9 +139,11 @@ def map_batch(cells: Cells) -> pa.RecordBatch:
     latitude, longitude = grid.centre(cells.cell)
     west, south, east, north = grid.bounds(cells.cell)
     lower, middle, upper = (mugrid.quantiles(cells.belief, q) for q in (LOWER, 0.5, UPPER))
+    basis = np.full(len(lower), _BORROWED) if cells.values is None else measured(lower, upper, cells.values)
     columns: dict[str, Any] = {
         "cell": cells.cell, "sector": cells.sector, "mu": middle, "mu_lower": lower, "mu_upper": upper,
-        "p_slippery": cells.belief @ SLIPPERY_SHARE, "basis": cells.basis, "vehicles": cells.vehicles,
+        "p_slippery": cells.belief @ SLIPPERY_SHARE, "basis": _BASES.take(basis.astype(np.int8)),
+        "vehicles": cells.vehicles,
         "observations": cells.observations, "first_time": cells.first, "last_time": cells.last,
         "age_s": np.maximum(cells.now - cells.last, 0) * 1e-9,
         "latitude": latitude, "longitude": longitude, "west": west, "south": south, "east": east, "north": north,
@@ -154,5 +158,7 @@ def arrow_stream(cells: pa.RecordBatch) -> bytes:
     return b"".join([_SCHEMA, cells.serialize(), _END])
 
 
+_BASES: Final = pa.array(["bound", "measured", "borrowed"])
+_BORROWED: Final = 2
 _SCHEMA: Final = tables.MAP_SCHEMA.serialize().to_pybytes()
 _END: Final = b"\xff\xff\xff\xff\x00\x00\x00\x00"  # a message without a head: the stream's end

@@ -6,14 +6,17 @@ for: what an answer can be no fresher than by more than a put can. Most question
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from typing import Any, Final, NamedTuple
 
+import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_service.map_state import MapState, arrow_stream, cells_at, map_batch
+from schemas import grid
 from schemas.numeric import IntArray
 
 SHOWN_NS: Final = 1_000_000_000  # as old as a tile that is put once a second may be
@@ -26,8 +29,9 @@ class Shown(NamedTuple):
 
     Attributes:
         payload: as an Arrow stream.
-        cells: the same; shares the payload's memory.
+        cells: the same, from south to north; shares the payload's memory.
         columns: FILTERED as arrays (k,).
+        common: what all cells have: so many vehicles, an eastern border east of this and a western one west of this.
         made: when [ns].
         change: the last change of the map that is in it.
     """
@@ -35,6 +39,7 @@ class Shown(NamedTuple):
     payload: bytes
     cells: pa.RecordBatch
     columns: Mapping[str, NDArray[Any]]
+    common: tuple[int, float, float]
     made: int
     change: int
 
@@ -73,12 +78,17 @@ class Tiles:
             cells = cells_at(self.state.fusion, self._public(self.state.slots(tile)), now)
         payload = arrow_stream(map_batch(cells))
         batch = pa.ipc.open_stream(payload).read_next_batch()
-        made = Shown(payload, batch, filtered(batch), now, change)
+        columns = filtered(batch)
+        made = Shown(payload, batch, columns, _common(columns), now, change)
         self._keep(tile, made)
         return made
 
     def _public(self, slots: IntArray) -> IntArray:
-        return slots[self.state.fusion.live.vehicles[slots] >= self._least]
+        """The public ones, from south to north."""
+        live = self.state.fusion.live
+        public = slots[live.vehicles[slots] >= self._least]
+        _, row = grid.deinterleave(live.key[public] // grid.SECTORS)
+        return public[np.argsort(-row, kind="stable")]
 
     def _keep(self, tile: int, made: Shown) -> None:
         with self.guard:
@@ -91,6 +101,12 @@ class Tiles:
     def _drop(self, tile: int) -> None:
         kept = self._kept.pop(tile, None)
         self._held -= len(kept.payload) if kept else 0
+
+
+def _common(columns: Mapping[str, NDArray[Any]]) -> tuple[int, float, float]:
+    if not len(columns["vehicles"]):
+        return 0, -math.inf, math.inf
+    return int(columns["vehicles"].min()), float(columns["east"].min()), float(columns["west"].max())
 
 
 def filtered(cells: pa.RecordBatch) -> dict[str, NDArray[Any]]:

@@ -19,8 +19,8 @@ from fleet_service.archive.rebuild import observations
 from fleet_service.evaluation.drive import LATENESS_S
 from fleet_service.evaluation.score import Scores, of_beliefs, safe
 from fleet_service.fusion import Fusion, Observations
-from fleet_service.map_state import basis_of
-from schemas import grid, wire
+from fleet_service.map_state import LOWER, UPPER, measured
+from schemas import grid, mugrid, wire
 from schemas.errors import InputError
 from schemas.numeric import FloatArray, IntArray
 
@@ -57,9 +57,10 @@ def measure(drive: Drive, folder: Path) -> dict[str, float]:
     slots, truth = slots[several], truth[several]
     belief = fusion.beliefs(slots, int(fusion.live.time[: fusion.size].max()))
     scores = of_beliefs(belief, truth, excited(fusion, visits)[slots])
-    measured = np.array(basis_of(belief, fusion.live.values[slots])) == "measured"
-    pure = measured & one_surface(fusion, visits)[slots]
-    return _figures(scores, measured) | {
+    lower, upper = (mugrid.quantiles(belief, q) for q in (LOWER, UPPER))
+    with_value = measured(lower, upper, fusion.live.values[slots])
+    pure = with_value & one_surface(fusion, visits)[slots]
+    return _figures(scores, with_value) | {
         "fusion.whole_way.rmse.one_surface": mean(scores.error[pure] ** 2) ** 0.5,
         "fusion.whole_way.safe95": safe(scores),
         "fusion.whole_way.observations": float(len(columns["cell"])),

@@ -8,9 +8,13 @@ import numpy as np
 import pytest
 
 from fleet_service import tiles
+from fleet_service.answer import answer
 from fleet_service.fusion import Fusion
 from fleet_service.map_state import MapState
 from fleet_service.tiles import Tiles
+from schemas import grid
+from schemas.query import MapQuery
+from schemas.tiles import decode_tile
 from tests.fleet_service.examples import SECOND, START, TILE, observations, value
 
 NOW = START + 60 * SECOND
@@ -87,3 +91,28 @@ def test_what_is_shown_is_a_copy_that_later_visits_do_not_change(state: MapState
     before = np.array(made.columns["vehicles"])
     visit(state, 2)
     assert (made.columns["vehicles"] == before).all()
+
+
+def test_a_box_gets_exactly_the_cells_that_it_touches_wherever_its_borders_lie() -> None:
+    state, rng = MapState(Fusion(120.0)), np.random.default_rng(0)
+    for vehicle in (1, 2):
+        for cell in (TILE << 14) + rng.choice(1 << 14, 60, replace=False):
+            visit(state, vehicle, int(cell))
+    made = Tiles(state, nullcontext(), 1)
+    cells = made.shown(TILE, NOW).cells.to_pylist()
+    west, south, east, north = (float(border) for border in grid.bounds(TILE, grid.TILE_ZOOM))
+    lengths = set()
+    for _ in range(200):
+        x, y = np.sort(rng.uniform(west - 0.02, east + 0.02, 2)), np.sort(rng.uniform(south - 0.01, north + 0.01, 2))
+        query = MapQuery(bbox=(x[0], y[0], x[1], y[1]), min_vehicles=int(rng.integers(1, 3)))
+        wanted = {
+            cell["cell"] for cell in cells
+            if cell["east"] > x[0] and cell["west"] < x[1] and cell["north"] > y[0] and cell["south"] < y[1]
+            and cell["vehicles"] >= query.min_vehicles
+        }  # fmt: skip
+        replies = dict(answer(made, query, lambda tile: tile == TILE, NOW, TILE))
+        told = decode_tile(replies[TILE])["cell"].to_pylist() if replies else []
+        assert set(told) == wanted
+        assert len(told) == len(wanted)
+        lengths.add(len(wanted))
+    assert {0, len(cells)} < lengths
