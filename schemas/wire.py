@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cache
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from google.protobuf import json_format
@@ -138,8 +138,7 @@ def parse(payload: bytes, encoding: str, message: type[Any], expected: str) -> A
     raise WireError("encoding", f"{encoding[:80]!r}", f"use {expected} or {JSON}")
 
 
-@dataclass(frozen=True)
-class StreamAck:
+class StreamAck(NamedTuple):
     """Settled batches of one stream: ranges of seq, both ends included, and (seq, row, reason) of the refused ones."""
 
     boot: int
@@ -153,11 +152,13 @@ def encode_ack(vehicle: str, streams: list[StreamAck]) -> bytes:
     """Protobuf bytes of an acknowledgement."""
     message = pb.Ack(vehicle=vehicle)
     for stream in streams:
-        message.streams.add(
-            boot=stream.boot, kind=_PB_KIND[stream.kind], region=stream.region,
-            durable=[pb.SeqRange(first=first, last=last) for first, last in stream.durable],
-            rejected=[pb.Rejection(seq=seq, row=row, reason=reason) for seq, row, reason in stream.rejected],
-        )  # fmt: skip
+        told = message.streams.add()  # field by field: half of what keyword arguments take
+        told.boot, told.kind, told.region = stream.boot, _PB_KIND[stream.kind], stream.region
+        for first, last in stream.durable:
+            run = told.durable.add()
+            run.first, run.last = first, last
+        for seq, row, reason in stream.rejected:
+            told.rejected.add(seq=seq, row=row, reason=reason)
     return message.SerializeToString()
 
 
