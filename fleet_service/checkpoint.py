@@ -13,10 +13,10 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_service.fusion import Fusion
-from fleet_service.fusion.state import fusion_of, image_of
+from fleet_service.fusion.state import LAYOUT, fusion_of, image_of
 from schemas.errors import InputError
 
-VERSION = "1"  # of the layout; another one is not read but replayed
+VERSION = f"2-{LAYOUT}"  # another one is not read but replayed
 _KEY = b"gripmap.checkpoint"
 
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from fleet_service.fusion import constants as c
 from schemas import mugrid
-from schemas.numeric import ByteArray, Float32Array, FloatArray, lean
+from schemas.numeric import ByteArray, Float32Array, FloatArray, lean_inlined
 
 PackedArray = NDArray[np.uint16]
 Bins = NDArray[np.floating[Any]]
@@ -35,6 +35,7 @@ _STEP: Final = 0.25  # largest share that leaves a bin to each side in one diffu
 _STEPS: Final = 64  # one day; by then the change hazard has levelled everything
 _LIKELIHOOD: Final = np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT).astype(np.float32)
 _CENTRES: Final = mugrid.CENTRES
+_PLACES: Final[Float32Array] = mugrid.CENTRES.astype(np.float32)
 _EDGE: Final = (c.SLIPPERY - mugrid.LOWER) / c.BIN_WIDTH
 SLIPPERY_SHARE: Final[FloatArray] = np.clip(_EDGE - np.arange(_BINS), 0.0, 1.0)  # of each bin that lies below SLIPPERY
 PRIOR: Final[Float32Array] = mugrid.PRIOR.astype(np.float32)
@@ -85,42 +86,58 @@ def read(p: FloatArray) -> FloatArray:
     return np.asarray(road / road.sum(axis=1, keepdims=True))
 
 
-@lean
+@lean_inlined
 def total(p: Bins) -> float:
-    """Sum of 32 numbers, in four strands: a single one waits for itself."""
-    a, b, d, e = p[0], p[1], p[2], p[3]
-    for i in range(4, _BINS, 4):
+    """Sum of 32 numbers, in eight strands: a single one waits for itself."""
+    a, b, d, e, f, g, h, j = p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7]
+    for i in range(8, _BINS, 8):
         a += p[i]
         b += p[i + 1]
         d += p[i + 2]
         e += p[i + 3]
-    return (a + b) + (d + e)  # type: ignore[no-any-return]
+        f += p[i + 4]
+        g += p[i + 5]
+        h += p[i + 6]
+        j += p[i + 7]
+    return ((a + f) + (b + g)) + ((d + h) + (e + j))  # type: ignore[no-any-return]
 
 
-@lean
+@lean_inlined
+def largest(p: Bins) -> float:
+    """Largest of 32 numbers, in eight strands."""
+    a, b, d, e, f, g, h, j = p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7]
+    for i in range(8, _BINS, 8):
+        a = p[i] if p[i] > a else a
+        b = p[i + 1] if p[i + 1] > b else b
+        d = p[i + 2] if p[i + 2] > d else d
+        e = p[i + 3] if p[i + 3] > e else e
+        f = p[i + 4] if p[i + 4] > f else f
+        g = p[i + 5] if p[i + 5] > g else g
+        h = p[i + 6] if p[i + 6] > h else h
+        j = p[i + 7] if p[i + 7] > j else j
+    return max(max(max(a, b), max(d, e)), max(max(f, g), max(h, j)))  # type: ignore[no-any-return]
+
+
+@lean_inlined
 def unpack(belief: PackedArray, row: int, p: Bins) -> None:
     """p of a belief at rest."""
-    whole = 0
+    whole = np.uint32(0)
     for i in range(_BINS):
-        whole += belief[row, i]
+        whole = np.uint32(whole + belief[row, i])
     scale = np.float32(1.0) / np.float32(whole)
     for i in range(_BINS):
         p[i] = np.float32(belief[row, i]) * scale
 
 
-@lean
+@lean_inlined
 def pack(p: Bins, belief: PackedArray, row: int) -> None:
     """Put a belief at rest; it need not be normalised. Rounding keeps a rising one rising and a uniform one uniform."""
-    a, b = p[0], p[1]
-    for i in range(2, _BINS, 2):
-        a = max(a, p[i])
-        b = max(b, p[i + 1])
-    scale = np.float32(FULL) / np.float32(max(a, b))
+    scale = np.float32(FULL) / np.float32(largest(p))
     for i in range(_BINS):
         belief[row, i] = np.uint16(np.float32(p[i]) * scale + np.float32(0.5))
 
 
-@lean
+@lean_inlined
 def mix(p: Bins, change: float, prior: Float32Array) -> None:
     """p ← (1 - h)·p + h·prior, in place."""
     h = np.float32(change)
@@ -128,7 +145,7 @@ def mix(p: Bins, change: float, prior: Float32Array) -> None:
         p[i] += h * (prior[i] - p[i])
 
 
-@lean
+@lean_inlined
 def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded: Bins) -> None:
     """Let time pass: diffusion over `drift_s` with reflecting ends, then the hazard of a change over `change_s`.
 
@@ -149,7 +166,7 @@ def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded
         mix(p, -math.expm1(-change_s / c.CHANGE_S), prior)
 
 
-@lean
+@lean_inlined
 def doubt(p: Bins, change_s: float, power: float, prior: Float32Array) -> None:
     """Make up what `forget` over `change_s` lacks to CHANGE_LEAST, for a value of which `power` is new. In place."""
     lacking = c.CHANGE_LEAST * power + math.expm1(-max(change_s, 0.0) / c.CHANGE_S)
@@ -157,7 +174,7 @@ def doubt(p: Bins, change_s: float, power: float, prior: Float32Array) -> None:
         mix(p, lacking, prior)
 
 
-@lean
+@lean_inlined
 def kind_of(evidence: ByteArray) -> int:
     """VALUE where the likelihood falls towards the upper end by more than senders differ; else BOUND."""
     least = np.uint8(255)
@@ -166,7 +183,7 @@ def kind_of(evidence: ByteArray) -> int:
     return VALUE if evidence[_BINS - 1] >= int(least) + c.VALUE_DROP_STEPS else BOUND
 
 
-@lean
+@lean_inlined
 def spread(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> None:
     """L̃ of a visit into `out` (32), mean 1. The fall of a BOUND above its maximum is noise and is levelled.
 
@@ -190,7 +207,7 @@ def spread(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> None:
         out[i] *= scale
 
 
-@lean
+@lean_inlined
 def vote(p: Bins, spread_likelihood: Bins, strength: float) -> None:
     """p ← p·(s·L̃ + 1 - s), in place and not normalised."""
     s, rest = np.float32(strength), np.float32(1.0 - strength)
@@ -198,16 +215,24 @@ def vote(p: Bins, spread_likelihood: Bins, strength: float) -> None:
         p[i] *= s * spread_likelihood[i] + rest
 
 
-@lean
+@lean_inlined
 def mean_of(likelihood: Bins) -> float:
     """Mean of a likelihood of mean 1 against the uniform prior."""
-    first = 0.0
-    for i in range(_BINS):
-        first += likelihood[i] * _CENTRES[i]
-    return first / _BINS
+    a, b, d, e = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    f, g, h, j = a, a, a, a
+    for i in range(0, _BINS, 8):
+        a += likelihood[i] * _PLACES[i]
+        b += likelihood[i + 1] * _PLACES[i + 1]
+        d += likelihood[i + 2] * _PLACES[i + 2]
+        e += likelihood[i + 3] * _PLACES[i + 3]
+        f += likelihood[i + 4] * _PLACES[i + 4]
+        g += likelihood[i + 5] * _PLACES[i + 5]
+        h += likelihood[i + 6] * _PLACES[i + 6]
+        j += likelihood[i + 7] * _PLACES[i + 7]
+    return float(((a + f) + (b + g)) + ((d + h) + (e + j))) / _BINS
 
 
-@lean
+@lean_inlined
 def describe(likelihood: Bins, mean: float) -> tuple[float, float]:
     """Standard deviation about `mean`, and P(slippery), of a likelihood of mean 1 against the uniform prior."""
     second, slippery = 0.0, 0.0

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from fleet_service.fusion.belief import FULL, PackedArray
 from schemas import mugrid
-from schemas.numeric import Float32Array, IntArray, lean
+from schemas.numeric import LINE, Float32Array, IntArray, lean, lean_inlined
 
 NONE: Final = -1
 NOBODY: Final = -1
 SECOND: Final = 10**9  # ns
-LINE: Final = 64  # bytes that a processor reads at once
 Records = NDArray[np.void]
 Int32Array = NDArray[np.int32]
 UIntArray = NDArray[np.uint32]
@@ -45,7 +44,7 @@ class Cells(NamedTuple):
         values: (n,) votes with a value, fractions of repeated ones summed.
         crowd: (n, 2) bounds and values of vehicles that are not trusted, as far as they are not renewed.
         window: (n,) row of the slot's window, or NONE.
-        voice: (n,) row of its voices, or NONE where nobody gave a value.
+        voice: (n,) row of its voices, or NONE where nobody gave a value or bore witness lately.
     """
 
     belief: PackedArray
@@ -89,7 +88,7 @@ def begin(belief: PackedArray, cells: Records, slot: int, key: int) -> None:
     cells[slot].voice = NONE
 
 
-@lean
+@lean_inlined
 def copy_slot(
     belief: PackedArray, cells: Records, at: int, to_belief: PackedArray, to_cells: Records, to: int
 ) -> None:  # fmt: skip

@@ -213,7 +213,7 @@ class Fusion:
             stores = self.stores
             for due in stores.due_windows(before):
                 settle(stores.state, self._weather, stores.peers, stores.names, due, before)
-            stores.forget_pairs(before // SECOND)
+            stores.forget(before // SECOND)
             weights = self.trusts[-1][1]
             joined = np.full(stores.vehicles - len(weights), newcomer(False), np.float32)
             weights, established = trusted(stores.peers, np.append(weights, joined))

@@ -7,13 +7,13 @@ import numpy as np
 from fleet_service.fusion.belief import VALUE
 from fleet_service.fusion.cells import NONE, SECOND, Records
 from fleet_service.fusion.pools import PAIRS
-from fleet_service.fusion.table import pair_place
-from schemas.numeric import BoolArray, IntArray, compiled, lean
+from fleet_service.fusion.table import AHEAD, pair_place
+from schemas.numeric import IntArray, ask, compiled, lean_inlined
 
 _FIBONACCI = np.uint64(0x9E3779B97F4A7C15)  # 2⁶⁴ over the golden ratio: its multiples lie far apart
 
 
-@lean
+@lean_inlined
 def earlier(entries: Records, a: int, b: int) -> bool:
     """Whether entry `a` is folded before `b`: by time, then by identity."""
     if entries[a].time != entries[b].time:
@@ -25,7 +25,7 @@ def earlier(entries: Records, a: int, b: int) -> bool:
     return bool(entries[a].place < entries[b].place)
 
 
-@lean
+@lean_inlined
 def pair_of(pairs: Records, used: IntArray, slot: int, vehicle: int) -> int:
     """Place of a pair; makes it where there is none."""
     pair = pair_place(pairs, slot, vehicle)
@@ -40,7 +40,7 @@ def pair_of(pairs: Records, used: IntArray, slot: int, vehicle: int) -> int:
     return pair
 
 
-@lean
+@lean_inlined
 def chain(entries: Records, pairs: Records, pair: int, entry: int) -> None:
     """Put an entry among those of its vehicle in its window."""
     pairs[pair].waiting += 1
@@ -58,7 +58,7 @@ def chain(entries: Records, pairs: Records, pair: int, entry: int) -> None:
         entries[after].before = entry
 
 
-@lean
+@lean_inlined
 def remember(entries: Records, pairs: Records, entry: int) -> None:
     """What an entry said becomes what its vehicle said before the checkpoint; later ones stand alone."""
     pair, kind = int(entries[entry].pair), int(entries[entry].kind)
@@ -74,27 +74,48 @@ def remember(entries: Records, pairs: Records, entry: int) -> None:
         entries[entries[entry].after].before = NONE
 
 
+@lean_inlined
+def _stays(pairs: Records, place: int, least: int) -> bool:
+    """Whether a pair spoke since `least` [s], or waits in the window."""
+    pair = pairs[place]
+    return bool(pair.last != NONE or pair.time[0] >= least or pair.time[1] >= least)
+
+
 @compiled
-def moved(entries: Records, old: Records, new: Records, stay: BoolArray) -> IntArray:
-    """Move the pairs that `stay` (places,) to another table; returns the places of the others."""
+def staying(pairs: Records, least: int) -> int:
+    """How many pairs spoke since `least` [s]."""
+    count = 0
+    for place in range(len(pairs)):
+        count += pairs[place].slot != NONE and _stays(pairs, place, least)
+    return count
+
+
+@compiled
+def moved(entries: Records, old: Records, new: Records, least: int) -> IntArray:
+    """Move the pairs that spoke since `least` [s] to another table; returns the places of the others."""
     gone, count = np.empty(len(old), np.int64), 0
-    for place in range(len(old)):
-        if old[place].slot == NONE:
-            continue
-        if not stay[place]:
-            gone[count] = place
-            count += 1
-            continue
-        to = pair_place(new, old[place].slot, old[place].vehicle)
-        new[to] = old[place]
-        entry = int(old[place].last)
-        while entry != NONE:
-            entries[entry].pair = to
-            entry = int(entries[entry].before)
+    for begin in range(0, len(old), AHEAD):
+        end = min(begin + AHEAD, len(old))
+        for place in range(begin, end):
+            if old[place].slot != NONE and old[place].last != NONE:
+                ask(entries, old[place].last, 0)
+        for place in range(begin, end):
+            if old[place].slot == NONE:
+                continue
+            if not _stays(old, place, least):
+                gone[count] = place
+                count += 1
+                continue
+            to = pair_place(new, old[place].slot, old[place].vehicle)
+            new[to] = old[place]
+            entry = int(old[place].last)
+            while entry != NONE:
+                entries[entry].pair = to
+                entry = int(entries[entry].before)
     return gone[:count]
 
 
-@lean
+@lean_inlined
 def returning(number: int) -> np.uint64:
     """The bit of `Cells.returned` that a vehicle has."""
     return np.uint64(1) << ((np.uint64(number) * _FIBONACCI) >> np.uint64(58))

@@ -18,36 +18,40 @@ from schemas.numeric import IntArray
 GRIP, ICE = 0, 1  # what a witness says
 WITNESSES: Final = 5  # remembered per slot of each kind: as many as an alert ever needs
 
+# What a vehicle said last, its mean, standard deviation and votes spent, is remembered in 16 bits: parts of 1/FINE, and
+# below 4 all. In the window as before the checkpoint, so that it does not matter which of the two is asked.
+FINE: Final = 16384.0
+
 # One observation in one cell. `previous` and `following` link the slot's window in order of time, `before` and `after`
 # the entries of one vehicle in it; `pair` is the place of their pair. `number`, `boot`, `place` order equal times.
 # `mean`, `std`, `slippery` describe the vote; `power`, `last_mean`, `last_std`, `spent`, `fresh` say what the same
-# vehicle had said before.
+# vehicle had said before. What settling reads lies in the first line of two.
 ENTRY: Final = np.dtype(
     [("previous", "i4"), ("following", "i4"), ("before", "i4"), ("after", "i4"), ("pair", "i4"), ("vehicle", "i4"),
-     ("kind", "i1"), ("fresh", "i1"), ("weight", "f4"), ("time", "i8"), ("number", "i8"), ("boot", "i8"),
-     ("place", "i8"), ("share", "f4"), ("mean", "f4"), ("std", "f4"), ("slippery", "f4"), ("power", "f4"),
-     ("last_mean", "f4"), ("last_std", "f4"), ("spent", "f4"), ("evidence", "u1", (mugrid.BINS,))],
-    align=True,
+     ("kind", "i1"), ("fresh", "i1"), ("last_mean", "u2"), ("last_std", "u2"), ("spent", "u2"), ("time", "i8"),
+     ("weight", "f4"), ("share", "f4"), ("power", "f4"), ("mean", "f4"), ("std", "f4"), ("slippery", "f4"),
+     ("number", "i8"), ("boot", "i8"), ("place", "i8"), ("evidence", "u1", (mugrid.BINS,)), ("unused", "i8")]
 )  # fmt: skip
 # The window of a slot: its first and last entry, the first one's time, how many are values; `stale` says that the live
-# row waits to be folded anew; the witnesses as they were before the checkpoint. A window that is not in use has slot
-# NONE.
+# row waits to be folded anew. A window that is not in use has slot NONE.
 WINDOW: Final = np.dtype(
-    [("slot", "i4"), ("head", "i4"), ("tail", "i4"), ("stale", "i4"), ("first", "i8"), ("values", "i4"),
-     ("witness", "i4", (2, WITNESSES)), ("witnessed", "u4", (2, WITNESSES))]
+    [("slot", "i4"), ("head", "i4"), ("tail", "i4"), ("stale", "i4"), ("first", "i8"), ("values", "i8")]
 )  # fmt: skip
+# The last WITNESSES of grip and ice in a slot, when [s].
+WITNESSED: Final = [("witness", "i4", (2, WITNESSES)), ("witnessed", "u4", (2, WITNESSES))]
+KEPT_VOICE: Final = np.dtype(WITNESSED)
 # What a vehicle last said in a cell before the checkpoint: a hash table of (slot, vehicle). `last` is the newest of
 # the pair's `waiting` entries in the window. Columns are the kinds BOUND and VALUE; `time` [s] is 0 where it said
-# nothing of the kind; `std` is the value's.
+# nothing of the kind; `std` is the value's. Half a line, so that none lies in two.
 PAIR: Final = np.dtype(
-    [("slot", "i4"), ("vehicle", "i4"), ("last", "i4"), ("waiting", "i4"), ("time", "u4", (2,)), ("mean", "f4", (2,)),
-     ("std", "f4"), ("spent", "f4", (2,))]
+    [("slot", "i4"), ("vehicle", "i4"), ("last", "i4"), ("waiting", "u2"), ("std", "u2"), ("time", "u4", (2,)),
+     ("mean", "u2", (2,)), ("spent", "u2", (2,))]
 )  # fmt: skip
-# Of a slot with a value: the last SPEAKERS vehicles that gave one before the checkpoint, when [s] and what; the last
-# WITNESSES of grip and ice, when [s].
+# Of a slot with a value or a witness lately: the last SPEAKERS vehicles that gave a value before the checkpoint, when
+# [s] and what; and the witnesses.
 VOICE: Final = np.dtype(
     [("speaker", "i4", (c.SPEAKERS,)), ("spoke", "u4", (c.SPEAKERS,)), ("mean", "f4", (c.SPEAKERS,)),
-     ("std", "f4", (c.SPEAKERS,)), ("witness", "i4", (2, WITNESSES)), ("witnessed", "u4", (2, WITNESSES))]
+     ("std", "f4", (c.SPEAKERS,)), *WITNESSED]
 )  # fmt: skip
 # Whom a vehicle met: the other, the pair's rank, agreement and meetings.
 PEER: Final = np.dtype(
@@ -62,14 +66,16 @@ FREE_WINDOWS, FREE_ENTRIES, PAIRS, VOICES = range(4)
 class State(NamedTuple):
     """All that compiled code works on.
 
-    `belief` and `cells` are the slots as they are now. `kept_belief` and `kept` are, row by row of `windows`, what they
-    were before the checkpoint. `free_windows` and `free_entries` are stacks of free rows.
+    `belief`, `cells` and `voices` are the slots as they are now. `kept_belief`, `kept` and, where there is a voice,
+    `kept_voices` are, row by row of `windows`, what they were before the checkpoint. `free_windows` and `free_entries`
+    are stacks of free rows.
     """
 
     belief: PackedArray
     cells: Records
     kept_belief: PackedArray
     kept: Records
+    kept_voices: Records
     windows: Records
     free_windows: Int32Array
     entries: Records

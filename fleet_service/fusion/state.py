@@ -1,28 +1,44 @@
 """All that a fusion knows as plain arrays, and back: so that a snapshot goes on exactly where the fusion was. Pure.
 
-A column is a one-dimensional array. Columns of one length belong together: `Image` is a table of tables, by name.
+A column is a one-dimensional array, records are a column of bytes. Columns of one length belong together: `Image` is a
+table of tables, by name. LAYOUT tells what the bytes mean, by every field's name, place and order of bytes.
 """
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import fields
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_service.fusion.cells import CELL, Records
+from fleet_service.fusion.belief import PackedArray
+from fleet_service.fusion.cells import CELL, Records, no_beliefs, rows_of_lines
 from fleet_service.fusion.fuse import Fusion
-from fleet_service.fusion.pools import ENTRY, FREE_ENTRIES, FREE_WINDOWS, PAIR, PEER, VEHICLE, VOICE, VOICES, WINDOW
+from fleet_service.fusion.pools import (
+    ENTRY,
+    FREE_ENTRIES,
+    FREE_WINDOWS,
+    KEPT_VOICE,
+    PAIR,
+    PEER,
+    VEHICLE,
+    VOICE,
+    VOICES,
+    WINDOW,
+)  # fmt: skip
 from fleet_service.fusion.stores import Stores
 from fleet_service.fusion.weather import Reports
 from schemas import mugrid
+from schemas.numeric import ByteArray
 
 Image = dict[str, dict[str, NDArray[Any]]]
 _RECORDS: Final = {
-    "cells": CELL, "kept": CELL, "windows": WINDOW, "entries": ENTRY, "pairs": PAIR, "voices": VOICE, "peers": PEER,
-    "names": VEHICLE,
+    "cells": CELL, "kept": CELL, "kept_voices": KEPT_VOICE, "windows": WINDOW, "entries": ENTRY, "pairs": PAIR,
+    "voices": VOICE, "peers": PEER, "names": VEHICLE,
 }  # fmt: skip
+LAYOUT: Final = hashlib.blake2b(repr([kind.descr for kind in _RECORDS.values()]).encode(), digest_size=8).hexdigest()
 _BELIEFS: Final = ("belief", "kept_belief")
 
 
@@ -31,7 +47,9 @@ def image_of(fusion: Fusion) -> Image:
     stores, state = fusion.stores, fusion.stores.state
     used = {"cells": stores.size, "voices": int(state.used[VOICES]), "peers": stores.vehicles, "names": stores.vehicles}
     whole = {name: getattr(state, name, None) for name in _RECORDS} | {"peers": stores.peers, "names": stores.names}
-    image = {name: _flat(array[: used.get(name)]) for name, array in whole.items() if array is not None}
+    image: Image = {
+        name: {"bytes": _bytes(array[: used.get(name)])} for name, array in whole.items() if array is not None
+    }
     image["belief"] = {"bins": state.belief[: stores.size].reshape(-1)}
     image["kept_belief"] = {"bins": state.kept_belief.reshape(-1)}
     image["free_windows"] = {"row": state.free_windows[: int(state.used[FREE_WINDOWS])]}
@@ -54,8 +72,8 @@ def image_of(fusion: Fusion) -> Image:
 def fusion_of(image: Image, lateness_s: float) -> Fusion:
     """The fusion of an image, with the lateness that it had."""
     fusion = Fusion(lateness_s)
-    records = {name: _records(image[name], kind) for name, kind in _RECORDS.items()}
-    beliefs = {name: image[name]["bins"].reshape(-1, mugrid.BINS).copy() for name in _BELIEFS}
+    records = {name: _records(image[name]["bytes"], kind) for name, kind in _RECORDS.items()}
+    beliefs = {name: _beliefs(image[name]["bins"]) for name in _BELIEFS}
     free = {name: _padded(image[name]["row"], len(records[name.removeprefix("free_")])) for name in _FREE}
     peers, names = records.pop("peers"), records.pop("names")
     size, vehicles, hour, epoch = image["used"]["more"].tolist()
@@ -75,15 +93,19 @@ def fusion_of(image: Image, lateness_s: float) -> Fusion:
 _FREE: Final = ("free_windows", "free_entries")
 
 
-def _flat(records: Records) -> dict[str, NDArray[Any]]:
-    return {name: records[name].reshape(-1) for name in records.dtype.names or ()}
+def _bytes(records: Records) -> ByteArray:
+    return records.view(np.uint8) if len(records) else np.zeros(0, np.uint8)
 
 
-def _records(table: dict[str, NDArray[Any]], kind: np.dtype[Any]) -> Records:
-    names = kind.names or ()
-    out = np.zeros(len(table[names[0]]) // int(np.prod(kind[names[0]].shape, dtype=np.int64)), kind)
-    for name in names:
-        out[name] = table[name].reshape(out[name].shape)
+def _records(stored: ByteArray, kind: np.dtype[Any]) -> Records:
+    out = rows_of_lines(len(stored) // kind.itemsize, kind)
+    out[:] = stored.view(kind)
+    return out
+
+
+def _beliefs(bins: PackedArray) -> PackedArray:
+    out = no_beliefs(len(bins) // mugrid.BINS)
+    out.reshape(-1)[:] = bins
     return out
 
 

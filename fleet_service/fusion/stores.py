@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.cells import CELL, NONE, Cells, Int32Array, Records, cells_of, no_beliefs, rows_of_lines
-from fleet_service.fusion.pairs import mark_returned, moved
+from fleet_service.fusion.pairs import mark_returned, moved, staying
 from fleet_service.fusion.pools import (
     ENTRY,
     FREE_ENTRIES,
     FREE_WINDOWS,
+    KEPT_VOICE,
     PAIR,
     PAIRS,
     VEHICLE,
@@ -22,8 +23,9 @@ from fleet_service.fusion.pools import (
     WINDOW,
     State,
 )  # fmt: skip
-from fleet_service.fusion.table import LEAST, grown, numbered, room, rows_of, slots_for
+from fleet_service.fusion.table import LEAST, grown, is_full, numbered, room, rows_of, slots_for
 from fleet_service.fusion.trust import no_peers
+from fleet_service.fusion.window import due
 from schemas.numeric import IntArray
 
 _NOTHING = np.zeros(0, np.int32)
@@ -43,14 +45,15 @@ class Stores:
 
     def __init__(self) -> None:
         self.state = State(
-            no_beliefs(0), np.zeros(0, CELL), no_beliefs(0), np.zeros(0, CELL), np.zeros(0, WINDOW), _NOTHING,
-            np.zeros(0, ENTRY), _NOTHING, _no_pairs(LEAST), np.zeros(0, VOICE), np.zeros(4, np.int64),
+            no_beliefs(0), np.zeros(0, CELL), no_beliefs(0), np.zeros(0, CELL), np.zeros(0, KEPT_VOICE),
+            np.zeros(0, WINDOW), _NOTHING, np.zeros(0, ENTRY), _NOTHING, _no_pairs(LEAST), np.zeros(0, VOICE),
+            np.zeros(4, np.int64),
         )  # fmt: skip
         self.peers = no_peers(0)
         self.names: Records = np.zeros(0, VEHICLE)
         self.size = self.vehicles = 0
-        self._slots: Int32Array = np.full(LEAST, NONE, np.int32)
-        self._known: Int32Array = np.full(LEAST, NONE, np.int32)
+        self._slots: IntArray = np.full(LEAST, NONE, np.int64)
+        self._known: IntArray = np.full(LEAST, NONE, np.int64)
         self.hour = 0  # whose pairs were dropped last
 
     @staticmethod
@@ -79,11 +82,8 @@ class Stores:
         Values that pass the checkpoint meet others, which is what reputation is made of; so their order may not depend
         on who came first. All else is done in the order of memory.
         """
-        windows = self.state.windows
-        due = np.flatnonzero((windows["slot"] != NONE) & (windows["first"] < before))
-        quiet = windows["values"][due] == 0
-        talking = due[~quiet]
-        return due[quiet], talking[np.argsort(self.state.cells["key"][windows["slot"][talking]])]
+        quiet, talking = due(self.state.windows, before)
+        return quiet, talking[np.argsort(self.state.cells["key"][self.state.windows["slot"][talking]])]
 
     def slots_of(self, keys: IntArray) -> IntArray:
         """Slot of each key, NONE where there is none."""
@@ -92,16 +92,17 @@ class Stores:
     def slots_for(self, keys: IntArray) -> IntArray:
         """Slot of each key; new ones begin with the prior."""
         slots = self.slots_of(keys)
-        if len(slots) and slots.min() != NONE:
+        new = np.flatnonzero(slots == NONE)
+        if not len(new):
             return slots
-        most = self.size + len(distinct(keys[slots == NONE]))
-        if 3 * most > 2 * len(self._slots):
+        most = self.size + len(distinct(keys[new]))
+        if is_full(most, len(self._slots)):
             self._slots = grown(self.state.cells, self.size, room(most))
         if most > len(self.state.cells):
             rows = max(most, 2 * len(self.state.cells))
             belief, cells = _longer(self.state.belief, rows), _longer(self.state.cells, rows)
             self.state = self.state._replace(belief=belief, cells=cells)
-        slots, self.size = slots_for(self._slots, self.state.belief, self.state.cells, keys, self.size)
+        slots[new], self.size = slots_for(self._slots, self.state.belief, self.state.cells, keys[new], self.size)
         return slots
 
     def known(self, vehicle: IntArray) -> IntArray:
@@ -114,7 +115,7 @@ class Stores:
         if not len(index) or index.min() != NONE:
             return index
         most = self.vehicles + len(distinct(vehicle[index == NONE]))
-        if 3 * most > 2 * len(self._known):
+        if is_full(most, len(self._known)):
             self._known = grown(self.names, self.vehicles, room(most))
         if most > len(self.names):
             rows = max(most, 2 * len(self.names))
@@ -134,7 +135,7 @@ class Stores:
         if used[VOICES] + rows > len(self.state.voices):
             most = max(int(used[VOICES]) + rows, 2 * len(self.state.voices))
             self.state = self.state._replace(voices=_longer(self.state.voices, most))
-        if 3 * (int(used[PAIRS]) + rows) > 2 * len(self.state.pairs):
+        if is_full(int(used[PAIRS]) + rows, len(self.state.pairs)):
             self._rebuild_pairs(0, int(used[PAIRS]) + rows)
 
     def _more_entries(self, most: int) -> None:
@@ -148,27 +149,41 @@ class Stores:
         windows["slot"][len(old.windows) :] = NONE
         self.state = old._replace(
             windows=windows, kept=_longer(old.kept, rows), kept_belief=_longer(old.kept_belief, rows),
+            kept_voices=_longer(old.kept_voices, rows),
             free_windows=_restacked(old.free_windows, old.used, FREE_WINDOWS, rows),
         )  # fmt: skip
 
-    def forget_pairs(self, checkpoint_s: int) -> None:
-        """Drop what vehicles said FORGOTTEN_S before the checkpoint's hour, as `votes.recall` no longer asks for it."""
+    def forget(self, checkpoint_s: int) -> None:
+        """Once in an hour of the checkpoint drop what nobody asks for any more: what vehicles said FORGOTTEN_S before
+        it (`votes.recall`), speakers and witnesses of an hour before it (`trust.meet`, `Fusion.witnesses`)."""
         hour = checkpoint_s - checkpoint_s % _HOUR
         if hour != self.hour:
             self.hour = hour
             self._rebuild_pairs(hour - int(c.FORGOTTEN_S), 0)
+            self._rebuild_voices(hour - _HOUR)
 
     def _rebuild_pairs(self, least: int, most: int) -> None:
         """Drop pairs last heard before `least` [s], and make room for `most`."""
         state = self.state
         old = state.pairs
-        stay = (old["slot"] != NONE) & ((old["time"].max(axis=1) >= least) | (old["last"] != NONE))
-        count = int(stay.sum())
+        count = staying(old, least)
         new = _no_pairs(room(max(count, most)))
-        gone = moved(state.entries, old, new, stay)
+        gone = moved(state.entries, old, new, least)
         mark_returned(state.cells, state.kept, old["slot"][gone], self.names["key"][old["vehicle"][gone]])
         state.used[PAIRS] = count
         self.state = state._replace(pairs=new)
+
+    def _rebuild_voices(self, least: int) -> None:
+        """Drop voices that were last heard before `least` [s], but for those of a window."""
+        cells, old = self.state.cells[: self.size], self.state.voices
+        slots = np.flatnonzero(cells["voice"] != NONE)
+        voice = cells["voice"][slots]
+        heard = np.maximum(old["spoke"].max(axis=1, initial=0), old["witnessed"].max(axis=(1, 2), initial=0))
+        stay = (heard[voice] >= least) | (cells["window"][slots] != NONE)
+        cells["voice"][slots] = NONE
+        cells["voice"][slots[stay]] = np.arange(stay.sum())
+        self.state.used[VOICES] = stay.sum()
+        self.state = self.state._replace(voices=old[voice[stay]])
 
 
 def distinct(values: IntArray) -> IntArray:
@@ -178,7 +193,7 @@ def distinct(values: IntArray) -> IntArray:
 
 
 def _no_pairs(places: int) -> Records:
-    pairs = np.zeros(places, PAIR)
+    pairs = rows_of_lines(places, PAIR)
     pairs["slot"] = NONE
     return pairs
 

@@ -1,5 +1,11 @@
-"""Open-addressing hash tables: arrays of row numbers whose keys lie in the rows themselves, so that a place costs four
-bytes. Compiled; at least one place must be free."""
+"""Open-addressing hash tables: arrays of row numbers whose keys lie in the rows themselves. Compiled; at least one
+place must be free.
+
+A place holds the row in its lower half and some of the key's hash in the upper one, so that a row of another key is
+hardly ever looked at: that would be a wait for memory.
+
+A key's place is its hash as a share of the table: any length will do, and a longer table holds its rows in the same
+order, so that it is filled from one end to the other."""
 
 from __future__ import annotations
 
@@ -8,95 +14,132 @@ from typing import Final
 import numpy as np
 
 from fleet_service.fusion.belief import PackedArray
-from fleet_service.fusion.cells import NONE, Int32Array, Records, begin
-from schemas.numeric import IntArray, compiled, lean
+from fleet_service.fusion.cells import NONE, Records, begin
+from schemas.numeric import IntArray, ask, compiled, lean_inlined
 
-LEAST: Final = 1024  # places of a new table; a power of two, so that a mask finds the place
+LEAST: Final = 1024  # places of a new table
+_LOWER: Final = 0xFFFFFFFF
+_TAG: Final = 0x7FFFFFFF
+AHEAD: Final = 128  # rows whose memory is asked for before they are worked on, so that it comes for all at once
 
 
-@lean
+@lean_inlined
 def _mixed(key: int | np.int64) -> np.uint64:
-    """Every bit of the key moves the place: mixing steps of the splitmix64 generator."""
+    """Hash of a key: mixing steps of the splitmix64 generator, so that every bit of it moves all."""
     h = np.uint64(key)
     h = (h ^ (h >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     h = (h ^ (h >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return h ^ (h >> np.uint64(31))
 
 
-@lean
-def locate(table: Int32Array, rows: Records, key: int) -> int:
+@lean_inlined
+def _first(mixed: np.uint64, places: int) -> int:
+    """Where a key is sought first."""
+    return int(np.int64(((mixed >> np.uint64(32)) * np.uint64(places)) >> np.uint64(32)))
+
+
+@lean_inlined
+def _row(held: int) -> int:
+    """Row that a place holds; NONE in a free one."""
+    return int(np.int32(held & _LOWER))
+
+
+@lean_inlined
+def _held(mixed: np.uint64, row: int) -> int:
+    """What a place holds for a key and its row; never NONE."""
+    return int((np.int64(mixed & np.uint64(_TAG)) << 32) | row)
+
+
+@lean_inlined
+def locate(table: IntArray, rows: Records, key: int) -> int:
     """Place of the row with `key`, or the free place where it belongs."""
-    mask = len(table) - 1
-    place = np.int64(_mixed(key) & np.uint64(mask))
-    while table[place] != NONE and rows[table[place]].key != key:
-        place = (place + 1) & mask
-    return int(place)
+    mixed = _mixed(key)
+    place, tag = _first(mixed, len(table)), np.int64(mixed & np.uint64(_TAG))
+    while table[place] != NONE and ((table[place] >> 32) != tag or rows[_row(table[place])].key != key):
+        place = place + 1 if place + 1 < len(table) else 0
+    return place
 
 
 @compiled
-def rows_of(table: Int32Array, rows: Records, wanted: IntArray) -> IntArray:
+def rows_of(table: IntArray, rows: Records, wanted: IntArray) -> IntArray:
     """Row of each key, (n,); NONE where it is unknown."""
     out = np.empty(len(wanted), np.int64)
-    for i in range(len(wanted)):
-        out[i] = table[locate(table, rows, wanted[i])]
+    for group in range(0, len(wanted), AHEAD):
+        end = min(group + AHEAD, len(wanted))
+        for i in range(group, end):
+            out[i] = _first(_mixed(wanted[i]), len(table))
+            ask(table, out[i], 0)
+        for i in range(group, end):
+            ask(rows, _row(table[out[i]]), 0)
+        for i in range(group, end):
+            out[i] = _row(table[locate(table, rows, wanted[i])])
     return out
 
 
 @compiled
 def slots_for(
-    table: Int32Array, belief: PackedArray, cells: Records, wanted: IntArray, used: int
+    table: IntArray, belief: PackedArray, cells: Records, wanted: IntArray, used: int
 ) -> tuple[IntArray, int]:  # fmt: skip
     """Slot of each key, (n,), and how many are used then; an unknown key begins the next. Room must be there."""
     out = np.empty(len(wanted), np.int64)
     for i in range(len(wanted)):
         place = locate(table, cells, wanted[i])
         if table[place] == NONE:
-            table[place] = used
+            table[place] = _held(_mixed(wanted[i]), used)
             begin(belief, cells, used, wanted[i])
             used += 1
-        out[i] = table[place]
+        out[i] = _row(table[place])
     return out, used
 
 
 @compiled
-def numbered(table: Int32Array, rows: Records, wanted: IntArray, used: int) -> tuple[IntArray, int]:
+def numbered(table: IntArray, rows: Records, wanted: IntArray, used: int) -> tuple[IntArray, int]:
     """Row of each key, (n,), and how many are used then; an unknown key is written to the next of `rows`."""
     out = np.empty(len(wanted), np.int64)
     for i in range(len(wanted)):
         place = locate(table, rows, wanted[i])
         if table[place] == NONE:
-            table[place] = used
+            table[place] = _held(_mixed(wanted[i]), used)
             rows[used].key = wanted[i]
             used += 1
-        out[i] = table[place]
+        out[i] = _row(table[place])
     return out, used
 
 
 @compiled
-def fill(table: Int32Array, rows: Records, used: int) -> None:
+def fill(table: IntArray, rows: Records, used: int) -> None:
     """Enter the first `used` rows into an empty table."""
     for row in range(used):
-        table[locate(table, rows, rows[row].key)] = row
+        table[locate(table, rows, rows[row].key)] = _held(_mixed(rows[row].key), row)
 
 
-@lean
+@lean_inlined
+def first_place(pairs: Records, slot: int, vehicle: int) -> int:
+    """Where a pair is sought first."""
+    return _first(_mixed((np.int64(slot) << np.int64(32)) | np.int64(vehicle)), len(pairs))
+
+
+@lean_inlined
 def pair_place(pairs: Records, slot: int, vehicle: int) -> int:
     """Place of a pair in a table that holds the pairs themselves, or the free place (slot NONE) where it belongs."""
-    mask = len(pairs) - 1
-    key = (np.int64(slot) << np.int64(32)) | np.int64(vehicle)
-    place = np.int64(_mixed(key) & np.uint64(mask))
+    place = first_place(pairs, slot, vehicle)
     while pairs[place].slot != NONE and (pairs[place].slot != slot or pairs[place].vehicle != vehicle):
-        place = (place + 1) & mask
-    return int(place)
+        place = place + 1 if place + 1 < len(pairs) else 0
+    return place
 
 
-def grown(rows: Records, used: int, places: int) -> Int32Array:
+def grown(rows: Records, used: int, places: int) -> IntArray:
     """A table of `places` with the first `used` rows."""
-    table = np.full(places, NONE, np.int32)
+    table = np.full(places, NONE, np.int64)
     fill(table, rows, used)
     return table
 
 
 def room(entries: int) -> int:
-    """Places for so many entries at two thirds of the load at the most: two or three probes."""
-    return max(LEAST, 1 << (3 * entries // 2).bit_length())
+    """Places for so many entries, and for four in ten more until it is full."""
+    return max(LEAST, entries * 5 // 2)
+
+
+def is_full(entries: int, places: int) -> bool:
+    """Whether so many entries are more than four in seven: beyond, they cost more than two or three probes."""
+    return 7 * entries > 4 * places

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -27,10 +27,10 @@ from fleet_service.fusion.belief import (
 )  # fmt: skip
 from fleet_service.fusion.cells import NONE, SECOND, Records
 from fleet_service.fusion.pairs import returning
-from fleet_service.fusion.pools import GRIP, ICE, WITNESSES
+from fleet_service.fusion.pools import FINE, GRIP, ICE, WITNESSES
 from fleet_service.fusion.weather import Weather, aged
 from schemas import mugrid
-from schemas.numeric import Float32Array, lean
+from schemas.numeric import Float32Array, lean, lean_inlined
 
 # Rows of scratch, (3, SCRATCH) single precision: the belief, what `forget` and `spread` need, and the likelihood.
 P, PADDED, LIKELIHOOD = 0, 1, 2
@@ -41,7 +41,7 @@ _NO_WITNESS: Final = 0.5  # P(slippery) that is neither ice nor grip
 _FORGOTTEN: Final = int(c.FORGOTTEN_S)
 
 
-@lean
+@lean_inlined
 def voice_of(entries: Records, entry: int, said: Float32Array, scratch: Bins) -> None:
     """Kind of an entry's vote, and what describes it; leaves its likelihood in the scratch.
 
@@ -74,14 +74,14 @@ def respread(entries: Records, entry: int, scratch: Bins) -> None:
     spread(entries[entry].evidence, int(entries[entry].kind), scratch[PADDED], scratch[LIKELIHOOD])
 
 
-@lean
+@lean_inlined
 def _clear(scratch: Bins) -> None:
     for i in range(REACH):
         scratch[PADDED, i] = 0.0
         scratch[PADDED, SCRATCH - 1 - i] = 0.0
 
 
-@lean
+@lean_inlined
 def recall(entries: Records, pairs: Records, entry: int) -> None:
     """How much of a vote is new, from what its vehicle said here before: in the window, or before the checkpoint.
 
@@ -96,12 +96,12 @@ def recall(entries: Records, pairs: Records, entry: int) -> None:
     while earlier != NONE and entries[earlier].kind != kind:
         earlier = entries[earlier].before
     if earlier != NONE:
-        time, mean, std = entries[earlier].time // SECOND, entries[earlier].last_mean, entries[earlier].last_std
-        spent = entries[earlier].spent
+        time, mean = entries[earlier].time // SECOND, _coarse(entries[earlier].last_mean)
+        std, spent = _coarse(entries[earlier].last_std), _coarse(entries[earlier].spent)
     else:
         seen = seen or pairs[pair].time[BOUND] >= max(least, 1) or pairs[pair].time[VALUE] >= max(least, 1)
-        time, mean, std = int(pairs[pair].time[kind]), pairs[pair].mean[kind], pairs[pair].std
-        spent = pairs[pair].spent[kind]
+        time, mean = int(pairs[pair].time[kind]), _coarse(pairs[pair].mean[kind])
+        std, spent = _coarse(pairs[pair].std), _coarse(pairs[pair].spent[kind])
     new_mean, new_std = entries[entry].mean, entries[entry].std
     power = np.float32(1.0)
     if time > 0 and time >= least:
@@ -116,13 +116,25 @@ def recall(entries: Records, pairs: Records, entry: int) -> None:
     else:
         spent = np.float32(0.0)
     entries[entry].power = power
-    entries[entry].last_mean = new_mean
-    entries[entry].last_std = new_std
-    entries[entry].spent = spent + power
+    entries[entry].last_mean = _fine(new_mean)
+    entries[entry].last_std = _fine(new_std)
+    entries[entry].spent = _fine(spent + power)
     entries[entry].fresh = 0 if seen else 1
 
 
-@lean
+@lean_inlined
+def _fine(number: float | np.floating[Any]) -> np.uint16:
+    """A number in parts of 1/FINE."""
+    return np.uint16(min(max(number * np.float32(FINE) + np.float32(0.5), np.float32(0.0)), np.float32(65535.0)))
+
+
+@lean_inlined
+def _coarse(parts: int) -> np.float32:
+    """The number of so many parts."""
+    return np.float32(parts) * np.float32(1.0 / FINE)
+
+
+@lean_inlined
 def _novelty(kind: int, mean: float, std: float, new_mean: float, new_std: float) -> float:
     if kind == BOUND:  # the mean of "at least u" against the uniform prior moves by half of u
         share = 2.0 * (new_mean - mean) / c.NOVELTY_UTILISED
@@ -175,13 +187,13 @@ def fold(
             _witness(voices, voice, GRIP, entries[entry].vehicle, time)
 
 
-@lean
+@lean_inlined
 def speaks(entries: Records, entry: int) -> bool:
     """Whether a cell needs voices for an entry: it is a value, or bears witness."""
     return bool(entries[entry].kind == VALUE or entries[entry].slippery <= 1.0 - c.WITNESS_SHARE)
 
 
-@lean
+@lean_inlined
 def _count(cells: Records, row: int, entries: Records, entry: int) -> None:
     """Visits and vehicles; who was probably elsewhere is not counted."""
     if entries[entry].share < c.HERE_SHARE:
@@ -191,7 +203,7 @@ def _count(cells: Records, row: int, entries: Records, entry: int) -> None:
         cells[row].vehicles += np.uint32(1)
 
 
-@lean
+@lean_inlined
 def _crowded(cells: Records, row: int, kind: int, power: float, weight: float, passed: float) -> float:
     """Weight of a vote among others that are not trusted either: the k-th new one counts 1/k², all together 1.6 votes.
 

@@ -9,23 +9,17 @@ Both rows see the same operations in the same order, so that they agree bit for 
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 
 from fleet_service.fusion.belief import VALUE, Bins
 from fleet_service.fusion.cells import NOBODY, NONE, Int32Array, Records, copy_slot
 from fleet_service.fusion.pairs import chain, earlier, pair_of, remember
 from fleet_service.fusion.pools import FREE_ENTRIES, FREE_WINDOWS, VOICES, WITNESSES, State
-from fleet_service.fusion.table import pair_place
+from fleet_service.fusion.table import AHEAD, first_place
 from fleet_service.fusion.trust import meet
 from fleet_service.fusion.votes import SCRATCH, fold, recall, respread, speaks, voice_of
 from fleet_service.fusion.weather import Weather
-from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray, lean
-
-# Rows whose memory is asked for at once before they are worked on: the processor waits for all of them together instead
-# of for each; they fit into its second cache.
-AHEAD: Final = 256
+from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray, ask, compiled, lean, lean_inlined
 
 
 def absorb(
@@ -58,12 +52,12 @@ def _absorb(
     """Fills `left_out` and notes in `stale` the windows that have to be folded anew; returns how many. `seen` (n,) is
     for keeps."""
     cells, windows, entries, pairs, voices = state.cells, state.windows, state.entries, state.pairs, state.voices
-    asked, waiting = 0, 0
+    waiting = 0
     for k in range(len(slots)):
         if k % AHEAD == 0:
-            asked += _ask(state, slots[k : k + AHEAD], rows[k : k + AHEAD], vehicle)
+            _ask(state, slots, rows, vehicle, k, min(k + AHEAD, len(slots)))
         row, slot = rows[k], slots[k]
-        if left_out[row] or asked < 0:  # never below: but what was asked for must be used
+        if left_out[row]:
             continue
         pair = pair_of(pairs, state.used, slot, vehicle[row])
         if not seen[row] and pairs[pair].waiting >= most:
@@ -83,7 +77,7 @@ def _absorb(
         if window == NONE:
             window = _open(state, slot)
         if cells[slot].voice == NONE and speaks(entries, entry):
-            _speak(state, slot)
+            _speak(state, slot, window)
         _link(windows, entries, window, entry)
         chain(entries, pairs, pair, entry)
         if windows[window].stale:
@@ -98,22 +92,37 @@ def _absorb(
     return waiting
 
 
-@lean
-def _ask(state: State, slots: IntArray, rows: IntArray, vehicle: IntArray) -> int:
-    """Read the first of everything that observations `rows` (k,) in `slots` (k,) will touch."""
-    seen, free = 0, state.used[FREE_ENTRIES] - 1
-    for k in range(len(slots)):
+@lean_inlined
+def _ask(state: State, slots: IntArray, rows: IntArray, vehicle: IntArray, begin: int, end: int) -> None:
+    """Ask for all that observations `begin` to `end` will touch; last for what lies behind a number that comes first.
+
+    No branch waits for memory: a processor that guesses it wrongly forgets what it asked for meanwhile.
+    """
+    cells, windows, used = state.cells, state.windows, state.used
+    for k in range(begin, end):
         slot = slots[k]
-        seen += state.belief[slot, 0] + state.cells[slot].visits
-        seen += state.pairs[pair_place(state.pairs, slot, vehicle[rows[k]])].waiting
-        if state.cells[slot].window != NONE:
-            seen += state.entries[state.windows[state.cells[slot].window].tail].kind
-        coming = state.entries[state.free_entries[free - k]]
-        seen += coming.kind + coming.evidence[0] + coming.evidence[31]
-    return seen
+        ask(cells, slot, 0)
+        ask(state.belief, slot, 0)
+        pair = first_place(state.pairs, slot, vehicle[rows[k]])
+        ask(state.pairs, pair, 0)
+        ask(state.pairs, pair, 1)
+        entry = state.free_entries[used[FREE_ENTRIES] - 1 - (k - begin)]
+        ask(state.entries, entry, 0)
+        ask(state.entries, entry, 1)
+        window = state.free_windows[used[FREE_WINDOWS] - 1 - (k - begin)]
+        ask(state.kept, window, 0)
+        ask(state.kept_belief, window, 0)
+        ask(windows, window, 0)
+    for k in range(begin, end):
+        ask(windows, max(cells[slots[k]].window, 0), 0)
+        voice = max(cells[slots[k]].voice, 0)
+        ask(state.voices, voice, 1)
+        ask(state.voices, voice, 2)
+    for k in range(begin, end):
+        ask(state.entries, windows[max(cells[slots[k]].window, 0)].tail, 0)
 
 
-@lean
+@lean_inlined
 def _open(state: State, slot: int) -> int:
     """A window for a slot that has none, with its row as it is."""
     state.used[FREE_WINDOWS] -= 1
@@ -123,21 +132,28 @@ def _open(state: State, slot: int) -> int:
     new.slot, new.head, new.tail, new.stale, new.values = slot, NONE, NONE, 0, 0
     copy_slot(state.belief, cells, slot, state.kept_belief, state.kept, window)
     voice = cells[slot].voice
-    for side in range(2):
-        for k in range(WITNESSES):
-            new.witness[side, k] = NOBODY if voice == NONE else state.voices[voice].witness[side, k]
-            new.witnessed[side, k] = 0 if voice == NONE else state.voices[voice].witnessed[side, k]
+    if voice != NONE:
+        _copy_witnesses(state.voices, voice, state.kept_voices, window)
     return window
 
 
+@lean_inlined
+def _copy_witnesses(voices: Records, voice: int, to_voices: Records, to: int) -> None:
+    for side in range(2):
+        for k in range(WITNESSES):
+            to_voices[to].witness[side, k] = voices[voice].witness[side, k]
+            to_voices[to].witnessed[side, k] = voices[voice].witnessed[side, k]
+
+
 @lean
-def _speak(state: State, slot: int) -> None:
-    """Voices for a slot that gets its first value or witness."""
+def _speak(state: State, slot: int, window: int) -> None:
+    """Voices for a slot, with a window, that gets its first value or witness for long."""
     voice = state.used[VOICES]
     state.used[VOICES] += 1
     state.cells[slot].voice = voice
     state.voices[voice].speaker[:] = NOBODY
     state.voices[voice].witness[:] = NOBODY
+    _copy_witnesses(state.voices, voice, state.kept_voices, window)
 
 
 @lean
@@ -148,10 +164,7 @@ def _refold(state: State, weather: Weather, stale: Int32Array, scratch: Bins) ->
         voice = cells[slot].voice
         copy_slot(state.kept_belief, state.kept, window, state.belief, cells, slot)
         if voice != NONE:
-            for side in range(2):
-                for k in range(WITNESSES):
-                    voices[voice].witness[side, k] = windows[window].witness[side, k]
-                    voices[voice].witnessed[side, k] = windows[window].witnessed[side, k]
+            _copy_witnesses(state.kept_voices, window, voices, voice)
         entry = windows[window].head
         while entry != NONE:
             recall(entries, state.pairs, entry)
@@ -161,6 +174,21 @@ def _refold(state: State, weather: Weather, stale: Int32Array, scratch: Bins) ->
         windows[window].stale = 0
 
 
+@compiled
+def due(windows: Records, before: int) -> tuple[IntArray, IntArray]:
+    """Windows with entries before `before` [ns]: those without a value, and those with one."""
+    quiet, talking, silent, loud = np.empty(len(windows), np.int64), np.empty(len(windows), np.int64), 0, 0
+    for window in range(len(windows)):
+        if windows[window].slot != NONE and windows[window].first < before:
+            if windows[window].values:
+                talking[loud] = window
+                loud += 1
+            else:
+                quiet[silent] = window
+                silent += 1
+    return quiet[:silent], talking[:loud]
+
+
 def settle(
     state: State, weather: Weather, peers: Records, names: Records, due_windows: IntArray, before: int
 ) -> None:  # fmt: skip
@@ -168,14 +196,31 @@ def settle(
     _settle(state, weather, peers, names, due_windows, before, np.zeros((3, SCRATCH), np.float32))
 
 
-@lean
-def _ask_settled(state: State, windows: IntArray) -> int:
-    """Read the first of everything that settling windows (k,) will touch."""
-    seen = 0
-    for window in windows:
-        head = state.entries[state.windows[window].head]
-        seen += state.cells[state.windows[window].slot].visits + state.pairs[head.pair].waiting + head.evidence[0]
-    return seen
+@lean_inlined
+def _ask_settled(state: State, settled: IntArray, begin: int, end: int) -> None:
+    """Ask for all that settling windows `begin` to `end` will touch, in the same way."""
+    windows, entries = state.windows, state.entries
+    for k in range(begin, end):
+        ask(windows, settled[k], 0)
+    for k in range(begin, end):
+        ask(entries, windows[settled[k]].head, 0)
+        ask(entries, windows[settled[k]].tail, 0)
+        ask(state.cells, windows[settled[k]].slot, 0)
+    for k in range(begin, end):
+        window = settled[k]
+        ask(state.pairs, entries[windows[window].head].pair, 0)
+        if windows[window].values:
+            ask(state.voices, state.cells[windows[window].slot].voice, 0)
+            ask(state.voices, state.cells[windows[window].slot].voice, 1)
+        if windows[window].tail != windows[window].head:
+            ask(entries, windows[window].head, 1)
+            ask(entries, entries[windows[window].head].following, 0)
+            ask(state.kept, window, 0)
+            ask(state.kept_belief, window, 0)
+    for k in range(begin, end):
+        window = settled[k]
+        if windows[window].tail != windows[window].head:
+            ask(state.pairs, entries[entries[windows[window].head].following].pair, 0)
 
 
 @lean
@@ -183,10 +228,9 @@ def _settle(
     state: State, weather: Weather, peers: Records, names: Records, settled: IntArray, before: int, scratch: Bins
 ) -> None:  # fmt: skip
     cells, windows, entries = state.cells, state.windows, state.entries
-    asked = 0
     for k in range(len(settled)):
         if k % AHEAD == 0:
-            asked += _ask_settled(state, settled[k : k + AHEAD])
+            _ask_settled(state, settled, k, min(k + AHEAD, len(settled)))
         window = settled[k]
         slot = int(windows[window].slot)
         whole = entries[windows[window].tail].time < before
@@ -194,7 +238,9 @@ def _settle(
         while entry != NONE and entries[entry].time < before:
             if not whole:
                 respread(entries, entry, scratch)
-                fold(state.kept_belief, state.kept, window, windows, window, entries, entry, weather, scratch)
+                fold(
+                    state.kept_belief, state.kept, window, state.kept_voices, window, entries, entry, weather, scratch
+                )  # fmt: skip
             if entries[entry].kind == VALUE:
                 windows[window].values -= 1
                 meet(state.voices, cells[slot].voice, peers, names, entries, entry)
@@ -203,7 +249,7 @@ def _settle(
             state.used[FREE_ENTRIES] += 1
             entry = int(entries[entry].following)
         windows[window].head = entry
-        if entry == NONE and asked >= 0:
+        if entry == NONE:
             cells[slot].window = NONE
             windows[window].slot = NONE
             state.free_windows[state.used[FREE_WINDOWS]] = window
@@ -213,7 +259,7 @@ def _settle(
             windows[window].first = entries[entry].time
 
 
-@lean
+@lean_inlined
 def _link(windows: Records, entries: Records, window: int, entry: int) -> None:
     """Put an entry at its place in time; from the end, where nearly all belong."""
     after = windows[window].tail
