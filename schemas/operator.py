@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import logging
 import os
@@ -10,9 +11,11 @@ from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.abc import MetaPathFinder
-from typing import Any, Literal, TextIO
+from typing import Any, Final, Literal, TextIO
 
 Form = Literal["text", "json"]
+_MMAP_THRESHOLD: Final = -3  # M_MMAP_THRESHOLD of glibc's malloc.h
+_LARGE: Final = 4 << 20  # bytes; a turn's own arrays are smaller
 
 
 class Line(str):
@@ -34,9 +37,12 @@ def keep_small() -> None:
 
     Arrow loads pandas, where that is installed, to look whether what it is handed is a data frame: half a second, and
     30 MB for good. The linear algebra behind numpy starts a thread a core, which wait for each other by turning: on
-    products as small as ours they double the processor time.
+    products as small as ours they double the processor time. And the allocator learns from the first large array that
+    is given back to keep the next ones, among which small things stay behind: a tenth of a gigabyte.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    with suppress(AttributeError, OSError):  # where it is another allocator than glibc's
+        ctypes.CDLL(None).mallopt(_MMAP_THRESHOLD, _LARGE)
     sys.meta_path.insert(0, _WithoutPandas())
 
 

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import log_ndtr
 
 from fleet_service.fusion import constants as c
+from fleet_service.fusion.normal import log_distribution
 from fleet_service.fusion.shape import Told, unshaped
 from schemas import mugrid
 from schemas.numeric import BoolArray, ByteArray, FloatArray
@@ -66,7 +66,7 @@ def levelled(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
 
 def at_least(used: FloatArray) -> FloatArray:
     """ℓ(μ) = ln Φ((μ - u) / σ_u): rises to u and is flat above; flat everywhere where u is NaN. (n, 32)."""
-    return log_ndtr((mugrid.CENTRES - np.nan_to_num(used, nan=-np.inf)[:, None]) / c.UTILISED_STD)
+    return log_distribution((mugrid.CENTRES - np.nan_to_num(used, nan=-np.inf)[:, None]) / c.UTILISED_STD)
 
 
 def posterior(mu: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:

@@ -15,9 +15,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from scipy.special import ndtr
 
 from fleet_service.fusion import constants as c
+from fleet_service.fusion.normal import distribution
 from schemas import grid
 from schemas.numeric import Float32Array, FloatArray, IntArray
 
@@ -54,4 +54,4 @@ def shares(std: FloatArray, length: FloatArray) -> FloatArray:
 
 
 def _g(x: FloatArray) -> FloatArray:
-    return np.asarray(x * ndtr(x) + np.exp(-0.5 * np.square(x)) / np.sqrt(2.0 * np.pi))
+    return np.asarray(x * distribution(x) + np.exp(-0.5 * np.square(x)) / np.sqrt(2.0 * np.pi))

@@ -23,7 +23,7 @@ from fleet_service.fusion.pools import (
     WINDOW,
     State,
 )  # fmt: skip
-from fleet_service.fusion.table import LEAST, grown, is_full, numbered, room, rows_of, slots_for
+from fleet_service.fusion.table import LEAST, PAIRS_MOST, ROWS_MOST, grown, is_full, numbered, room, rows_of, slots_for
 from fleet_service.fusion.trust import no_peers
 from fleet_service.fusion.window import due
 from schemas.numeric import IntArray
@@ -62,8 +62,8 @@ class Stores:
         stores = Stores()
         stores.state, stores.peers, stores.names = state, peers, names
         stores.size, stores.vehicles, stores.hour = size, vehicles, hour
-        stores._slots = grown(state.cells, size, room(size))
-        stores._known = grown(names, vehicles, room(vehicles))
+        stores._slots = grown(state.cells, size, size)
+        stores._known = grown(names, vehicles, vehicles)
         return stores
 
     @property
@@ -96,8 +96,8 @@ class Stores:
         if not len(new):
             return slots
         most = self.size + len(distinct(keys[new]))
-        if is_full(most, len(self._slots)):
-            self._slots = grown(self.state.cells, self.size, room(most))
+        if is_full(most, len(self._slots), ROWS_MOST):
+            self._slots = grown(self.state.cells, self.size, most)
         if most > len(self.state.cells):
             rows = max(most, 2 * len(self.state.cells))
             belief, cells = _longer(self.state.belief, rows), _longer(self.state.cells, rows)
@@ -115,8 +115,8 @@ class Stores:
         if not len(index) or index.min() != NONE:
             return index
         most = self.vehicles + len(distinct(vehicle[index == NONE]))
-        if is_full(most, len(self._known)):
-            self._known = grown(self.names, self.vehicles, room(most))
+        if is_full(most, len(self._known), ROWS_MOST):
+            self._known = grown(self.names, self.vehicles, most)
         if most > len(self.names):
             rows = max(most, 2 * len(self.names))
             self.names, peers = _longer(self.names, rows), no_peers(rows)
@@ -135,7 +135,7 @@ class Stores:
         if used[VOICES] + rows > len(self.state.voices):
             most = max(int(used[VOICES]) + rows, 2 * len(self.state.voices))
             self.state = self.state._replace(voices=_longer(self.state.voices, most))
-        if is_full(int(used[PAIRS]) + rows, len(self.state.pairs)):
+        if is_full(int(used[PAIRS]) + rows, len(self.state.pairs), PAIRS_MOST):
             self._rebuild_pairs(0, int(used[PAIRS]) + rows)
 
     def _more_entries(self, most: int) -> None:
@@ -167,7 +167,7 @@ class Stores:
         state = self.state
         old = state.pairs
         count = staying(old, least)
-        new = _no_pairs(room(max(count, most)))
+        new = _no_pairs(room(max(count, most), PAIRS_MOST))
         gone = moved(state.entries, old, new, least)
         mark_returned(state.cells, state.kept, old["slot"][gone], self.names["key"][old["vehicle"][gone]])
         state.used[PAIRS] = count

@@ -18,6 +18,8 @@ from fleet_service.fusion.cells import NONE, Records, begin
 from schemas.numeric import IntArray, ask, compiled, lean_inlined
 
 LEAST: Final = 1024  # places of a new table
+ROWS_MOST: Final = 0.75  # share of the places that rows take: eight of them are a line, and probes cost little
+PAIRS_MOST: Final = 0.57  # ... that pairs take, of which two are a line: two or three probes
 _LOWER: Final = 0xFFFFFFFF
 _TAG: Final = 0x7FFFFFFF
 AHEAD: Final = 128  # rows whose memory is asked for before they are worked on, so that it comes for all at once
@@ -128,18 +130,18 @@ def pair_place(pairs: Records, slot: int, vehicle: int) -> int:
     return place
 
 
-def grown(rows: Records, used: int, places: int) -> IntArray:
-    """A table of `places` with the first `used` rows."""
-    table = np.full(places, NONE, np.int64)
+def grown(rows: Records, used: int, entries: int) -> IntArray:
+    """A table with room for `entries` that holds the first `used` rows."""
+    table = np.full(room(entries, ROWS_MOST), NONE, np.int64)
     fill(table, rows, used)
     return table
 
 
-def room(entries: int) -> int:
-    """Places for so many entries, and for four in ten more until it is full."""
-    return max(LEAST, entries * 5 // 2)
+def room(entries: int, most: float) -> int:
+    """Places for so many entries, and for four in ten more until a share `most` of them is taken."""
+    return max(LEAST, int(1.4 * entries / most))
 
 
-def is_full(entries: int, places: int) -> bool:
-    """Whether so many entries are more than four in seven: beyond, they cost more than two or three probes."""
-    return 7 * entries > 4 * places
+def is_full(entries: int, places: int, most: float) -> bool:
+    """Whether so many entries are more than a share `most` of the places."""
+    return entries > most * places

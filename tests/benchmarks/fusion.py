@@ -13,6 +13,7 @@ import numpy as np
 from fleet_service.fusion import Fusion, Observations
 from schemas import grid, mugrid
 from schemas.figures import Figure
+from schemas.operator import lean
 from tests.benchmarks.measure import ROUNDS, SEED
 
 BATCH = 5_000  # rows of a turn of the service under load
@@ -72,6 +73,7 @@ def per_observation_s(cells: int, per_s: int = 5_000) -> float:
 
 def resident() -> None:
     """Print the resident memory [MB] of a service's process with 10⁶ cells of three visits in a day."""
+    lean()  # as a service's process begins
     import fleet_service.service  # noqa: F401 what a service has loaded
     from fleet_service.map_state import MapState
 

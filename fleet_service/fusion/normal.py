@@ -1,0 +1,43 @@
+"""The standard normal distribution, for arrays of any shape. Compiled: a library for it takes 15 MB of a service."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from schemas.numeric import FloatArray, compiled
+
+_FAR: Final = -12.0  # below, the logarithm's series is better than a part in 10⁶, and its argument may not be held
+
+
+def distribution(x: FloatArray) -> FloatArray:
+    """Φ(x)."""
+    return _distribution(np.ravel(x)).reshape(x.shape)
+
+
+def log_distribution(x: FloatArray) -> FloatArray:
+    """ln Φ(x); far below nought -½x² - ln(-x·√(2π)) + ln(1 - 1/x² + 3/x⁴)."""
+    return _log_distribution(np.ravel(x)).reshape(x.shape)
+
+
+@compiled
+def _distribution(x: FloatArray) -> FloatArray:
+    out = np.empty(len(x))
+    for i in range(len(x)):
+        out[i] = 0.5 * math.erfc(-x[i] * math.sqrt(0.5))
+    return out
+
+
+@compiled
+def _log_distribution(x: FloatArray) -> FloatArray:
+    out = np.empty(len(x))
+    for i in range(len(x)):
+        if x[i] > _FAR:
+            out[i] = math.log(0.5 * math.erfc(-x[i] * math.sqrt(0.5)))
+        else:
+            square = x[i] * x[i]
+            series = -1.0 / square + 3.0 / (square * square)
+            out[i] = -0.5 * square - math.log(-x[i] * math.sqrt(2.0 * math.pi)) + math.log1p(series)
+    return out
