@@ -21,6 +21,9 @@ from schemas.errors import InputError
 from schemas.operator import keep_small, log_as, teller
 
 SWITCH_S = 0.0005  # after which a busy worker lets an answer go first; ten times that is Python's own
+# 25 MB that a running service's libraries load where they find them: for matrix products in kernels, of which there are
+# none, and for file systems that only a compaction writes to, which is a process of its own.
+UNUSED = ("scipy", "pyarrow._s3fs", "pyarrow._gcsfs", "pyarrow._azurefs", "pyarrow._hdfs")
 LEAVE_AT_LAST_S = 2.7  # after a signal; the process is to be gone within 3 s
 
 
@@ -32,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = _parser().parse_args(argv)
     if argv is None and arguments.command is _run:
-        keep_small()
+        keep_small(*UNUSED)
     try:
         return int(arguments.command(arguments))
     except InputError as error:

@@ -32,8 +32,11 @@ class Line(str):
     values: dict[str, object]
 
 
-def keep_small() -> None:
+def keep_small(*without: str) -> None:
     """Keep from a process that lives long what its libraries would do for others; call it at its very start.
+
+    Args:
+        without: modules that its libraries can do without, and it does.
 
     Arrow loads pandas, where that is installed, to look whether what it is handed is a data frame: half a second, and
     30 MB for good. The linear algebra behind numpy starts a thread a core, which wait for each other by turning: on
@@ -43,13 +46,22 @@ def keep_small() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     with suppress(AttributeError, OSError):  # where it is another allocator than glibc's
         ctypes.CDLL(None).mallopt(_MMAP_THRESHOLD, _LARGE)
-    sys.meta_path.insert(0, _WithoutPandas())
+    sys.meta_path.insert(0, _Without({"pandas", *without}))
 
 
-class _WithoutPandas(MetaPathFinder):
+def give_back() -> None:
+    """Give the system what lies free between what is in use: after work that takes much memory for a short time."""
+    with suppress(AttributeError, OSError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+class _Without(MetaPathFinder):
+    def __init__(self, names: set[str]) -> None:
+        self._names = names
+
     def find_spec(self, fullname: str, path: object, target: object = None) -> None:  # noqa: ARG002 as finders have it
-        if fullname == "pandas":
-            raise ModuleNotFoundError("pandas is kept out of this process", name=fullname)
+        if fullname in self._names:
+            raise ModuleNotFoundError(f"{fullname} is kept out of this process", name=fullname)
 
 
 def tell(line: str, stream: TextIO) -> None:

@@ -18,8 +18,8 @@ from fleet_service.fusion.cells import NONE, Records, begin
 from schemas.numeric import IntArray, ask, compiled, lean_inlined
 
 LEAST: Final = 1024  # places of a new table
-ROWS_MOST: Final = 0.75  # share of the places that rows take: eight of them are a line, and probes cost little
-PAIRS_MOST: Final = 0.57  # ... that pairs take, of which two are a line: two or three probes
+ROWS_MOST: Final = 0.8  # share of the places that rows take: eight of them are a line, and probes cost little
+PAIRS_MOST: Final = 0.6  # ... that pairs take, of which two are a line: two or three probes
 _LOWER: Final = 0xFFFFFFFF
 _TAG: Final = 0x7FFFFFFF
 AHEAD: Final = 128  # rows whose memory is asked for before they are worked on, so that it comes for all at once
@@ -138,8 +138,8 @@ def grown(rows: Records, used: int, entries: int) -> IntArray:
 
 
 def room(entries: int, most: float) -> int:
-    """Places for so many entries, and for four in ten more until a share `most` of them is taken."""
-    return max(LEAST, int(1.4 * entries / most))
+    """Places for so many entries, and for a third more until a share `most` is taken: an hour after three, of pairs."""
+    return max(LEAST, int(1.35 * entries / most))
 
 
 def is_full(entries: int, places: int, most: float) -> bool:

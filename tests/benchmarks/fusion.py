@@ -13,7 +13,7 @@ import numpy as np
 from fleet_service.fusion import Fusion, Observations
 from schemas import grid, mugrid
 from schemas.figures import Figure
-from schemas.operator import lean
+from schemas.operator import give_back
 from tests.benchmarks.measure import ROUNDS, SEED
 
 BATCH = 5_000  # rows of a turn of the service under load
@@ -22,6 +22,13 @@ EXCITED = 1 / 9  # visits that give a value
 SECOND = 10**9
 START = 1_800_000_000 * SECOND
 CELLS = 1_000_000
+RESIDENT = """
+from fleet_service.cli import UNUSED
+from schemas.operator import keep_small
+keep_small(*UNUSED)  # as a service's process begins
+from tests.benchmarks.fusion import resident
+resident()
+"""
 
 
 def visits(rng: np.random.Generator, rows: int, cells: int, begin_s: float, seconds: float) -> Observations:
@@ -73,12 +80,12 @@ def per_observation_s(cells: int, per_s: int = 5_000) -> float:
 
 def resident() -> None:
     """Print the resident memory [MB] of a service's process with 10⁶ cells of three visits in a day."""
-    lean()  # as a service's process begins
     import fleet_service.service  # noqa: F401 what a service has loaded
     from fleet_service.map_state import MapState
 
     fusion, _ = filled(CELLS, 3, 86_400.0)
     MapState(fusion).tiles()
+    give_back()  # as upkeep does
     with open("/proc/self/status") as status:  # noqa: PTH123
         kilobytes = next(int(line.split()[1]) for line in status if line.startswith("VmRSS"))
     print(kilobytes * 1024 / 1e6, fusion.size)
@@ -87,7 +94,7 @@ def resident() -> None:
 def fusion() -> list[Figure]:
     """Observations per second of the fusion alone into 10⁶ cells, what more cells do to it, and their memory."""
     few, many = per_observation_s(10_000), per_observation_s(CELLS)
-    command = [sys.executable, "-c", "from tests.benchmarks.fusion import resident; resident()"]
+    command = [sys.executable, "-c", RESIDENT]
     megabytes, _ = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
     return [
         Figure("bench.fusion.per_s", 1.0 / many, "observations/s, settling included", 1_000_000, "more"),

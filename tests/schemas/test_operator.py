@@ -23,3 +23,13 @@ def test_arrow_reads_and_hands_out_numbers_where_pandas_is_kept_out() -> None:
         "assert pa.array(np.array([2])).to_pylist() == [2]; assert 'pandas' not in sys.modules"
     )
     assert subprocess.run([sys.executable, "-W", "error", "-c", words], check=False).returncode == 0
+
+
+def test_kernels_compile_where_what_they_can_do_without_is_kept_out() -> None:
+    words = (
+        "import sys; from schemas.operator import give_back, keep_small; keep_small('scipy')\n"
+        "import numpy as np; from fleet_service.fusion.normal import distribution\n"
+        "assert abs(distribution(np.array([1.0]))[0] - 0.8413447) < 1e-6\n"
+        "assert 'scipy' not in sys.modules and not np.zeros(1 << 20).any(); give_back()"
+    )
+    assert subprocess.run([sys.executable, "-W", "error", "-c", words], check=False).returncode == 0
