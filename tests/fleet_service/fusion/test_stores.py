@@ -1,0 +1,57 @@
+"""Room for the fusion: tables of any length find what was put in, and what nobody asks for any more is given back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fleet_service.fusion import Fusion
+from fleet_service.fusion.cells import NONE
+from fleet_service.fusion.pools import GRIP, ICE, PAIRS, VEHICLE, VOICES
+from fleet_service.fusion.table import PAIRS_MOST, fill, rows_of
+from tests.fleet_service.examples import CELL, START, at_least, belief, observations, value
+
+LATENESS_S = 120.0
+HOUR = 3600.0
+
+
+@pytest.mark.parametrize("places", [1024, 1500, 2047])
+def test_a_table_of_any_length_finds_every_row_and_no_other(places: int) -> None:
+    keys = np.unique(np.random.default_rng(places).integers(0, 1 << 40, 1000))
+    rows = np.zeros(len(keys), VEHICLE)
+    rows["key"] = keys
+    table = np.full(places, NONE, np.int64)
+    fill(table, rows, len(rows))
+    np.testing.assert_array_equal(rows_of(table, rows, keys), np.arange(len(keys)))
+    absent = np.setdiff1d(keys + 1, keys)
+    assert (rows_of(table, rows, absent) == NONE).all()
+
+
+def test_pairs_take_no_more_than_their_share_and_are_found_after_every_growth() -> None:
+    fusion, vehicles = Fusion(LATENESS_S), 3000
+    for step in range(3):
+        fusion.fold(
+            observations(
+                [10.0 * step + 0.001 * k for k in range(vehicles)], np.arange(vehicles), at_least([0.3] * vehicles)
+            )
+        )
+    state = fusion.stores.state
+    assert state.used[PAIRS] == vehicles <= PAIRS_MOST * len(state.pairs)
+    assert fusion.live.vehicles[0] == vehicles
+    assert fusion.live.visits[0] == 3 * vehicles
+
+
+def test_speakers_and_witnesses_of_hours_ago_are_given_back_and_new_ones_take_their_place() -> None:
+    fusion = Fusion(LATENESS_S)
+    cells = CELL + np.arange(40)
+    fusion.fold(observations(np.arange(40.0), np.arange(40), value([0.2] * 40), cells))
+    slots = fusion.slots_of(cells, np.zeros(40, np.int64))
+    assert fusion.witnesses(slots, ICE, START - 1)[0].tolist() == [1] * 40
+    fusion.fold(observations([4 * HOUR], [1], value([0.8]), CELL))
+    assert fusion.stores.state.used[VOICES] == 1  # the window's
+    before = belief(fusion, CELL + 7)
+    fusion.fold(observations([4 * HOUR + 10.0, 4 * HOUR + 20.0], [50, 51], value([0.8, 0.8]), CELL + 7))
+    assert fusion.stores.state.used[VOICES] == 2
+    assert fusion.witnesses(slots[7:8], GRIP, START - 1)[0].tolist() == [2]
+    assert fusion.witnesses(slots[8:9], GRIP, START - 1)[0].tolist() == [0]
+    assert not np.allclose(belief(fusion, CELL + 7), before)
