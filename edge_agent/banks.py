@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from edge_agent.estimators import TUNED, Bank, create
+from edge_agent.estimators import TUNED, EstimatorBank, create
 from edge_agent.tuning.tuned import shipped
 from schemas.vehicle import Vehicle
 
 
-def bank_of(estimator: str, vehicles: Sequence[Vehicle]) -> Bank:
+def bank_of(estimator: str, vehicles: Sequence[Vehicle]) -> EstimatorBank:
     """A bank of estimators by name, one per vehicle.
 
     Raises:

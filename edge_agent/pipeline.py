@@ -15,7 +15,7 @@ from edge_agent.trip_ends import TripEnds
 from edge_agent.visits import Track, locate
 
 if TYPE_CHECKING:
-    from edge_agent.estimators import Bank, Estimates
+    from edge_agent.estimators import Estimates, EstimatorBank
     from schemas.config import AgentConfig
 
 FINAL_STEP_S = 1e-3  # after the last sample; short, so that the estimate is not propagated
@@ -24,7 +24,7 @@ FINAL_STEP_S = 1e-3  # after the last sample; short, so that the estimate is not
 class Pipeline:
     """A bank of N vehicles with its open visits. Use `step` for each block in order, then `finish` once."""
 
-    def __init__(self, bank: Bank, vehicles: int, config: AgentConfig) -> None:
+    def __init__(self, bank: EstimatorBank, vehicles: int, config: AgentConfig) -> None:
         self._bank, self._config = bank, config
         self._track, self._open = Track.start(vehicles), Open.start(vehicles)
         self._ends = TripEnds(vehicles, config.trip_end_m, config.trip_end_s)

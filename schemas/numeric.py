@@ -88,6 +88,15 @@ def _asked(context: Any, array: Any, row: Any, line: Any) -> Any:  # noqa: ANN40
 ask = cast(Callable[[NDArray[Any], Any, int], None], intrinsic(_asked))
 
 
+def entry(kernel: Callable[P, R]) -> Callable[P, R]:
+    """The machine code of a compiled function that has been called, without numba's look at the arguments (.3 us).
+
+    Every argument must be of the kind that it had in that call: nobody checks it again.
+    """
+    made = next(iter(kernel.overloads.values()))  # type: ignore[attr-defined]
+    return cast(Callable[P, R], made.entry_point)
+
+
 def _compile(
     function: Callable[P, R], *, nogil: bool = False, forceinline: bool = False, references: bool = True
 ) -> Callable[P, R]:  # fmt: skip

@@ -34,7 +34,7 @@ IMPURE = {
 }  # fmt: skip
 IMPURE_CALLS = {"open", "print", "input"}
 # What the pure core may use of the contract: numbers, names and errors, no messages, tables or transport.
-PURE_SCHEMAS = {"errors", "grid", "mugrid", "numeric", "signals", "vehicle"}
+PURE_SCHEMAS = {"errors", "grid", "mugrid", "numeric", "records", "signals", "vehicle"}
 
 # Top-level entries of the design, section 2; dot files and lock files may lie beside them.
 TOP_LEVEL = {

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from edge_agent.backfill import Outcome
     from edge_agent.estimates_file import EstimatesFile
-    from edge_agent.estimators import Bank
+    from edge_agent.estimators import EstimatorBank
     from edge_agent.sources.replay import Log
     from schemas.config import AgentConfig
 
@@ -85,7 +85,7 @@ def _told(outcomes: Iterator[Outcome], count: int) -> int:
 
 
 def _published(
-    name: str, log: Log, start_ns: int, bank: Bank, estimator: str, config: AgentConfig, file: EstimatesFile
+    name: str, log: Log, start_ns: int, bank: EstimatorBank, estimator: str, config: AgentConfig, file: EstimatesFile
 ) -> int:
     from edge_agent.agent import Progress
     from edge_agent.cli.common import checked_name, leave, publisher_of

@@ -93,8 +93,8 @@ def response(
     x_rl, y_rl = _pull(body, rl, mu[2], vx - rear * rate, aside, cos[2], sin[2], omega[2], known_x[2])
     x_rr, y_rr = _pull(body, rr, mu[3], vx + rear * rate, aside, cos[3], sin[3], omega[3], known_x[3])
     moment = a * (y_fl + y_fr) - b * (y_rl + y_rr) + front * (x_fr - x_fl) + rear * (x_rr - x_rl)
-    mass = body.mass
-    return (x_fl + x_fr + x_rl + x_rr) / mass, (y_fl + y_fr + y_rl + y_rr) / mass, moment / body.yaw_inertia
+    per_mass, per_inertia = 1.0 / body.mass, 1.0 / body.yaw_inertia
+    return (x_fl + x_fr + x_rl + x_rr) * per_mass, (y_fl + y_fr + y_rl + y_rr) * per_mass, moment * per_inertia
 
 
 @inlined

@@ -20,13 +20,13 @@ def wheel_loads(body: Body, ax: float, ay: float) -> Four:
     The lateral transfer of each axle is in proportion to the mass it carries (equal roll stiffness per load).
     """
     mass, height = body.mass, body.cg_height
-    base = body.to_front + body.to_rear
-    pitch = mass * ax * height / base
-    front = mass * GRAVITY * body.to_rear / base - pitch
-    rear = mass * GRAVITY * body.to_front / base + pitch
-    roll = ay * height / GRAVITY
-    shift_front = front * roll / body.track_front
-    shift_rear = rear * roll / body.track_rear
+    # what does not depend on ax and ay stands in brackets: many states share it
+    per_base = 1.0 / (body.to_front + body.to_rear)
+    pitch = ax * (mass * height * per_base)
+    front = mass * GRAVITY * body.to_rear * per_base - pitch
+    rear = mass * GRAVITY * body.to_front * per_base + pitch
+    shift_front = front * (ay * (height / (GRAVITY * body.track_front)))
+    shift_rear = rear * (ay * (height / (GRAVITY * body.track_rear)))
     least = LEAST_LOAD_SHARE * mass * GRAVITY / 4.0
     return (
         max(0.5 * front - shift_front, least),

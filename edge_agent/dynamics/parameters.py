@@ -61,8 +61,11 @@ def parameter_row(vehicle: Vehicle) -> FloatArray:
 
 
 def parameter_table(vehicles: Sequence[Vehicle]) -> FloatArray:
-    """One row per vehicle, shape (N, 12)."""
-    return np.stack([parameter_row(v) for v in vehicles])
+    """One row per vehicle, shape (N, 12); a fleet of one model is looked at once."""
+    models = {id(vehicle): vehicle for vehicle in vehicles}
+    place = {model: k for k, model in enumerate(models)}
+    rows = np.stack([parameter_row(vehicle) for vehicle in models.values()])
+    return np.asarray(rows[[place[id(vehicle)] for vehicle in vehicles]])
 
 
 class Body(NamedTuple):

@@ -36,10 +36,17 @@ def wheel_velocity(
 
 
 @inlined
+def along_wheel(row: FloatArray, wheel: int, vx: float, vy: float, yaw_rate: float, cos: float, sin: float) -> float:
+    """v_wx [m/s] of the centre of `wheel`, for its steering's cosine and sine."""
+    x, y = wheel_position(row, wheel)
+    return cos * (vx - y * yaw_rate) + sin * (vy + x * yaw_rate)
+
+
+@inlined
 def slips(radius: float, omega: float, along: float, across: float) -> tuple[float, float]:
     """(slip_x, slip_y) [1]: (R*omega - v_wx)/|v_wx| and -v_wy/|v_wx|, the tangent of the slip angle.
 
     Positive slip_x drives forward, positive slip_y pushes to the left.
     """
-    speed = max(abs(along), SLOWEST_M_S)
-    return (radius * omega - along) / speed, -across / speed
+    share = 1.0 / max(abs(along), SLOWEST_M_S)  # one division, which is what a step waits for
+    return (radius * omega - along) * share, -across * share

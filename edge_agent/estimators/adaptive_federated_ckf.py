@@ -16,27 +16,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Annotated
 
 import numpy as np
 
 from edge_agent.adaptation.rules import ALPHA, RATE, infer_two, rule_table
-from edge_agent.dynamics.parameters import parameter_table
+from edge_agent.dynamics.parameters import P
 from edge_agent.estimators import flags
+from edge_agent.estimators.bank import EstimatorBank
+from edge_agent.estimators.estimates import Y
 from edge_agent.estimators.gaussian import pair
-from edge_agent.estimators.gaussian.bank import (
-    GaussianBank,
-    Stretch,
+from edge_agent.estimators.gaussian.intake import BEGUN, STEPPED, Track, new_filters, take
+from edge_agent.estimators.gaussian.pair import Pair, X
+from edge_agent.estimators.gaussian.telling import (
     lost,
-    prior_interval,
     sliding,
     tell_motion,
     tell_nothing,
+    tell_prior,
+    tell_rest,
     variance,
 )
-from edge_agent.estimators.gaussian.intake import BEGUN, STEPPED, Track, grip_used, take
-from edge_agent.estimators.gaussian.pair import X
 from schemas.numeric import FloatArray, compiled, released
+from schemas.records import Records, records
 from schemas.vehicle import Vehicle
 
 DRY = 0.85  # the friction that is set: the paper's first experiment
@@ -44,61 +46,70 @@ WINDOW_S = 0.5  # of the innovation variances; the paper's M is not given
 ORDINARY = 1.0  # c of (32): gamma up to here is no sign of trouble; the paper's .85 to 1
 
 
-class Memory(NamedTuple):
-    """State of N filters."""
+class Memory:
+    """One filter."""
 
-    motion: pair.Pair
-    actual: FloatArray  # (N, 2, 4) windowed squared innovations
-    expected: FloatArray  # (N, 2, 4) windowed innovation variances
-    alpha: FloatArray  # (N, 2) mismatch at the sample before
-    friction: FloatArray  # (4,)
-    levels: FloatArray  # (5, 7)
+    row: Annotated[FloatArray, len(P)]  # parameters of the vehicle
+    track: Track
+    motion: Pair
+    actual: Annotated[FloatArray, 2, pair.ROWS]  # windowed squared innovations
+    expected: Annotated[FloatArray, 2, pair.ROWS]  # windowed innovation variances
+    alpha: Annotated[FloatArray, 2]  # mismatch at the sample before
 
 
-def bank(vehicles: Sequence[Vehicle], friction: float = DRY) -> GaussianBank[Memory]:
+class Design:
+    """What is set by hand."""
+
+    friction: Annotated[FloatArray, 4]
+    levels: Annotated[FloatArray, 5, 7]  # of the rules
+
+
+def bank(vehicles: Sequence[Vehicle], friction: float = DRY) -> EstimatorBank:
     """N of these filters on a road whose friction is set."""
-    n = len(vehicles)
-    shape = (n, 2, pair.ROWS)
-    memory = Memory(
-        pair.new_pair(n), np.zeros(shape), np.zeros(shape), np.zeros((n, 2)), np.full(4, friction), rule_table()
-    )
-    return GaussianBank(parameter_table(vehicles), memory, _advance)
+    design = records(Design, 1)
+    design["friction"], design["levels"] = friction, rule_table()
+    return EstimatorBank(new_filters(Memory, vehicles), design, _advance)
 
 
 @released
-def _advance(memory: Memory, track: Track, stretch: Stretch, first: int, last: int) -> None:
-    rows, t, signals, out, _wheels, health = stretch
-    motion = memory.motion
+def _advance(
+    filters: Records[Memory], desks: Records[Design], t: FloatArray, signals: FloatArray, tolds: FloatArray,
+    share: int, first: int, last: int,
+) -> None:  # fmt: skip
+    design = desks[share]
     for n in range(first, last):
+        memory = filters[n]
+        track, row = memory.track, memory.row
+        motion = memory.motion
         for k in range(t.shape[0]):
-            motion.told[n, 1] = 0.0
-            told, kind, gone = take(track, rows[n], n, t[k, n], signals[k, n])
+            told = tolds[k, n]
+            health, kind, gone = take(track, row, t[k, n], signals[k, n])
+            motion.log_likelihood = 0.0
             if kind == STEPPED:
-                pair.turn(motion, track, rows[n], n, gone, memory.friction)
-                if lost(motion.mean[n], motion.root[n], X.VX, X.VY, X.YAW_RATE):
-                    told, kind = told | flags.RESET, BEGUN
+                pair.turn(motion, track, row, gone, design.friction)
+                if lost(motion.mean, motion.root, X.VX, X.VY, X.YAW_RATE):
+                    health, kind = health | flags.RESET, BEGUN
                 else:
-                    _adapt(memory, n, gone)
+                    _adapt(memory, design, gone)
             if kind == BEGUN:
-                pair.begin(motion, track, rows[n], n, signals[k, n])
-                memory.actual[n], memory.expected[n], memory.alpha[n] = 0.0, 0.0, 0.0
-            if track.started[n]:
-                x, root = motion.mean[n], motion.root[n]
+                pair.begin(motion, track, row, signals[k, n])
+                memory.actual[:], memory.expected[:], memory.alpha[:] = 0.0, 0.0, 0.0
+            if track.started:
+                x, root = motion.mean, motion.root
                 tell_motion(
-                    out[:, k, n], x[X.VX], x[X.VY], x[X.YAW_RATE],
+                    told, x[X.VX], x[X.VY], x[X.YAW_RATE],
                     variance(root, X.VX), variance(root, X.VY), variance(root, X.YAW_RATE),
                 )  # fmt: skip
-                prior_interval(out[8:11, k, n])
-                out[11, k, n], out[12, k, n] = grip_used(track, n), motion.told[n, 0]
-                out[13, k, n], out[14, k, n] = motion.factor[n].max(), motion.told[n, 1]
-                health[k, n] = told | sliding(rows[n], track.use[n], x[X.VX], x[X.VY], memory.friction[0])
+                tell_prior(told)
+                tell_rest(told, track.used, motion.nis, max(motion.factor[0], motion.factor[1]), motion.log_likelihood)
+                health |= sliding(row, track, x[X.VX], x[X.VY], design.friction[0])
             else:
-                health[k, n] = told
-                tell_nothing(out[:, k, n])
+                tell_nothing(told)
+            told[Y.HEALTH] = health
 
 
 @compiled
-def _adapt(memory: Memory, n: int, gone: float) -> None:
+def _adapt(memory: Memory, design: Design, gone: float) -> None:
     """Factors on R and shares for the next sample."""
     motion = memory.motion
     keep = 0.5 ** (gone / WINDOW_S)
@@ -106,17 +117,17 @@ def _adapt(memory: Memory, n: int, gone: float) -> None:
     for sub in range(2):
         mismatch, count = 0.0, 0
         for r in range(pair.ROWS):
-            error = motion.innovation[n, sub, r]
+            error = motion.innovation[sub, r]
             if math.isnan(error):
                 continue
-            memory.actual[n, sub, r] = keep * memory.actual[n, sub, r] + (1.0 - keep) * error * error
-            memory.expected[n, sub, r] = keep * memory.expected[n, sub, r] + (1.0 - keep) * motion.expected[n, sub, r]
-            mismatch += memory.actual[n, sub, r] / memory.expected[n, sub, r] - 1.0
+            memory.actual[sub, r] = keep * memory.actual[sub, r] + (1.0 - keep) * error * error
+            memory.expected[sub, r] = keep * memory.expected[sub, r] + (1.0 - keep) * motion.expected[sub, r]
+            mismatch += memory.actual[sub, r] / memory.expected[sub, r] - 1.0
             count += 1
         alpha = mismatch / max(count, 1)
-        rate = (alpha - memory.alpha[n, sub]) / gone
-        memory.alpha[n, sub] = alpha
-        motion.factor[n, sub] = math.exp(infer_two(alpha, rate, ALPHA, RATE, memory.levels))
-        if motion.gamma[n, sub] > ORDINARY:
-            raw[sub] = ORDINARY / motion.gamma[n, sub]
-    motion.beta[n] = min(max(raw[0] / (raw[0] + raw[1]), pair.LEAST_BETA), 1.0 - pair.LEAST_BETA)
+        rate = (alpha - memory.alpha[sub]) / gone
+        memory.alpha[sub] = alpha
+        motion.factor[sub] = math.exp(infer_two(alpha, rate, ALPHA, RATE, design.levels))
+        if motion.gamma[sub] > ORDINARY:
+            raw[sub] = ORDINARY / motion.gamma[sub]
+    motion.beta = min(max(raw[0] / (raw[0] + raw[1]), pair.LEAST_BETA), 1.0 - pair.LEAST_BETA)

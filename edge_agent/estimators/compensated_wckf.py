@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Annotated
 
 import numpy as np
 
@@ -29,31 +29,35 @@ from edge_agent.adaptation.windows import push, weighted_noise
 from edge_agent.dynamics.body import accelerations
 from edge_agent.dynamics.chassis import turned, tyre_forces
 from edge_agent.dynamics.drive_wheel import blended, drive_wheel, slip_share
-from edge_agent.dynamics.parameters import P, parameter_table
+from edge_agent.dynamics.parameters import P
 from edge_agent.dynamics.slip import wheel_velocity
 from edge_agent.estimators import flags
 from edge_agent.estimators.adaptive_federated_ckf import DRY
+from edge_agent.estimators.bank import EstimatorBank
+from edge_agent.estimators.estimates import Y
 from edge_agent.estimators.friction_mixture.sample import rolling_speed
-from edge_agent.estimators.gaussian.bank import (
+from edge_agent.estimators.gaussian.intake import BEGUN, STEPPED, Track, new_filters, take
+from edge_agent.estimators.gaussian.telling import (
     FIRST_V_STD,
     UNKNOWN_V_STD,
-    GaussianBank,
-    Stretch,
     lost,
-    prior_interval,
     sliding,
     tell_motion,
     tell_nothing,
+    tell_prior,
+    tell_rest,
     variance,
 )
-from edge_agent.estimators.gaussian.intake import BEGUN, STEPPED, Track, grip_used, take
 from edge_agent.filters.sigma import cubature
 from edge_agent.filters.squareroot import deviations, predict, sigma_points, update, weighted_mean
 from schemas.numeric import FloatArray, compiled, released
+from schemas.records import Records, records
 from schemas.signals import S
 from schemas.vehicle import Vehicle
 
 A_STATES, A_ROWS, B_STATES = 19, 9, 3
+A_XI, A_WEIGHT = cubature(A_STATES).xi, cubature(A_STATES).w_cov
+B_XI, B_WEIGHT = cubature(B_STATES).xi, cubature(B_STATES).w_cov
 SHAPE = 1.4  # c of the Magic Formula (12): between the usual lateral 1.3 and longitudinal 1.65
 WINDOW = 25  # samples; the paper's N is not given
 LEAST, LARGEST = 0.5, 20.0  # of the nominal R
@@ -76,70 +80,76 @@ class X(IntEnum):
     SLOPE = 15
 
 
-class Memory(NamedTuple):
-    """State of N pairs of filters."""
+class Memory:
+    """One pair of filters."""
 
-    mean: FloatArray  # (N, 19)
-    root: FloatArray  # (N, 19, 19)
-    window: FloatArray  # (N, 9, WINDOW) innovations
-    fused: FloatArray  # (N, 3)
-    fused_root: FloatArray  # (N, 3, 3)
-    fused_window: FloatArray  # (N, 3, WINDOW)
-    told: FloatArray  # (N, 3) NIS, log-likelihood, largest factor on R
-    friction: FloatArray  # (4,)
-    xi: FloatArray  # (38, 19)
-    weight: FloatArray  # (38,)
-    fused_xi: FloatArray  # (6, 3)
-    fused_weight: FloatArray  # (6,)
+    row: Annotated[FloatArray, len(P)]  # parameters of the vehicle
+    track: Track
+    mean: Annotated[FloatArray, A_STATES]
+    root: Annotated[FloatArray, A_STATES, A_STATES]
+    window: Annotated[FloatArray, A_ROWS, WINDOW]  # innovations
+    fused: Annotated[FloatArray, B_STATES]
+    fused_root: Annotated[FloatArray, B_STATES, B_STATES]
+    fused_window: Annotated[FloatArray, B_STATES, WINDOW]
+    nis: float
+    log_likelihood: float
+    largest: float  # factor on R
 
 
-def bank(vehicles: Sequence[Vehicle], friction: float = DRY) -> GaussianBank[Memory]:
+class Design:
+    """What is set by hand."""
+
+    friction: Annotated[FloatArray, 4]
+
+
+def bank(vehicles: Sequence[Vehicle], friction: float = DRY) -> EstimatorBank:
     """N of these filters on a road whose friction is set."""
-    n, large, small = len(vehicles), cubature(A_STATES), cubature(B_STATES)
-    memory = Memory(
-        np.zeros((n, A_STATES)), np.zeros((n, A_STATES, A_STATES)), np.full((n, A_ROWS, WINDOW), np.nan),
-        np.zeros((n, B_STATES)), np.zeros((n, B_STATES, B_STATES)), np.full((n, B_STATES, WINDOW), np.nan),
-        np.zeros((n, 3)), np.full(4, friction), large.xi, large.w_cov, small.xi, small.w_cov,
-    )  # fmt: skip
-    return GaussianBank(parameter_table(vehicles), memory, _advance)
+    design = records(Design, 1)
+    design["friction"] = friction
+    return EstimatorBank(new_filters(Memory, vehicles), design, _advance)
 
 
 @released
-def _advance(memory: Memory, track: Track, stretch: Stretch, first: int, last: int) -> None:
-    rows, t, signals, out, _wheels, health = stretch
+def _advance(
+    filters: Records[Memory], desks: Records[Design], t: FloatArray, signals: FloatArray, tolds: FloatArray,
+    share: int, first: int, last: int,
+) -> None:  # fmt: skip
+    design = desks[share]
     points, work = np.empty((2 * A_STATES, A_STATES)), np.empty((A_ROWS + A_STATES, 4 * A_STATES))
     force_y = np.empty(4)
     for n in range(first, last):
+        memory = filters[n]
+        track, row = memory.track, memory.row
         for k in range(t.shape[0]):
-            memory.told[n, 1] = 0.0
-            told, kind, gone = take(track, rows[n], n, t[k, n], signals[k, n])
+            told = tolds[k, n]
+            health, kind, gone = take(track, row, t[k, n], signals[k, n])
+            memory.log_likelihood = 0.0
             if kind == STEPPED:
-                _preliminary(memory, track, rows[n], n, gone, force_y, points, work)
-                _fuse(memory, track, rows[n], n, gone, work)
-                if lost(memory.fused[n], memory.fused_root[n], X.VX, X.VY, X.YAW_RATE) or lost(
-                    memory.mean[n], memory.root[n], X.VX, X.VY, X.YAW_RATE
+                _preliminary(memory, design, gone, force_y, points, work)
+                _fuse(memory, design, gone, work)
+                if lost(memory.fused, memory.fused_root, X.VX, X.VY, X.YAW_RATE) or lost(
+                    memory.mean, memory.root, X.VX, X.VY, X.YAW_RATE
                 ):
-                    told, kind = told | flags.RESET, BEGUN
+                    health, kind = health | flags.RESET, BEGUN
             if kind == BEGUN:
-                _begin(memory, track, rows[n], n, signals[k, n])
-            if track.started[n]:
-                x, root = memory.fused[n], memory.fused_root[n]
+                _begin(memory, signals[k, n])
+            if track.started:
+                x, root = memory.fused, memory.fused_root
                 tell_motion(
-                    out[:, k, n], x[X.VX], x[X.VY], x[X.YAW_RATE],
+                    told, x[X.VX], x[X.VY], x[X.YAW_RATE],
                     variance(root, X.VX), variance(root, X.VY), variance(root, X.YAW_RATE),
                 )  # fmt: skip
-                prior_interval(out[8:11, k, n])
-                out[11, k, n], out[12, k, n] = grip_used(track, n), memory.told[n, 0]
-                out[13, k, n], out[14, k, n] = memory.told[n, 2], memory.told[n, 1]
-                health[k, n] = told | sliding(rows[n], track.use[n], x[X.VX], x[X.VY], memory.friction[0])
+                tell_prior(told)
+                tell_rest(told, track.used, memory.nis, memory.largest, memory.log_likelihood)
+                health |= sliding(row, track, x[X.VX], x[X.VY], design.friction[0])
             else:
-                health[k, n] = told
-                tell_nothing(out[:, k, n])
+                tell_nothing(told)
+            told[Y.HEALTH] = health
 
 
 @compiled
-def _begin(memory: Memory, track: Track, row: FloatArray, n: int, sample: FloatArray) -> None:
-    mean, root, use = memory.mean[n], memory.root[n], track.use[n]
+def _begin(memory: Memory, sample: FloatArray) -> None:
+    row, mean, root, use = memory.row, memory.mean, memory.root, memory.track.use
     speed = rolling_speed(row, sample)
     known = not math.isnan(speed)
     mean[:] = 0.0
@@ -154,9 +164,9 @@ def _begin(memory: Memory, track: Track, row: FloatArray, n: int, sample: FloatA
         root[X.FORCE + wheel, X.FORCE + wheel], root[X.SLOPE + wheel, X.SLOPE + wheel] = 200.0, 1000.0
     root[X.VX, X.VX], root[X.VY, X.VY] = FIRST_V_STD if known else UNKNOWN_V_STD, FIRST_V_STD
     root[X.YAW_RATE, X.YAW_RATE] = 0.1
-    memory.fused[n], memory.fused_root[n] = mean[:B_STATES], root[:B_STATES, :B_STATES]
-    memory.window[n], memory.fused_window[n] = math.nan, math.nan
-    memory.told[n, 0], memory.told[n, 1], memory.told[n, 2] = 0.0, 0.0, 1.0
+    memory.fused[:], memory.fused_root[:] = mean[:B_STATES], root[:B_STATES, :B_STATES]
+    memory.window[:], memory.fused_window[:] = math.nan, math.nan
+    memory.nis, memory.log_likelihood, memory.largest = 0.0, 0.0, 1.0
 
 
 @compiled
@@ -177,15 +187,15 @@ def _forces(
 
 @compiled
 def _preliminary(
-    memory: Memory, track: Track, row: FloatArray, n: int, gone: float, force_y: FloatArray, points: FloatArray,
-    work: FloatArray,
-) -> None:  # fmt: skip
+    memory: Memory, design: Design, gone: float, force_y: FloatArray, points: FloatArray, work: FloatArray
+) -> None:
     """WCKF-A: lateral forces come from the tyre model in B's last motion."""
-    mean, root, use, now = memory.mean[n], memory.root[n], track.before[n], track.now[n]
+    row, mean, root = memory.row, memory.mean, memory.root
+    use, now = memory.track.before, memory.track.now
     force_x, noise = np.empty(4), np.zeros((A_STATES, A_STATES))
-    _forces(row, memory.fused[n], use, memory.friction, mean[X.FORCE : X.FORCE + 4], force_x, force_y)
+    _forces(row, memory.fused, use, design.friction, mean[X.FORCE : X.FORCE + 4], force_x, force_y)
     delta = use[S.DELTA : S.DELTA + 4]
-    sigma_points(mean, root, memory.xi, points)
+    sigma_points(mean, root, A_XI, points)
     for p in range(points.shape[0]):
         x = points[p]
         _, _, turn = accelerations(row, x[X.FORCE : X.FORCE + 4], force_y, delta)
@@ -199,7 +209,7 @@ def _preliminary(
             )  # fmt: skip
     for i in range(A_STATES):
         noise[i, i] = A_PROCESS[i] * math.sqrt(gone)
-    predict(points, memory.weight, memory.weight, noise, mean, root, work)
+    predict(points, A_WEIGHT, A_WEIGHT, noise, mean, root, work)
     innovation, std, rows = np.empty(A_ROWS), np.empty(A_ROWS), np.empty((A_ROWS, A_STATES))
     for r in range(A_ROWS):
         place = X.YAW_RATE + r
@@ -207,26 +217,27 @@ def _preliminary(
         rows[r] = root[place]
         innovation[r] = reading - mean[place]
         if not math.isnan(innovation[r]):
-            push(memory.window[n, r], innovation[r])
-        std[r] = math.sqrt(weighted_noise(memory.window[n, r], variance(root, place), A_NOISE[r], LEAST, LARGEST))
+            push(memory.window[r], innovation[r])
+        std[r] = math.sqrt(weighted_noise(memory.window[r], variance(root, place), A_NOISE[r], LEAST, LARGEST))
     update(mean, root, root.copy(), rows, innovation, std, work)
 
 
 @compiled
-def _fuse(memory: Memory, track: Track, row: FloatArray, n: int, gone: float, work: FloatArray) -> None:
+def _fuse(memory: Memory, design: Design, gone: float, work: FloatArray) -> None:
     """WCKF-B: motion by the compensated forces."""
-    mean, root, use, now = memory.fused[n], memory.fused_root[n], track.use[n], track.now[n]
-    observed, count = memory.mean[n, X.FORCE : X.FORCE + 4], 2 * B_STATES
+    row, track, mean, root = memory.row, memory.track, memory.fused, memory.fused_root
+    use, now = track.use, track.now
+    observed, count = memory.mean[X.FORCE : X.FORCE + 4], 2 * B_STATES
     points, outcomes, predicted = np.empty((count, B_STATES)), np.empty((count, B_STATES)), np.empty(B_STATES)
     state, measured = np.empty((B_STATES, count)), np.empty((B_STATES, count))
     innovation, std, noise = np.empty(B_STATES), np.empty(B_STATES), np.zeros((B_STATES, B_STATES))
     force_x, force_y = np.empty(4), np.empty(4)
     delta = use[S.DELTA : S.DELTA + 4]
     for act in range(2):
-        sigma_points(mean, root, memory.fused_xi, points)
+        sigma_points(mean, root, B_XI, points)
         for p in range(count):
             x = points[p]
-            _forces(row, x, track.before[n] if act == 0 else use, memory.friction, observed, force_x, force_y)
+            _forces(row, x, track.before if act == 0 else use, design.friction, observed, force_x, force_y)
             ax, ay, turn = accelerations(row, force_x, force_y, delta)
             if act == 0:
                 vx, vy, rate = x[X.VX], x[X.VY], x[X.YAW_RATE]
@@ -237,10 +248,10 @@ def _fuse(memory: Memory, track: Track, row: FloatArray, n: int, gone: float, wo
         if act == 0:
             for i in range(B_STATES):
                 noise[i, i] = B_PROCESS[i] * math.sqrt(gone)
-            predict(points, memory.fused_weight, memory.fused_weight, noise, mean, root, work)
-    weighted_mean(outcomes, memory.fused_weight, predicted)
-    deviations(points, mean, memory.fused_weight, state, 0)
-    deviations(outcomes, predicted, memory.fused_weight, measured, 0)
+            predict(points, B_WEIGHT, B_WEIGHT, noise, mean, root, work)
+    weighted_mean(outcomes, B_WEIGHT, predicted)
+    deviations(points, mean, B_WEIGHT, state, 0)
+    deviations(outcomes, predicted, B_WEIGHT, measured, 0)
     largest = 0.0
     for r in range(B_STATES):
         innovation[r] = (now[S.YAW_RATE] if r == 0 else now[S.AX + r - 1]) - predicted[r]
@@ -248,9 +259,9 @@ def _fuse(memory: Memory, track: Track, row: FloatArray, n: int, gone: float, wo
         for p in range(count):
             spread += measured[r, p] ** 2
         if not math.isnan(innovation[r]):
-            push(memory.fused_window[n, r], innovation[r])
-        adapted = weighted_noise(memory.fused_window[n, r], spread, B_NOISE[r], LEAST, LARGEST)
+            push(memory.fused_window[r], innovation[r])
+        adapted = weighted_noise(memory.fused_window[r], spread, B_NOISE[r], LEAST, LARGEST)
         std[r] = math.sqrt(adapted)
         largest = max(largest, adapted / B_NOISE[r])
     used, log_likelihood, square = update(mean, root, state, measured, innovation, std, work)
-    memory.told[n, 0], memory.told[n, 1], memory.told[n, 2] = square / max(used, 1), log_likelihood, largest
+    memory.nis, memory.log_likelihood, memory.largest = square / max(used, 1), log_likelihood, largest

@@ -15,37 +15,40 @@ loads from a_x and a_y, which (9) of paper 000 gives. Friction keeps to its rang
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from edge_agent.adaptation.fuzzy import adapted_within
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.dynamics.parameters import parameter_table
+from edge_agent.dynamics.parameters import P
 from edge_agent.estimators import flags
+from edge_agent.estimators.bank import EstimatorBank
+from edge_agent.estimators.estimates import Y
 from edge_agent.estimators.friction_mixture.sample import rolling_speed
-from edge_agent.estimators.gaussian.bank import (
+from edge_agent.estimators.gaussian.intake import BEGUN, STEPPED, Track, new_filters, take
+from edge_agent.estimators.gaussian.planar import POINTS, carry
+from edge_agent.estimators.gaussian.telling import (
     FIRST_V_STD,
     PRIOR_MU,
     PRIOR_MU_STD,
     UNKNOWN_V_STD,
-    GaussianBank,
-    Stretch,
     hold_mu,
     interval,
     lost,
     sliding,
     tell_motion,
     tell_nothing,
+    tell_rest,
     variance,
 )
-from edge_agent.estimators.gaussian.intake import BEGUN, STEPPED, Track, grip_used, take
-from edge_agent.estimators.gaussian.planar import carry
-from edge_agent.filters.sigma import cubature
-from edge_agent.filters.squareroot import predict, sigma_points, update
+from edge_agent.filters.columns import gather, look, spread
+from edge_agent.filters.squareroot import LOG_TWO_PI
 from schemas.numeric import FloatArray, compiled, released
+from schemas.records import Records, records
 from schemas.signals import S
 from schemas.vehicle import Vehicle
 
@@ -80,144 +83,151 @@ AT_THE_TRUTH = Setting(start=(1e-6, 1e-6, 1e-3, 1e-3, 1e-6, 1e-6), noise=(0.05, 
 """The paper's experiments: R known, and the start (section IV.A) so well known that the printed mu error can be met."""
 
 
-class Memory(NamedTuple):
-    """State and tables of N filters."""
+class Memory:
+    """One filter."""
 
-    mean: FloatArray  # (N, 6)
-    root: FloatArray  # (N, 6, 6)
-    actual: FloatArray  # (N, 3) windowed innovation variances
-    theoretical: FloatArray  # (N, 3)
-    factor: FloatArray  # (N, 3) on R
-    told: FloatArray  # (N, 2) NIS per row, log-likelihood
-    xi: FloatArray  # (12, 6)
-    weight: FloatArray  # (12,)
-    process: FloatArray  # (6,) standard deviations per STEP_S
-    start: FloatArray  # (6,) standard deviations
-    noise: FloatArray  # (3,) variances
-    inputs: FloatArray  # (5,) fuzzy sets
-    outputs: FloatArray  # (5,)
+    row: Annotated[FloatArray, len(P)]  # parameters of the vehicle
+    track: Track
+    mean: Annotated[FloatArray, STATES]
+    root: Annotated[FloatArray, STATES, STATES]
+    actual: Annotated[FloatArray, ROWS]  # windowed innovation variances
+    theoretical: Annotated[FloatArray, ROWS]
+    factor: Annotated[FloatArray, ROWS]  # on R
+    nis: float  # per row
+    log_likelihood: float
+
+
+class Design:
+    """What all filters of a bank share."""
+
+    process: Annotated[FloatArray, STATES]  # standard deviations per STEP_S
+    start: Annotated[FloatArray, STATES]  # standard deviations
+    noise: Annotated[FloatArray, ROWS]  # variances
+    inputs: Annotated[FloatArray, 5]  # fuzzy sets
+    outputs: Annotated[FloatArray, 5]
     mu: float
     straight: bool
 
 
-class Scratch(NamedTuple):
+class Scratch:
     """What a step writes before it reads it."""
 
-    points: FloatArray  # (12, 6)
-    noise: FloatArray  # (6, 6), zero off the diagonal
-    state: FloatArray  # (6, 6)
-    rows: FloatArray  # (3, 6)
-    innovation: FloatArray  # (3,)
-    std: FloatArray  # (3,)
-    work: FloatArray  # (12, 24)
+    points: Annotated[FloatArray, STATES, POINTS]
+    noise: Annotated[FloatArray, ROWS]  # variances
+    gain: Annotated[FloatArray, STATES]
 
 
-@compiled
-def new_scratch() -> Scratch:
-    """Room for one thread."""
-    return Scratch(
-        np.empty((2 * STATES, STATES)), np.zeros((STATES, STATES)), np.empty((STATES, STATES)),
-        np.empty((ROWS, STATES)), np.empty(ROWS), np.empty(ROWS), np.zeros((2 * STATES, 4 * STATES)),
-    )  # fmt: skip
+class Desk:
+    """What the filters of a thread share."""
+
+    design: Design
+    scratch: Scratch
 
 
-def bank(vehicles: Sequence[Vehicle], memberships: Memberships, setting: Setting | None = None) -> GaussianBank[Memory]:
+def bank(vehicles: Sequence[Vehicle], memberships: Memberships, setting: Setting | None = None) -> EstimatorBank:
     """N of these filters; `setting` replaces the one for ordinary sensors and an unknown road."""
-    n, rule = len(vehicles), cubature(STATES)
     chosen = Setting() if setting is None else setting
-    memory = Memory(
-        np.zeros((n, STATES)), np.zeros((n, STATES, STATES)), np.zeros((n, ROWS)), np.zeros((n, ROWS)),
-        np.ones((n, ROWS)), np.zeros((n, 2)), rule.xi, rule.w_cov, np.sqrt(np.array(chosen.process)),
-        np.sqrt(np.array(chosen.start)), np.array(chosen.noise), np.array(memberships.inputs),
-        np.array(memberships.outputs), chosen.mu, chosen.straight,
-    )  # fmt: skip
-    return GaussianBank(parameter_table(vehicles), memory, _advance)
+    desk = records(Desk, 1)
+    design = desk["design"]
+    design["process"], design["start"], design["noise"] = np.sqrt(chosen.process), np.sqrt(chosen.start), chosen.noise
+    design["inputs"], design["outputs"] = memberships.inputs, memberships.outputs
+    design["mu"], design["straight"] = chosen.mu, chosen.straight
+    return EstimatorBank(new_filters(Memory, vehicles), desk, _advance)
 
 
 @released
-def _advance(memory: Memory, track: Track, stretch: Stretch, first: int, last: int) -> None:
-    rows, t, signals, out, _wheels, health = stretch
-    scratch = new_scratch()
+def _advance(
+    filters: Records[Memory], desks: Records[Desk], t: FloatArray, signals: FloatArray, tolds: FloatArray,
+    share: int, first: int, last: int,
+) -> None:  # fmt: skip
+    desk = desks[share]
+    design, scratch = desk.design, desk.scratch
     for n in range(first, last):
+        memory = filters[n]
         for k in range(t.shape[0]):
-            memory.told[n, 1] = 0.0
-            told, kind, gone = take(track, rows[n], n, t[k, n], signals[k, n])
+            memory.log_likelihood = 0.0
+            told = tolds[k, n]
+            health, kind, gone = take(memory.track, memory.row, t[k, n], signals[k, n])
             if kind == STEPPED:
-                _step(memory, track, rows[n], n, gone, scratch)
-                if lost(memory.mean[n], memory.root[n], X.VX, X.VY, X.YAW_RATE):
-                    told, kind = told | flags.RESET, BEGUN
+                _step(memory, design, gone, scratch)
+                if lost(memory.mean, memory.root, X.VX, X.VY, X.YAW_RATE):
+                    health, kind = health | flags.RESET, BEGUN
             if kind == BEGUN:
-                _begin(memory, track, rows[n], n, signals[k, n])
-            if track.started[n]:
-                mean = memory.mean[n]
-                health[k, n] = told | sliding(rows[n], track.use[n], mean[X.VX], mean[X.VY], mean[X.MU])
-                _report(memory, track, n, out[:, k, n])
+                _begin(memory, design, signals[k, n])
+            if memory.track.started:
+                mean = memory.mean
+                health |= sliding(memory.row, memory.track, mean[X.VX], mean[X.VY], mean[X.MU])
+                _report(memory, told)
             else:
-                health[k, n] = told
-                tell_nothing(out[:, k, n])
+                tell_nothing(told)
+            told[Y.HEALTH] = health
 
 
 @compiled
-def _begin(memory: Memory, track: Track, row: FloatArray, n: int, sample: FloatArray) -> None:
+def _begin(memory: Memory, design: Design, sample: FloatArray) -> None:
     """Begin at the speed of the wheels, straight on."""
-    mean, root, use = memory.mean[n], memory.root[n], track.use[n]
-    speed = rolling_speed(row, sample)
-    known = speed == speed
+    mean, root, use = memory.mean, memory.root, memory.track.use
+    speed = rolling_speed(memory.row, sample)
+    known = not math.isnan(speed)
     mean[X.VX], mean[X.VY] = speed if known else 0.0, 0.0
-    told = 0.0 if memory.straight else 1.0
-    mean[X.AX], mean[X.AY], mean[X.YAW_RATE] = told * use[S.AX], told * use[S.AY], told * use[S.YAW_RATE]
-    mean[X.MU] = memory.mu
+    measured = 0.0 if design.straight else 1.0
+    mean[X.AX], mean[X.AY], mean[X.YAW_RATE] = (
+        measured * use[S.AX], measured * use[S.AY], measured * use[S.YAW_RATE],
+    )  # fmt: skip
+    mean[X.MU] = design.mu
     root[:, :] = 0.0
     for i in range(STATES):
-        root[i, i] = memory.start[i]
+        root[i, i] = design.start[i]
     if not known:
         root[X.VX, X.VX] = UNKNOWN_V_STD
-    memory.factor[n] = 1.0
-    memory.actual[n] = 0.0
-    memory.theoretical[n] = 0.0
-    memory.told[n] = 0.0
+    for r in range(ROWS):
+        memory.factor[r], memory.actual[r], memory.theoretical[r] = 1.0, 0.0, 0.0
+    memory.nis = memory.log_likelihood = 0.0
 
 
 @compiled
-def _step(memory: Memory, track: Track, row: FloatArray, n: int, gone: float, scratch: Scratch) -> None:
-    points, noise, work = scratch.points, scratch.noise, scratch.work
-    mean, root, now = memory.mean[n], memory.root[n], track.now[n]
-    sigma_points(mean, root, memory.xi, points)
-    carry(row, points, memory.factor[n], track.before[n], track.use[n], gone, False)
+def _step(memory: Memory, design: Design, gone: float, scratch: Scratch) -> None:
+    mean, root, points = memory.mean, memory.root, scratch.points
     pace = gone / STEP_S
-    for i in range(STATES):
-        noise[i, i] = memory.process[i] * pace**0.5
-    predict(points, memory.weight, memory.weight, noise, mean, root, work)
-    innovation, std, rows = scratch.innovation, scratch.std, scratch.rows
-    keep = 0.5 ** (gone / WINDOW_S)
+    spread(mean, root, points)
+    carry(memory.row, points, memory.factor, memory.track, gone, False)
+    gather(points, design.process, math.sqrt(pace), mean, root)
+    _adapt(memory, design, pace, math.exp(-math.log(2.0) * gone / WINDOW_S), scratch.noise)
+    used, square, determinant = 0, 0.0, 1.0
     for r in range(ROWS):
-        # the measurement is linear: the deviations of its points are rows of the factor
-        rows[r] = root[X.AX + r]
-        innovation[r] = now[r] - mean[X.AX + r]
-        theoretical = variance(root, X.AX + r) + memory.factor[n, r] * memory.noise[r]
-        std[r] = (memory.factor[n, r] * memory.noise[r]) ** 0.5
-        if innovation[r] == innovation[r]:
-            memory.actual[n, r] = keep * memory.actual[n, r] + (1.0 - keep) * innovation[r] ** 2
-            memory.theoretical[n, r] = keep * memory.theoretical[n, r] + (1.0 - keep) * theoretical
-            memory.factor[n, r] = adapted_within(
-                memory.factor[n, r], memory.actual[n, r], memory.theoretical[n, r], memory.inputs, memory.outputs,
-                pace, LEAST_FACTOR, LARGEST_FACTOR,
-            )  # fmt: skip
-    scratch.state[:] = root
-    used, log_likelihood, square = update(mean, root, scratch.state, rows, innovation, std, work)
-    memory.told[n, 0] = square / max(used, 1)
-    memory.told[n, 1] = log_likelihood
+        # the measurement is linear, a state itself
+        reading = memory.track.now[r]
+        if not math.isnan(reading):
+            far, expected = look(mean, root, X.AX + r, reading, scratch.noise[r], scratch.gain)
+            used, square, determinant = used + 1, square + far, determinant * expected
+    memory.nis = square / max(used, 1)
+    memory.log_likelihood = -0.5 * (used * LOG_TWO_PI + math.log(determinant) + square)
     hold_mu(mean, root, X.MU, PRIOR_MU_STD)
 
 
 @compiled
-def _report(memory: Memory, track: Track, n: int, out: FloatArray) -> None:
-    mean, root = memory.mean[n], memory.root[n]
+def _adapt(memory: Memory, design: Design, pace: float, keep: float, noise: FloatArray) -> None:
+    """noise (3,) = R of this sample, and the factors on R for the next."""
+    for r in range(ROWS):
+        noise[r] = memory.factor[r] * design.noise[r]
+        innovation = memory.track.now[r] - memory.mean[X.AX + r]
+        if not math.isnan(innovation):
+            theoretical = variance(memory.root, X.AX + r) + noise[r]
+            memory.actual[r] = keep * memory.actual[r] + (1.0 - keep) * innovation * innovation
+            memory.theoretical[r] = keep * memory.theoretical[r] + (1.0 - keep) * theoretical
+            memory.factor[r] = adapted_within(
+                memory.factor[r], memory.actual[r], memory.theoretical[r], design.inputs, design.outputs, pace,
+                LEAST_FACTOR, LARGEST_FACTOR,
+            )  # fmt: skip
+
+
+@compiled
+def _report(memory: Memory, told: FloatArray) -> None:
+    mean, root = memory.mean, memory.root
     tell_motion(
-        out, mean[X.VX], mean[X.VY], mean[X.YAW_RATE],
+        told, mean[X.VX], mean[X.VY], mean[X.YAW_RATE],
         variance(root, X.VX), variance(root, X.VY), variance(root, X.YAW_RATE),
     )  # fmt: skip
-    interval(mean[X.MU], variance(root, X.MU) ** 0.5, out[8:11])
-    out[11], out[12], out[13], out[14] = (
-        grip_used(track, n), memory.told[n, 0], memory.factor[n].max(), memory.told[n, 1],
-    )  # fmt: skip
+    told[Y.MU], told[Y.MU_LOWER], told[Y.MU_UPPER] = interval(mean[X.MU], math.sqrt(variance(root, X.MU)))
+    most = max(memory.factor[0], memory.factor[1], memory.factor[2])
+    tell_rest(told, memory.track.used, memory.nis, most, memory.log_likelihood)

@@ -17,13 +17,13 @@ import numpy as np
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.dynamics.parameters import parameter_table
 from edge_agent.estimators import adaptive_federated_ckf, compensated_wckf, federated_ckf, paper_aco_fckf, sr_ukf
+from edge_agent.estimators.bank import EstimatorBank
 from edge_agent.estimators.friction_mixture.advance import Design
-from edge_agent.estimators.friction_mixture.bank import EstimatorBank
+from edge_agent.estimators.friction_mixture.bank import mixture_bank
 from edge_agent.estimators.friction_mixture.constants import NODES, C, constant_row, nominal_states
 from edge_agent.estimators.friction_mixture.curve import curve_tables
 from edge_agent.estimators.friction_mixture.node import Nominal
 from edge_agent.estimators.friction_mixture.nodes import node_table, side_table
-from edge_agent.estimators.gaussian.bank import Bank
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.vehicle import Vehicle
@@ -42,7 +42,7 @@ ESTIMATORS = {
 TUNED: Final = {"aco-fckf": "aco-fckf", "paper-aco-fckf": "paper-aco-fckf"}
 
 # the papers' estimators without fuzzy sets that could be tuned
-PLAIN: Final[dict[str, Callable[[Sequence[Vehicle]], Bank]]] = {
+PLAIN: Final[dict[str, Callable[[Sequence[Vehicle]], EstimatorBank]]] = {
     "federated-ckf": federated_ckf.bank,
     "adaptive-federated-ckf": adaptive_federated_ckf.bank,
     "compensated-wckf": compensated_wckf.bank,
@@ -68,7 +68,7 @@ def design_of(memberships: Memberships, *, adaptive: bool, constants: FloatArray
     )
 
 
-def create(name: str, vehicles: Sequence[Vehicle], *, memberships: Memberships | None = None) -> Bank:
+def create(name: str, vehicles: Sequence[Vehicle], *, memberships: Memberships | None = None) -> EstimatorBank:
     """A bank of estimators `name`, one per vehicle.
 
     Args:
@@ -94,4 +94,4 @@ def create(name: str, vehicles: Sequence[Vehicle], *, memberships: Memberships |
         memberships = Memberships()
     if name == "paper-aco-fckf":
         return paper_aco_fckf.bank(vehicles, memberships)
-    return EstimatorBank(parameter_table(vehicles), design_of(memberships, adaptive=name != "ckf"))
+    return mixture_bank(parameter_table(vehicles), design_of(memberships, adaptive=name != "ckf"))

@@ -14,6 +14,8 @@ from schemas.errors import InputError
 from schemas.numeric import BoolArray, FloatArray
 from schemas.signals import CHANNELS
 
+CHANNEL_COUNT = len(CHANNELS)
+
 
 def checked(t: FloatArray, signals: FloatArray, closes: BoolArray | None, count: int) -> tuple[FloatArray, FloatArray]:
     """t (T, N) and signals (T, N, 18) as contiguous float64, for a bank of `count` vehicles.
@@ -22,12 +24,13 @@ def checked(t: FloatArray, signals: FloatArray, closes: BoolArray | None, count:
         InputError: shapes do not agree with the bank or with each other.
     """
     t, signals = np.ascontiguousarray(t, np.float64), np.ascontiguousarray(signals, np.float64)
-    if t.ndim != 2 or t.shape[1] != count:
-        raise InputError("t", f"shape {t.shape} for a bank of {count}", "give (T, N)")
-    if signals.shape != (*t.shape, len(CHANNELS)):
-        raise InputError("signals", f"shape {signals.shape}", f"give {(*t.shape, len(CHANNELS))}")
-    if closes is not None and closes.shape != t.shape:
-        raise InputError("closes", f"shape {closes.shape}", f"give {t.shape}")
+    shape = t.shape
+    if len(shape) != 2 or shape[1] != count:
+        raise InputError("t", f"shape {shape} for a bank of {count}", "give (T, N)")
+    if signals.shape != (*shape, CHANNEL_COUNT):
+        raise InputError("signals", f"shape {signals.shape}", f"give {(*shape, CHANNEL_COUNT)}")
+    if closes is not None and closes.shape != shape:
+        raise InputError("closes", f"shape {closes.shape}", f"give {shape}")
     return t, signals
 
 

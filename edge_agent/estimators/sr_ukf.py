@@ -21,44 +21,50 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Annotated
 
 import numpy as np
 
 from edge_agent.dynamics.body import advance_velocity
 from edge_agent.dynamics.chassis import DUGOFF, response, turned, tyre_forces
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import GRAVITY, Four, P, body, four, parameter_table
+from edge_agent.dynamics.parameters import GRAVITY, Four, P, body, four
 from edge_agent.estimators import flags
+from edge_agent.estimators.bank import EstimatorBank
+from edge_agent.estimators.estimates import FOUR_FRICTIONS, Y
 from edge_agent.estimators.friction_mixture.sample import rolling_speed
-from edge_agent.estimators.gaussian.bank import (
+from edge_agent.estimators.gaussian.intake import BEGUN, STEPPED, Track, new_filters, take, wheel_force
+from edge_agent.estimators.gaussian.pair import doubted, freed_speed, rolling
+from edge_agent.estimators.gaussian.road import FORGET_M, LOOK_S, PRIOR_ROOT, mean_friction, told_share
+from edge_agent.estimators.gaussian.telling import (
     FIRST_V_STD,
     PRIOR_MU,
     PRIOR_MU_STD,
     UNKNOWN_V_STD,
-    GaussianBank,
-    Stretch,
     hold_mu,
     interval,
     lost,
     sliding,
     tell_motion,
+    tell_no_wheel,
     tell_nothing,
+    tell_rest,
+    tell_wheel,
     variance,
 )
-from edge_agent.estimators.gaussian.intake import BEGUN, STEPPED, Track, grip_used, take, wheel_force
-from edge_agent.estimators.gaussian.pair import doubted, freed_speed, rolling
-from edge_agent.estimators.gaussian.road import FORGET_M, LOOK_S, PRIOR_ROOT, mean_friction, told_share
 from edge_agent.filters.downdate import update_by_downdate
 from edge_agent.filters.sigma import unscented
 from edge_agent.filters.squareroot import deviations, predict, sigma_points, weighted_mean
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray, compiled, released
+from schemas.records import Nothing, Records, records
 from schemas.signals import S
 from schemas.vehicle import Vehicle
 
 STATES, ROWS = 7, 7  # rows: speed of the wheels, r, a_y, four longitudinal forces
 MU = 3  # first friction
+RULE = unscented(STATES, 1.0, 2.0, 0.0)
+XI, W_MEAN, W_COV = RULE.xi, RULE.w_mean, RULE.w_cov
 DRIFT = np.array([0.05, 0.05, 0.1])  # [m/s, m/s, rad/s per s^.5] offsets of the accelerometers; yaw model error
 RATE_STD = 0.003  # [rad/s]
 AY_STD, AY_SHARE = 0.15, 0.05  # [m/s^2], and of a_y, that the tyre model may miss, per look
@@ -74,62 +80,62 @@ class X(IntEnum):
     YAW_RATE = 2
 
 
-class Memory(NamedTuple):
-    """State of N filters."""
+class Memory:
+    """One filter."""
 
-    mean: FloatArray  # (N, 7)
-    root: FloatArray  # (N, 7, 7)
-    told: FloatArray  # (N, 3) NIS per row, log-likelihood, downdates refused
-    xi: FloatArray  # (15, 7)
-    w_mean: FloatArray  # (15,)
-    w_cov: FloatArray  # (15,)
+    row: Annotated[FloatArray, len(P)]  # parameters of the vehicle
+    track: Track
+    mean: Annotated[FloatArray, STATES]
+    root: Annotated[FloatArray, STATES, STATES]
+    nis: float  # per row
+    log_likelihood: float
+    refused: float  # downdates
 
 
-def bank(vehicles: Sequence[Vehicle]) -> GaussianBank[Memory]:
+def bank(vehicles: Sequence[Vehicle]) -> EstimatorBank:
     """N of these filters."""
-    n, rule = len(vehicles), unscented(STATES, 1.0, 2.0, 0.0)
-    memory = Memory(
-        np.zeros((n, STATES)), np.zeros((n, STATES, STATES)), np.zeros((n, 3)), rule.xi, rule.w_mean, rule.w_cov
-    )
-    return GaussianBank(parameter_table(vehicles), memory, _advance, wheels=True)
+    return EstimatorBank(new_filters(Memory, vehicles), records(Nothing, 1), _advance, tells=FOUR_FRICTIONS)
 
 
 @released
-def _advance(memory: Memory, track: Track, stretch: Stretch, first: int, last: int) -> None:
-    rows, t, signals, out, wheels, health = stretch
+def _advance(
+    filters: Records[Memory], _desks: Records[Nothing], t: FloatArray, signals: FloatArray, tolds: FloatArray,
+    _share: int, first: int, last: int,
+) -> None:  # fmt: skip
     for n in range(first, last):
+        memory = filters[n]
+        track, row = memory.track, memory.row
         for k in range(t.shape[0]):
-            memory.told[n, 1] = 0.0
-            told, kind, gone = take(track, rows[n], n, t[k, n], signals[k, n])
+            told = tolds[k, n]
+            health, kind, gone = take(track, row, t[k, n], signals[k, n])
+            memory.log_likelihood = 0.0
             if kind == STEPPED:
-                _step(memory, track, rows[n], n, gone)
-                if lost(memory.mean[n], memory.root[n], X.VX, X.VY, X.YAW_RATE):
-                    told, kind = told | flags.RESET, BEGUN
+                _step(memory, gone)
+                if lost(memory.mean, memory.root, X.VX, X.VY, X.YAW_RATE):
+                    health, kind = health | flags.RESET, BEGUN
             if kind == BEGUN:
-                _begin(memory, track, rows[n], n, signals[k, n])
-            if track.started[n]:
-                _report(memory, track, n, out[:, k, n], wheels[k, n])
-                x = memory.mean[n]
-                health[k, n] = told | sliding(rows[n], track.use[n], x[X.VX], x[X.VY], out[8, k, n])
+                _begin(memory, signals[k, n])
+            if track.started:
+                _report(memory, told)
+                health |= sliding(row, track, memory.mean[X.VX], memory.mean[X.VY], told[Y.MU])
             else:
-                health[k, n] = told
-                tell_nothing(out[:, k, n])
-                for wheel in range(4):
-                    wheels[k, n, wheel] = out[8:11, k, n]
+                tell_nothing(told)
+                tell_no_wheel(told)
+            told[Y.HEALTH] = health
 
 
 @compiled
-def _begin(memory: Memory, track: Track, row: FloatArray, n: int, sample: FloatArray) -> None:
-    mean, root = memory.mean[n], memory.root[n]
-    speed = rolling_speed(row, sample)
+def _begin(memory: Memory, sample: FloatArray) -> None:
+    mean, root = memory.mean, memory.root
+    speed = rolling_speed(memory.row, sample)
     known = not math.isnan(speed)
-    mean[X.VX], mean[X.VY], mean[X.YAW_RATE] = speed if known else 0.0, 0.0, track.use[n, S.YAW_RATE]
+    mean[X.VX], mean[X.VY], mean[X.YAW_RATE] = speed if known else 0.0, 0.0, memory.track.use[S.YAW_RATE]
     mean[MU:] = PRIOR_MU
     root[:, :] = 0.0
     root[X.VX, X.VX], root[X.VY, X.VY] = FIRST_V_STD if known else UNKNOWN_V_STD, FIRST_V_STD
     root[X.YAW_RATE, X.YAW_RATE] = 0.1
     root[MU:, MU:] = PRIOR_ROOT
-    memory.told[n] = 0.0
+    memory.nis = memory.log_likelihood = memory.refused = 0.0
 
 
 @compiled
@@ -153,15 +159,15 @@ def _felt(
 
 
 @compiled
-def _step(memory: Memory, track: Track, row: FloatArray, n: int, gone: float) -> None:
-    mean, root, use = memory.mean[n], memory.root[n], track.use[n]
-    count = memory.xi.shape[0]
+def _step(memory: Memory, gone: float) -> None:
+    row, mean, root, use = memory.row, memory.mean, memory.root, memory.track.use
+    count = XI.shape[0]
     points, work = np.empty((count, STATES)), np.empty((ROWS + STATES, count + 2 * STATES))
     noise, unknown, mu = np.zeros((STATES, STATES)), (math.nan, math.nan, math.nan, math.nan), np.empty(4)
     steering = turned(use[S.DELTA : S.DELTA + 4])
     middle, share = mean.copy(), told_share(math.hypot(use[S.AX], use[S.AY]) / GRAVITY)
     keep = math.exp(-abs(mean[X.VX]) * gone / FORGET_M)
-    sigma_points(mean, root, memory.xi, points)
+    sigma_points(mean, root, XI, points)
     for p in range(count):
         x = points[p]
         _friction(x, middle, share, mu)
@@ -173,25 +179,17 @@ def _step(memory: Memory, track: Track, row: FloatArray, n: int, gone: float) ->
     for i in range(3):
         noise[i, i] = DRIFT[i] * math.sqrt(gone)
     noise[MU:, MU:] = math.sqrt(max(1.0 - keep * keep, 0.0)) * PRIOR_ROOT
-    predict(points, memory.w_mean, memory.w_cov, noise, mean, root, work)
-    sigma_points(mean, root, memory.xi, points)
-    _measure(memory, track, row, n, gone, share, points, work)
+    predict(points, W_MEAN, W_COV, noise, mean, root, work)
+    sigma_points(mean, root, XI, points)
+    _measure(memory, gone, share, points, work)
     for wheel in range(4):
         hold_mu(mean, root, MU + wheel, PRIOR_MU_STD)
 
 
 @compiled
-def _measure(
-    memory: Memory,
-    track: Track,
-    row: FloatArray,
-    n: int,
-    gone: float,
-    share: float,
-    points: FloatArray,
-    work: FloatArray,
-) -> None:
-    mean, root, now, use = memory.mean[n], memory.root[n], track.now[n], track.use[n]
+def _measure(memory: Memory, gone: float, share: float, points: FloatArray, work: FloatArray) -> None:
+    row, track, mean, root = memory.row, memory.track, memory.mean, memory.root
+    now, use = track.now, track.use
     count = points.shape[0]
     outcomes, predicted, unknown = np.empty((count, ROWS)), np.empty(ROWS), (math.nan, math.nan, math.nan, math.nan)
     state, measured = np.empty((STATES, count)), np.empty((ROWS, count))
@@ -204,16 +202,16 @@ def _measure(
         outcomes[p, 2], _ = _felt(row, points[p], use, steering, mu, unknown)
         motion[:3] = points[p, :3]
         tyre_forces(row, motion, steering, use[S.OMEGA : S.OMEGA + 4], mu, DUGOFF, outcomes[p, 3:], force_y)
-    weighted_mean(outcomes, memory.w_mean, predicted)
-    deviations(points, mean, memory.w_cov, state, 0)
-    deviations(outcomes, predicted, memory.w_cov, measured, 0)
+    weighted_mean(outcomes, W_MEAN, predicted)
+    deviations(points, mean, W_COV, state, 0)
+    deviations(outcomes, predicted, W_COV, measured, 0)
     looks = math.sqrt(max(LOOK_S / gone, 1.0))
-    speed, std[0] = freed_speed(row, track.before[n], use, gone)
+    speed, std[0] = freed_speed(row, track.before, use, gone)
     innovation[0], innovation[1], innovation[2] = speed, now[S.YAW_RATE], now[S.AY]
     std[1], std[2] = RATE_STD, looks * math.hypot(AY_STD, AY_SHARE * use[S.AY])
     loads = wheel_loads(body(row), use[S.AX], use[S.AY])
     for wheel in range(4):
-        force = wheel_force(row, track.before[n], use, wheel, gone)
+        force = wheel_force(row, track.before, use, wheel, gone)
         slip_std = SLIP_STD + OMEGA_STD * row[P.RADIUS] / max(abs(mean[X.VX]), 1.0)
         quiet = math.hypot(FORCE_STD * loads[wheel], FORCE_SHARE * force)
         std[3 + wheel] = looks * math.hypot(quiet, row[P.SLOPE_X] * loads[wheel] * slip_std)
@@ -223,19 +221,19 @@ def _measure(
         innovation[r] -= predicted[r]
     std[0] = doubted(std[0], innovation[0])
     used, log_likelihood, square, refused = update_by_downdate(mean, root, state, measured, innovation, std, work)
-    memory.told[n, 0], memory.told[n, 1] = square / max(used, 1), log_likelihood
-    memory.told[n, 2] += 1.0 if refused else 0.0
+    memory.nis, memory.log_likelihood = square / max(used, 1), log_likelihood
+    memory.refused += 1.0 if refused else 0.0
 
 
 @compiled
-def _report(memory: Memory, track: Track, n: int, out: FloatArray, wheels: FloatArray) -> None:
-    mean, root = memory.mean[n], memory.root[n]
+def _report(memory: Memory, told: FloatArray) -> None:
+    mean, root = memory.mean, memory.root
     tell_motion(
-        out, mean[X.VX], mean[X.VY], mean[X.YAW_RATE],
+        told, mean[X.VX], mean[X.VY], mean[X.YAW_RATE],
         variance(root, X.VX), variance(root, X.VY), variance(root, X.YAW_RATE),
     )  # fmt: skip
     for wheel in range(4):
-        interval(mean[MU + wheel], math.sqrt(variance(root, MU + wheel)), wheels[wheel])
+        tell_wheel(told, wheel, mean[MU + wheel], math.sqrt(variance(root, MU + wheel)))
     mu, std = mean_friction(mean, root, MU)
-    interval(mu, std, out[8:11])
-    out[11], out[12], out[13], out[14] = grip_used(track, n), memory.told[n, 0], 1.0, memory.told[n, 1]
+    told[Y.MU], told[Y.MU_LOWER], told[Y.MU_UPPER] = interval(mu, std)
+    tell_rest(told, memory.track.used, memory.nis, 1.0, memory.log_likelihood)

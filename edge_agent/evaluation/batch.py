@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pyarrow as pa
 
-from edge_agent.estimators import Bank, Estimates
+from edge_agent.estimators import Estimates, EstimatorBank
 from edge_agent.simulation import simulate_manoeuvre
 from edge_agent.simulation.manoeuvres import Friction
 from edge_agent.simulation.presets import TrueVehicle
@@ -94,6 +94,6 @@ def repeated(batch: Batch, count: int) -> Batch:
     )
 
 
-def estimates(bank: Bank, batch: Batch) -> Estimates:
+def estimates(bank: EstimatorBank, batch: Batch) -> Estimates:
     """What the bank says of the drives."""
     return bank.advance(batch.t, batch.signals)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from edge_agent.banks import bank_of
-from edge_agent.estimators import ESTIMATORS, Bank, Estimates, adaptive_federated_ckf, compensated_wckf
+from edge_agent.estimators import ESTIMATORS, Estimates, EstimatorBank, adaptive_federated_ckf, compensated_wckf
 from edge_agent.evaluation import faults
 from edge_agent.evaluation.batch import Batch, estimates, ideal, realistic, repeated
 from edge_agent.evaluation.measures import arrival, consistency, false_changes, measures, sides
@@ -75,7 +75,7 @@ def run(seeds: Sequence[int], *, quick: bool, tell: Callable[[str], None]) -> Re
     return results
 
 
-def _as_in_paper(estimator: str, batch: Batch) -> Bank:
+def _as_in_paper(estimator: str, batch: Batch) -> EstimatorBank:
     """The bank for a paper's own conditions: where friction is set by hand, it is set to the truth of the start."""
     friction = float(batch.mu[0, 0])
     if estimator == "adaptive-federated-ckf":

@@ -112,11 +112,10 @@ def harmed(batch: Batch, case: Case) -> Batch:
 def outcome(batch: Batch, said: Estimates, case: Case) -> dict[str, FloatArray]:
     """What is measured of a case, per drive: `finite`, `told` (1 or 0), coverage and width from BEGINS on, RMSE."""
     after = batch.t[:, 0] >= BEGINS
-    named = (getattr(said, name) for name in said._fields if name != "evidence")
-    whole = np.stack([np.isfinite(a).reshape(*batch.t.shape, -1).all(axis=-1) for a in named if a is not None])
+    whole = np.isfinite(said.told).all(axis=-1)
     ordered = (said.mu_lower <= said.mu) & (said.mu <= said.mu_upper)
     found = {
-        "finite": (whole.all(axis=0) & ordered).all(axis=0).astype(float),
+        "finite": (whole & ordered).all(axis=0).astype(float),
         "told": ((said.health & int(case.says)) != 0).any(axis=0).astype(float),
         "coverage90": covered(batch, said)[after].mean(axis=0),
         "width": (said.mu_upper - said.mu_lower)[after].mean(axis=0),

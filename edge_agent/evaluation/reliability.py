@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.estimators import Bank, Estimates
+from edge_agent.estimators import Estimates, EstimatorBank
 from edge_agent.evaluation.batch import Batch
 from schemas.mugrid import BINS, LOWER, UPPER
 from schemas.numeric import FloatArray
@@ -25,7 +25,7 @@ PRIOR_WIDTH: Final = 0.9 * (UPPER - LOWER)  # of its 90 % interval
 EDGES: Final = np.linspace(LOWER, UPPER, BINS + 1)
 
 
-def watched(bank: Bank, batch: Batch) -> tuple[Estimates, FloatArray]:
+def watched(bank: EstimatorBank, batch: Batch) -> tuple[Estimates, FloatArray]:
     """What the bank says of the drives, and the rank of the truth in its posterior once every EVERY_S, (K, N)."""
     samples = len(batch.t)
     step = max(1, round(EVERY_S / float(batch.t[1, 0] - batch.t[0, 0])))
@@ -39,16 +39,10 @@ def watched(bank: Bank, batch: Batch) -> tuple[Estimates, FloatArray]:
 
 def joined(parts: list[Estimates]) -> Estimates:
     """Estimates of one drive, one stretch after the other; evidence is left out."""
-    told = [name for name in Estimates._fields if name not in ("mu_wheel", "evidence")]
-    wheels = [part.mu_wheel for part in parts if part.mu_wheel is not None]
-    return Estimates(
-        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in told},
-        mu_wheel=np.concatenate(wheels) if wheels else None,
-        evidence=None,
-    )
+    return Estimates(np.concatenate([part.told for part in parts]))
 
 
-def _rank(bank: Bank, batch: Batch, now: int, said: Estimates) -> FloatArray:
+def _rank(bank: EstimatorBank, batch: Batch, now: int, said: Estimates) -> FloatArray:
     """Share of the posterior below the true friction of the sample before `now`, (N,)."""
     truth = batch.mu[now - 1]
     closes = np.ones((1, len(truth)), np.bool_)

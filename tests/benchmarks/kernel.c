@@ -1,17 +1,17 @@
 /* The limit for a Python filter: `paper-aco-fckf` as one would write it by hand in C, bare of checks and reports.
 
-   State x = [v_x, v_y, a_x, a_y, r, mu], four Dugoff tyres, twelve cubature points carried by Heun's rule, square-root
-   prediction and update by Householder reflections, R adapted by five fuzzy sets. One vehicle is one struct.
-   Equations and legend: edge_agent/estimators/paper_aco_fckf.py, gaussian/planar.py, dynamics, filters/squareroot.py. */
+   State x = [v_x, v_y, a_x, a_y, r, mu], four Dugoff tyres, twelve cubature points carried by Heun's rule, covariance
+   summed and factorized, Carlson's triangular update, R adapted by five fuzzy sets. One vehicle is one struct.
+   Equations and legend: edge_agent/estimators/paper_aco_fckf.py, gaussian/planar.py, dynamics, filters/columns.py. */
 
 #include <math.h>
 
-enum { N = 6, POINTS = 12, ROWS = 3, WIDE = POINTS + N };
+enum { N = 6, POINTS = 12, ROWS = 3 };
 enum { MASS, INERTIA, TO_FRONT, TO_REAR, TRACK_FRONT, TRACK_REAR, HEIGHT, RADIUS, WHEEL_INERTIA, SLOPE_X, SLOPE_Y };
 enum { AX, AY, RATE, DELTA, OMEGA = DELTA + 4, INPUTS = OMEGA + 4 };
 
 typedef struct {
-    double mean[N], root[N][N], actual[ROWS], theoretical[ROWS], factor[ROWS], before[INPUTS];
+    double mean[N], root[N][N], actual[ROWS], theoretical[ROWS], factor[ROWS], before[INPUTS], cosine[4], sine[4];
 } Filter;
 
 typedef struct {
@@ -22,45 +22,25 @@ static double clip(double v, double low, double high) { return v < low ? low : v
 
 static void respond(const double *p, double vx, double vy, double r, double ax, double ay, const double *c,
                     const double *s, const double *omega, double mu, double *out) {
-    double base = p[TO_FRONT] + p[TO_REAR], weight = p[MASS] * 9.81, pitch = p[MASS] * ax * p[HEIGHT] / base;
-    double front = weight * p[TO_REAR] / base - pitch, rear = weight * p[TO_FRONT] / base + pitch;
-    double roll = ay * p[HEIGHT] / 9.81, least = 0.02 * weight / 4.0, fx = 0.0, fy = 0.0, moment = 0.0;
+    double per_base = 1.0 / (p[TO_FRONT] + p[TO_REAR]), weight = p[MASS] * 9.81;
+    double pitch = ax * (p[MASS] * p[HEIGHT] * per_base), least = 0.02 * weight / 4.0, fx = 0.0, fy = 0.0, moment = 0.0;
+    double front = weight * p[TO_REAR] * per_base - pitch, rear = weight * p[TO_FRONT] * per_base + pitch;
     for (int w = 0; w < 4; w++) {
         double axle = w < 2 ? front : rear, track = w < 2 ? p[TRACK_FRONT] : p[TRACK_REAR];
         double left = w % 2 ? -1.0 : 1.0, x = w < 2 ? p[TO_FRONT] : -p[TO_REAR], y = left * 0.5 * track;
-        double load = fmax(0.5 * axle - left * axle * roll / track, least), grip = mu * load;
+        double shift = left * axle * (ay * (p[HEIGHT] / (9.81 * track)));
+        double load = fmax(0.5 * axle - shift, least), grip = mu * load;
         double ahead = vx - y * r, aside = vy + x * r;
         double along = c[w] * ahead + s[w] * aside, across = c[w] * aside - s[w] * ahead;
-        double speed = fmax(fabs(along), 0.5);
-        double free_x = p[SLOPE_X] * load * (p[RADIUS] * omega[w] - along) / speed;
-        double free_y = p[SLOPE_Y] * load * -across / speed, free = sqrt(free_x * free_x + free_y * free_y);
+        double per_speed = 1.0 / fmax(fabs(along), 0.5);
+        double free_x = p[SLOPE_X] * load * ((p[RADIUS] * omega[w] - along) * per_speed);
+        double free_y = p[SLOPE_Y] * load * (-across * per_speed), free = sqrt(free_x * free_x + free_y * free_y);
         double share = grip / free, gain = 2.0 * free <= grip ? 1.0 : share * (1.0 - 0.25 * share);
         double f_ahead = gain * (c[w] * free_x - s[w] * free_y), f_left = gain * (s[w] * free_x + c[w] * free_y);
         fx += f_ahead, fy += f_left, moment += x * f_left - y * f_ahead;
     }
-    out[0] = fx / p[MASS], out[1] = fy / p[MASS], out[2] = moment / p[INERTIA];
-}
-
-static void lower_triangle(double *a, int rows, int columns, int stride) {
-    for (int i = 0; i < rows; i++) {
-        double *u = a + i * stride, square = 0.0;
-        for (int j = i + 1; j < columns; j++) square += u[j] * u[j];
-        if (square > 0.0) {
-            double head = u[i], norm = sqrt(head * head + square);
-            double pivot = head <= 0.0 ? head - norm : -square / (head + norm), gain = 2.0 / (square + pivot * pivot);
-            for (int k = i + 1; k < rows; k++) {
-                double *v = a + k * stride, dot = v[i] * pivot;
-                for (int j = i + 1; j < columns; j++) dot += v[j] * u[j];
-                dot *= gain;
-                v[i] -= dot * pivot;
-                for (int j = i + 1; j < columns; j++) v[j] -= dot * u[j];
-            }
-            u[i] = norm;
-            for (int j = i + 1; j < columns; j++) u[j] = 0.0;
-        } else if (u[i] < 0.0) {
-            for (int k = i; k < rows; k++) a[k * stride + i] *= -1.0;
-        }
-    }
+    double per_mass = 1.0 / p[MASS];
+    out[0] = fx * per_mass, out[1] = fy * per_mass, out[2] = moment * (1.0 / p[INERTIA]);
 }
 
 static double infer(double mismatch, const double *in, const double *out) {
@@ -73,16 +53,60 @@ static double infer(double mismatch, const double *in, const double *out) {
     return out[4];
 }
 
+/* Mean and factor of the moved points; a pivot is at least its own noise. */
+static void gather(Filter *f, double x[POINTS][N], const double *process, double pace) {
+    double (*L)[N] = f->root;
+    for (int i = 0; i < N; i++) {
+        double total = 0.0;
+        for (int k = 1; k < POINTS; k++) total += x[k][i] - x[0][i];
+        f->mean[i] = x[0][i] + total * (1.0 / POINTS);
+        for (int k = 0; k < POINTS; k++) x[k][i] -= f->mean[i];
+    }
+    for (int i = 0; i < N; i++)
+        for (int j = 0; j <= i; j++) {
+            double total = 0.0;
+            for (int k = 0; k < POINTS; k++) total += x[k][i] * x[k][j];
+            L[i][j] = total * (1.0 / POINTS);
+        }
+    for (int j = 0; j < N; j++) {
+        double own = process[j] * process[j] * pace, total = L[j][j] + own, per;
+        for (int k = 0; k < j; k++) total -= L[j][k] * L[j][k];
+        L[j][j] = sqrt(fmax(total, own)), per = 1.0 / L[j][j];
+        for (int i = j + 1; i < N; i++) {
+            for (int k = 0; k < j; k++) L[i][j] -= L[i][k] * L[j][k];
+            L[i][j] *= per, L[j][i] = 0.0;
+        }
+    }
+}
+
+/* Take in a reading of state i with noise `after`. */
+static void look(Filter *f, int i, double reading, double after) {
+    double gain[N] = {0}, share;
+    for (int j = i; j >= 0; j--) {
+        double part = f->root[i][j], before = after, per, keep, lose;
+        after = before + part * part, per = 1.0 / sqrt(before * after), keep = before * per, lose = part * per;
+        for (int k = j; k < N; k++) {
+            double held = f->root[k][j];
+            f->root[k][j] = keep * held - lose * gain[k], gain[k] += part * held;
+        }
+    }
+    share = (reading - f->mean[i]) / after;
+    for (int k = 0; k < N; k++) f->mean[k] += gain[k] * share;
+}
+
 static void step(Filter *f, const double *p, const Setting *z, const double *now, double gone) {
-    double x[POINTS][N], c[2][4], s[2][4], work[N + ROWS][WIDE] = {{0}}, pace = gone / z->step_s, spread = sqrt(N);
-    const double *ends[2] = {f->before, now};
-    for (int e = 0; e < 2; e++)
-        for (int w = 0; w < 4; w++) c[e][w] = cos(ends[e][DELTA + w]), s[e][w] = sin(ends[e][DELTA + w]);
+    double x[POINTS][N], c[2][4], s[2][4], noise[ROWS], pace = gone / z->step_s, spread = sqrt(N);
+    for (int w = 0; w < 4; w++) {
+        c[0][w] = f->cosine[w], s[0][w] = f->sine[w];
+        if (now[DELTA + w] != f->before[DELTA + w])
+            f->cosine[w] = cos(now[DELTA + w]), f->sine[w] = sin(now[DELTA + w]);
+        c[1][w] = f->cosine[w], s[1][w] = f->sine[w];
+    }
     for (int k = 0; k < POINTS; k++) {
         double sign = k < N ? spread : -spread, a[3], b[3], *v = x[k];
         for (int i = 0; i < N; i++) v[i] = f->mean[i] + sign * f->root[i][k % N];
         double mu = clip(v[5], z->lower, z->upper);
-        respond(p, v[0], v[1], v[4], v[2], v[3], c[0], s[0], ends[0] + OMEGA, mu, a);
+        respond(p, v[0], v[1], v[4], v[2], v[3], c[0], s[0], f->before + OMEGA, mu, a);
         double kx = v[2] + v[4] * v[1], ky = v[3] - v[4] * v[0];
         double vx = v[0] + gone * kx, vy = v[1] + gone * ky, r = v[4] + gone * a[2];
         respond(p, vx, vy, r, v[2], v[3], c[1], s[1], now + OMEGA, mu, b);
@@ -91,37 +115,18 @@ static void step(Filter *f, const double *p, const Setting *z, const double *now
         respond(p, v[0], v[1], v[4], v[2], v[3], c[1], s[1], now + OMEGA, mu, a);
         v[2] = a[0], v[3] = a[1];
     }
-    for (int i = 0; i < N; i++) {
-        double total = 0.0;
-        for (int k = 0; k < POINTS; k++) total += (x[k][i] - x[0][i]) / POINTS;
-        f->mean[i] = x[0][i] + total;
-        for (int k = 0; k < POINTS; k++) work[i][k] = (x[k][i] - f->mean[i]) / sqrt(POINTS);
-        work[i][POINTS + i] = z->process[i] * sqrt(pace);
-    }
-    lower_triangle(&work[0][0], N, WIDE, WIDE);
-    for (int i = 0; i < N; i++)
-        for (int j = 0; j < N; j++) f->root[i][j] = j <= i ? work[i][j] : 0.0;
-    double joint[N + ROWS][N + ROWS] = {{0}}, white[ROWS], keep = pow(0.5, gone / z->window_s);
+    gather(f, x, z->process, pace);
+    double keep = exp(-log(2.0) * gone / z->window_s);
     for (int q = 0; q < ROWS; q++) {
-        double variance = 0.0, miss;
-        for (int j = 0; j < N; j++) joint[q][j] = f->root[2 + q][j], variance += joint[q][j] * joint[q][j];
-        miss = white[q] = now[q] - f->mean[2 + q];
-        joint[q][N + q] = sqrt(f->factor[q] * z->noise[q]);
+        double variance = 0.0, miss = now[q] - f->mean[2 + q];
+        for (int j = 0; j <= 2 + q; j++) variance += f->root[2 + q][j] * f->root[2 + q][j];
+        noise[q] = f->factor[q] * z->noise[q];
         f->actual[q] = keep * f->actual[q] + (1.0 - keep) * miss * miss;
-        f->theoretical[q] = keep * f->theoretical[q] + (1.0 - keep) * (variance + f->factor[q] * z->noise[q]);
+        f->theoretical[q] = keep * f->theoretical[q] + (1.0 - keep) * (variance + noise[q]);
         double more = pace * infer(f->actual[q] / f->theoretical[q] - 1.0, z->sets_in, z->sets_out);
         f->factor[q] = clip(f->factor[q] * exp(more), z->least, z->largest);
     }
-    for (int i = 0; i < N; i++)
-        for (int j = 0; j <= i; j++) joint[ROWS + i][j] = f->root[i][j];
-    lower_triangle(&joint[0][0], N + ROWS, N + ROWS, N + ROWS);
-    for (int q = 0; q < ROWS; q++) {
-        for (int j = 0; j < q; j++) white[q] -= joint[q][j] * white[j];
-        white[q] /= joint[q][q];
-        for (int i = 0; i < N; i++) f->mean[i] += joint[ROWS + i][q] * white[q];
-    }
-    for (int i = 0; i < N; i++)
-        for (int j = 0; j < N; j++) f->root[i][j] = j <= i ? joint[ROWS + i][ROWS + j] : 0.0;
+    for (int q = 0; q < ROWS; q++) look(f, 2 + q, now[q], noise[q]);
     f->mean[5] = clip(f->mean[5], z->lower, z->upper);
     double square = 0.0;
     for (int j = 0; j < N; j++) square += f->root[5][j] * f->root[5][j];

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.estimators.gaussian.bank import PRIOR_MU_STD
+from edge_agent.estimators.gaussian.telling import PRIOR_MU_STD
 from edge_agent.estimators.paper_aco_fckf import LARGEST_FACTOR, LEAST_FACTOR, STEP_S, WINDOW_S, Setting
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
 
 SOURCE = Path(__file__).with_name("kernel.c")
-STATES, ROWS = 6, 3
+STATES, ROWS, WHEELS = 6, 3, 4
 FACTOR = STATES + STATES * STATES + ROWS * 2  # place of `factor` in the struct's doubles
 
 
@@ -51,7 +51,10 @@ class Limit:
         for i in range(STATES):
             self.memory[:, STATES + i * STATES + i] = np.sqrt(setting.start[i])
         self.memory[:, FACTOR : FACTOR + ROWS] = 1.0
-        self.memory[:, FACTOR + ROWS : FACTOR + ROWS + first.shape[1]] = first
+        turned = FACTOR + ROWS + first.shape[1]
+        self.memory[:, FACTOR + ROWS : turned] = first
+        steering = first[:, ROWS : ROWS + WHEELS]
+        self.memory[:, turned:] = np.concatenate([np.cos(steering), np.sin(steering)], axis=1)
 
     def begin(self, speed: FloatArray) -> None:
         """The first speed (N,) [m/s]."""

@@ -12,7 +12,7 @@ Legend
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 
@@ -27,10 +27,10 @@ ROUND: Final = (1.33, 0.05)
 class Curve(NamedTuple):
     """Tables of CELLS + 1 values."""
 
-    ratio: FloatArray  # f/theta over u
-    slope: FloatArray  # f' over u
-    bend: FloatArray  # over u
-    inverse: FloatArray  # theta of the rising branch over t
+    ratio: Annotated[FloatArray, CELLS + 1]  # f/theta over u
+    slope: Annotated[FloatArray, CELLS + 1]  # f' over u
+    bend: Annotated[FloatArray, CELLS + 1]  # over u
+    inverse: Annotated[FloatArray, CELLS + 1]  # theta of the rising branch over t
 
 
 def shape(theta: FloatArray, c: float, e: float) -> FloatArray:

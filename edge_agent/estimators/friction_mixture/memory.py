@@ -1,14 +1,16 @@
-"""What a bank carries from sample to sample: one record of arrays, first axis the vehicle."""
+"""What a bank carries from sample to sample: one record per vehicle."""
 
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Annotated
 
 import numpy as np
 
+from edge_agent.dynamics.parameters import P
 from edge_agent.estimators.friction_mixture.constants import NODES, PAIRS, STATES
-from schemas.numeric import BoolArray, FloatArray, IntArray
+from schemas.numeric import FloatArray, IntArray
+from schemas.records import RecordArray, records
 
 INPUTS = 15  # ax, ay, yaw rate, steering, wheel speed, torque: the channels before the position
 RING = 64  # blocks remembered for the grip used in the last second
@@ -58,58 +60,37 @@ class G(IntEnum):
     UNIT = 3  # by 1 m/s^2 ahead, per [m/s^2] of offset
 
 
-class Memory(NamedTuple):
-    """State of N filters."""
+class Memory:
+    """One filter."""
 
-    started: BoolArray  # (N,)
-    held: FloatArray  # (N, int(H.LENGTH))
-    gain: FloatArray  # (N, 4, 2) indexed by G
-    gain_sum: FloatArray  # (N, 4, 2) over the samples of the block
-    sums: FloatArray  # (N, 15) of the valid samples in the block
-    counts: IntArray  # (N, 15)
-    start_omega: FloatArray  # (N, 4) at the beginning of the block [rad/s]
-    last_omega: FloatArray  # (N, 4) [rad/s]
-    last_delta: FloatArray  # (N, 4) [rad]
-    mean: FloatArray  # (N, K, n)
-    covariance: FloatArray  # (N, K, n, n)
-    weight: FloatArray  # (N, K)
-    visit: FloatArray  # (N, K) probabilities from the reference prior at the start of the visit
-    paid: FloatArray  # (N, K) price of what a node believes of the vehicle, beyond the evidence [nat]
-    all_mean: FloatArray  # (N, n) moments of the mixture
-    all_covariance: FloatArray  # (N, n, n)
-    actual: FloatArray  # (N, 2) windowed innovation variances
-    theoretical: FloatArray  # (N, 2)
-    factor: FloatArray  # (N, 2) adapted over nominal R
-    side: FloatArray  # (N, 2) SIDE of the axles in the block before [1]
-    usual: FloatArray  # (N, 6) FORCE of the wheels and SIDE of the axles, smoothed [1]
-    ring_time: FloatArray  # (N, 64) [s]
-    ring_used: FloatArray  # (N, 64)
+    row: Annotated[FloatArray, len(P)]  # parameters of the vehicle
+    started: bool
+    held: Annotated[FloatArray, H.LENGTH]
+    gain: Annotated[FloatArray, 4, 2]  # indexed by G
+    gain_sum: Annotated[FloatArray, 4, 2]  # over the samples of the block
+    sums: Annotated[FloatArray, INPUTS]  # of the valid samples in the block
+    counts: Annotated[IntArray, INPUTS]
+    start_omega: Annotated[FloatArray, 4]  # at the beginning of the block [rad/s]
+    last_omega: Annotated[FloatArray, 4]  # [rad/s]
+    last_delta: Annotated[FloatArray, 4]  # [rad]
+    mean: Annotated[FloatArray, NODES + PAIRS, STATES]
+    covariance: Annotated[FloatArray, NODES + PAIRS, STATES, STATES]
+    weight: Annotated[FloatArray, NODES + PAIRS]
+    visit: Annotated[FloatArray, NODES + PAIRS]  # probabilities from the reference prior at the start of the visit
+    paid: Annotated[FloatArray, NODES + PAIRS]  # price of what a node believes of the vehicle [nat]
+    all_mean: Annotated[FloatArray, STATES]  # moments of the mixture
+    all_covariance: Annotated[FloatArray, STATES, STATES]
+    actual: Annotated[FloatArray, 2]  # windowed innovation variances
+    theoretical: Annotated[FloatArray, 2]
+    factor: Annotated[FloatArray, 2]  # adapted over nominal R
+    side: Annotated[FloatArray, 2]  # SIDE of the axles in the block before [1]
+    usual: Annotated[FloatArray, 6]  # FORCE of the wheels and SIDE of the axles, smoothed [1]
+    ring_time: Annotated[FloatArray, RING]  # [s]
+    ring_used: Annotated[FloatArray, RING]
 
 
-def new_memory(count: int) -> Memory:
-    """Memory of `count` filters that have not seen a sample."""
-    return Memory(
-        started=np.zeros(count, np.bool_),
-        held=np.zeros((count, int(H.LENGTH))),
-        gain=np.zeros((count, 4, 2)),
-        gain_sum=np.zeros((count, 4, 2)),
-        sums=np.zeros((count, INPUTS)),
-        counts=np.zeros((count, INPUTS), np.int64),
-        start_omega=np.zeros((count, 4)),
-        last_omega=np.zeros((count, 4)),
-        last_delta=np.zeros((count, 4)),
-        mean=np.zeros((count, NODES + PAIRS, STATES)),
-        covariance=np.zeros((count, NODES + PAIRS, STATES, STATES)),
-        weight=np.zeros((count, NODES + PAIRS)),
-        visit=np.zeros((count, NODES + PAIRS)),
-        paid=np.zeros((count, NODES + PAIRS)),
-        all_mean=np.zeros((count, STATES)),
-        all_covariance=np.zeros((count, STATES, STATES)),
-        actual=np.zeros((count, 2)),
-        theoretical=np.zeros((count, 2)),
-        factor=np.ones((count, 2)),
-        side=np.full((count, 2), np.nan),
-        usual=np.zeros((count, 6)),
-        ring_time=np.full((count, RING), -np.inf),
-        ring_used=np.zeros((count, RING)),
-    )
+def new_filters(rows: FloatArray) -> RecordArray:
+    """Filters of vehicles with parameters `rows` (N, 12) that have not seen a sample."""
+    filters = records(Memory, len(rows))
+    filters["row"], filters["factor"], filters["side"], filters["ring_time"] = rows, 1.0, np.nan, -np.inf
+    return filters

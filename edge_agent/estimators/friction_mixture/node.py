@@ -14,9 +14,7 @@ leak, steering, shape and gain enter by D, exactly (a Rao-Blackwellised rule). R
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
-
-import numpy as np
+from typing import Annotated, NamedTuple
 
 from edge_agent.estimators.friction_mixture.block import F
 from edge_agent.estimators.friction_mixture.constants import ACTIVE, CURVED, STATES, C, X
@@ -37,52 +35,31 @@ LEAST_VARIANCE = 1e-18
 
 
 class Nominal(NamedTuple):
-    """Prior of the states that are properties of vehicle or sensor, (n,) each; velocity has none."""
+    """Prior of the states that are properties of vehicle or sensor; velocity has none."""
 
-    mean: FloatArray
-    std: FloatArray
-    time: FloatArray  # [s] of their return to it
+    mean: Annotated[FloatArray, STATES]
+    std: Annotated[FloatArray, STATES]
+    time: Annotated[FloatArray, STATES]  # [s] of their return to it
 
 
 class Room(NamedTuple):
     """Arrays that an update writes before it reads them."""
 
-    slip: FloatArray  # (12,)
-    bent: FloatArray  # (6,)
-    force: FloatArray  # (6,)
-    at_force: FloatArray  # (6,)
-    base: FloatArray  # (6,)
-    ahead: FloatArray  # (6,)
-    behind: FloatArray  # (6,)
-    even: FloatArray  # (6,)
-    middle: FloatArray  # (CURVED, 6)
-    derivative: FloatArray  # (ACTIVE, 6)
-    deviation: FloatArray  # (6, ACTIVE)
-    own: FloatArray  # (6,) variances of noise
-    noise: FloatArray  # (6,)
-    taken: FloatArray  # (ACTIVE,)
-    point: FloatArray  # (n,)
-
-
-def new_room() -> Room:
-    """Scratch of one update."""
-    return Room(
-        slip=np.zeros(int(L.LENGTH)),
-        bent=np.zeros(ROWS),
-        force=np.zeros(ROWS),
-        at_force=np.zeros(ROWS),
-        base=np.zeros(ROWS),
-        ahead=np.zeros(ROWS),
-        behind=np.zeros(ROWS),
-        even=np.zeros(ROWS),
-        middle=np.zeros((CURVED, ROWS)),
-        derivative=np.zeros((ACTIVE, ROWS)),
-        deviation=np.zeros((ROWS, ACTIVE)),
-        own=np.zeros(ROWS),
-        noise=np.zeros(ROWS),
-        taken=np.zeros(ACTIVE),
-        point=np.zeros(STATES),
-    )
+    slip: Annotated[FloatArray, L.LENGTH]
+    bent: Annotated[FloatArray, ROWS]
+    force: Annotated[FloatArray, ROWS]
+    at_force: Annotated[FloatArray, ROWS]
+    base: Annotated[FloatArray, ROWS]
+    ahead: Annotated[FloatArray, ROWS]
+    behind: Annotated[FloatArray, ROWS]
+    even: Annotated[FloatArray, ROWS]
+    middle: Annotated[FloatArray, CURVED, ROWS]
+    derivative: Annotated[FloatArray, ACTIVE, ROWS]
+    deviation: Annotated[FloatArray, ROWS, ACTIVE]
+    own: Annotated[FloatArray, ROWS]  # variances of noise
+    noise: Annotated[FloatArray, ROWS]
+    taken: Annotated[FloatArray, ACTIVE]
+    point: Annotated[FloatArray, STATES]
 
 
 @compiled
@@ -132,7 +109,7 @@ def linearize(
             curve, pair, room.point[X.LEAK_Y], room.point[X.BEND], room.point[X.GAIN], features, room.bent, room.force,
             room.at_force,
         )  # fmt: skip
-        told = room.base if state == ACTIVE else room.derivative[state]
+        told = room.base[:] if state == ACTIVE else room.derivative[state]
         residuals(curve, pair, room.slip, features, room.force, room.at_force, told)
         room.point[state] -= step
         if state < ACTIVE:
@@ -193,7 +170,7 @@ def spread(
     for column in range(CURVED):
         for sign in range(2):
             signed = scale if sign == 0 else -scale
-            told = room.ahead if sign == 0 else room.behind
+            told = room.ahead[:] if sign == 0 else room.behind[:]
             for i in range(ACTIVE):
                 room.point[i] = mean[i] + signed * root[i, column]
             room.point[X.STEER] = mean[X.STEER]

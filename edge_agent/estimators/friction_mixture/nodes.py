@@ -12,10 +12,11 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
+from edge_agent.estimators.friction_mixture.constants import NODES, PAIRS
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray, compiled
 
@@ -126,9 +127,10 @@ HIGH = (0.36, 0.55, 0.80, 1.20)  # and of the higher: often it is only known to 
 class Sides(NamedTuple):
     """Friction under the left and right wheels of all nodes: those of one friction first, then the pairs."""
 
-    pair: FloatArray  # (K + PAIRS, 2) left, right
-    prior: FloatArray  # (K + PAIRS,)
-    share: FloatArray  # (3, PAIRS, K) of a pair's left side, right side and mean in the cells of the K nodes
+    pair: Annotated[FloatArray, NODES + PAIRS, 2]  # left, right
+    prior: Annotated[FloatArray, NODES + PAIRS]
+    # of a pair's left side, right side and mean in the cells of the K nodes
+    share: Annotated[FloatArray, 3, PAIRS, NODES]
 
 
 class Hat(NamedTuple):

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from edge_agent.dynamics.body import advance_velocity
 from edge_agent.dynamics.parameters import P
 from edge_agent.estimators import flags
@@ -25,6 +27,10 @@ LARGEST_YAW_RATE = 6.0  # [rad/s]
 LARGEST_STEER = 1.3  # [rad]
 LARGEST_OMEGA = 500.0  # [rad/s]
 LARGEST_TORQUE = 50_000.0  # [N m]
+# largest believable size of a reading on each channel before the position
+LIMITS = np.array(
+    [LARGEST_ACCELERATION] * 2 + [LARGEST_YAW_RATE] + [LARGEST_STEER] * 4 + [LARGEST_OMEGA] * 4 + [LARGEST_TORQUE] * 4
+)
 
 JUMP_M_S2 = 3.0  # of an accelerometer from one reading to the next; a real one is believed at the second
 HOLD_S = 0.025  # a shorter silence of an accelerometer is bridged by its last reading
@@ -42,22 +48,10 @@ UNKNOWN_VX_STD = 15.0  # [m/s] without any wheel speed
 
 
 @compiled
-def limit(channel: int) -> float:
-    """Largest believable size of a reading on a channel before the position."""
-    if channel < S.YAW_RATE:
-        return LARGEST_ACCELERATION
-    if channel < S.DELTA:
-        return LARGEST_YAW_RATE
-    if channel < S.OMEGA:
-        return LARGEST_STEER
-    return LARGEST_OMEGA if channel < S.TORQUE else LARGEST_TORQUE
-
-
-@compiled
 def reading(sample: FloatArray, channel: int) -> float:
     """The reading, or NaN where it is missing, infinite or unbelievable."""
     value = sample[channel]
-    return value if abs(value) <= limit(channel) else math.nan
+    return value if abs(value) <= LIMITS[channel] else math.nan
 
 
 @compiled
@@ -82,14 +76,13 @@ def start(
     mu: FloatArray,
     prior: FloatArray,
     row: FloatArray,
-    n: int,
     time: float,
     sample: FloatArray,
 ) -> int:
-    """Begin vehicle n at its first sample with a finite time."""
+    """Begin the vehicle at its first sample with a finite time."""
     if not math.isfinite(time):
         return flags.TIME_GAP
-    held = memory.held[n]
+    held = memory.held
     for k in range(held.shape[0]):
         held[k] = 0.0
     held[H.TIME] = held[H.BLOCK_TIME] = time
@@ -99,59 +92,59 @@ def start(
     held[H.YAW_RATE] = held[H.START_YAW_RATE] = 0.0 if math.isnan(rate) else rate
     held[H.YAW_RATE_VAR] = 1.0 if math.isnan(rate) else YAW_STD**2
     for wheel in range(4):
-        memory.start_omega[n, wheel] = memory.last_omega[n, wheel] = reading(sample, S.OMEGA + wheel)
+        memory.start_omega[wheel] = memory.last_omega[wheel] = reading(sample, S.OMEGA + wheel)
         angle = reading(sample, S.DELTA + wheel)
-        memory.last_delta[n, wheel] = 0.0 if math.isnan(angle) else angle
+        memory.last_delta[wheel] = 0.0 if math.isnan(angle) else angle
     speed = rolling_speed(row, sample)
     known = not math.isnan(speed)
-    memory.all_mean[n, X.VX] = speed if known else 0.0
-    forget_vehicle(memory, nominal, n)
-    memory.all_covariance[n, X.VX, X.VX] = (FIRST_VX_STD if known else UNKNOWN_VX_STD) ** 2
-    memory.all_covariance[n, X.VY, X.VY] = FIRST_VY_STD**2
+    memory.all_mean[X.VX] = speed if known else 0.0
+    forget_vehicle(memory, nominal)
+    memory.all_covariance[X.VX, X.VX] = (FIRST_VX_STD if known else UNKNOWN_VX_STD) ** 2
+    memory.all_covariance[X.VY, X.VY] = FIRST_VY_STD**2
     for j in range(prior.shape[0]):
-        memory.weight[n, j] = memory.visit[n, j] = prior[j]
-        put(memory.mean[n, j], memory.all_mean[n])
-        put_square(memory.covariance[n, j], memory.all_covariance[n])
+        memory.weight[j] = memory.visit[j] = prior[j]
+        put(memory.mean[j], memory.all_mean)
+        put_square(memory.covariance[j], memory.all_covariance)
     for k, level in enumerate((0.5, 0.05, 0.95)):
         held[H.MU + k] = held[H.LEFT + k] = held[H.RIGHT + k] = quantile(mu, prior, prior, level)
-    clear_rows(memory.gain[n])
-    clear_rows(memory.gain_sum[n])
-    memory.started[n] = True
+    clear_rows(memory.gain)
+    clear_rows(memory.gain_sum)
+    memory.started = True
     return flags.OK
 
 
 @compiled
 def take_sample(
-    memory: Memory, constants: FloatArray, prior: FloatArray, row: FloatArray, n: int, time: float, sample: FloatArray
+    memory: Memory, constants: FloatArray, prior: FloatArray, row: FloatArray, time: float, sample: FloatArray
 ) -> tuple[int, bool]:
-    """Add a sample to the block of vehicle n; returns its health flags and whether the block is whole."""
-    held = memory.held[n]
+    """Add a sample to the block; returns its health flags and whether the block is whole."""
+    held = memory.held
     dt = time - held[H.TIME]
     if not dt > 0.0:
         return flags.TIME_GAP, False
-    health = _checks(memory, n, time, sample)
+    health = _checks(memory, time, sample)
     if dt > GAP_S:
-        return health | flags.TIME_GAP | _bridge(memory, constants, prior, row, n, time, sample), False
-    _yaw_rate(memory, row, n, dt, sample)
+        return health | flags.TIME_GAP | _bridge(memory, constants, prior, row, time, sample), False
+    _yaw_rate(memory, row, dt, sample)
     ax, ay = _believed(held, S.AX, H.AX, H.TOLD_AX, sample), _believed(held, S.AY, H.AY, H.TOLD_AY, sample)
     if math.isnan(ax + ay) and not math.isnan(reading(sample, S.AX) + reading(sample, S.AY)):
         health |= flags.OUTLIER
-    _kinematics(memory, n, time, dt, ax, ay, not math.isnan(reading(sample, S.YAW_RATE)))
-    _add(memory, n, ax, ay, sample)
+    _kinematics(memory, time, dt, ax, ay, not math.isnan(reading(sample, S.YAW_RATE)))
+    _add(memory, ax, ay, sample)
     held[H.TIME] = time
     return health, time - held[H.BLOCK_TIME] >= constants[C.BLOCK] - EARLY_S
 
 
 @compiled
-def _checks(memory: Memory, n: int, time: float, sample: FloatArray) -> int:
+def _checks(memory: Memory, time: float, sample: FloatArray) -> int:
     health = 0
     for channel in range(INPUTS):
         value = sample[channel]
-        if not math.isnan(value) and not abs(value) <= limit(channel):
+        if not math.isnan(value) and not abs(value) <= LIMITS[channel]:
             health |= flags.OUTLIER
     if math.isfinite(sample[S.LATITUDE]) and math.isfinite(sample[S.LONGITUDE]):
-        memory.held[n, H.POSITION_TIME] = time
-    if not time - memory.held[n, H.POSITION_TIME] <= POSITION_S:
+        memory.held[H.POSITION_TIME] = time
+    if not time - memory.held[H.POSITION_TIME] <= POSITION_S:
         health |= flags.NO_POSITION
     if math.isnan(reading(sample, S.AX) + reading(sample, S.AY) + reading(sample, S.YAW_RATE)):
         health |= flags.NO_INERTIAL
@@ -164,9 +157,9 @@ def _checks(memory: Memory, n: int, time: float, sample: FloatArray) -> int:
 
 
 @compiled
-def _yaw_rate(memory: Memory, row: FloatArray, n: int, dt: float, sample: FloatArray) -> None:
+def _yaw_rate(memory: Memory, row: FloatArray, dt: float, sample: FloatArray) -> None:
     """Scalar Kalman filter: random walk, gyroscope, and the rear wheels where it is missing."""
-    held = memory.held[n]
+    held = memory.held
     variance = held[H.YAW_RATE_VAR] + YAW_WALK**2 * dt
     value, noise = reading(sample, S.YAW_RATE), YAW_STD
     if math.isnan(value):
@@ -190,12 +183,12 @@ def _believed(held: FloatArray, channel: int, used: int, told: int, sample: Floa
 
 
 @compiled
-def _kinematics(memory: Memory, n: int, time: float, dt: float, ax: float, ay: float, turning: bool) -> None:
+def _kinematics(memory: Memory, time: float, dt: float, ax: float, ay: float, turning: bool) -> None:
     """Velocity gained since the block began, in the axes of now: the exact solution for inputs constant over dt.
 
     ax, ay are NaN where they are missing; `turning` is whether the yaw rate is not.
     """
-    held = memory.held[n]
+    held = memory.held
     rate = held[H.YAW_RATE]
     if not math.isnan(ax + ay):
         held[H.INERTIAL_TIME] = time
@@ -209,9 +202,9 @@ def _kinematics(memory: Memory, n: int, time: float, dt: float, ax: float, ay: f
     if math.isnan(ay) or not turning:
         held[H.MISSING_AY] = LOST_AY**2
     if math.isnan(ay):
-        ay, leak_y = rate * memory.all_mean[n, X.VX], 0.0
+        ay, leak_y = rate * memory.all_mean[X.VX], 0.0
     held[H.AX], held[H.AY] = ax, ay
-    gain = memory.gain[n]
+    gain = memory.gain
     put_pair(gain[G.INPUT], advance_velocity(gain[G.INPUT, 0], gain[G.INPUT, 1], ax, ay, rate, dt))
     put_pair(gain[G.LEAK_X], advance_velocity(gain[G.LEAK_X, 0], gain[G.LEAK_X, 1], leak_x, 0.0, rate, dt))
     put_pair(gain[G.LEAK_Y], advance_velocity(gain[G.LEAK_Y, 0], gain[G.LEAK_Y, 1], 0.0, leak_y, rate, dt))
@@ -220,47 +213,47 @@ def _kinematics(memory: Memory, n: int, time: float, dt: float, ax: float, ay: f
     held[H.SUM_COS] += math.cos(held[H.ANGLE])
     held[H.SUM_SIN] += math.sin(held[H.ANGLE])
     for k in range(gain.shape[0]):
-        memory.gain_sum[n, k, 0] += gain[k, 0]
-        memory.gain_sum[n, k, 1] += gain[k, 1]
+        memory.gain_sum[k, 0] += gain[k, 0]
+        memory.gain_sum[k, 1] += gain[k, 1]
     held[H.SAMPLES] += 1.0
 
 
 @compiled
-def _add(memory: Memory, n: int, ax: float, ay: float, sample: FloatArray) -> None:
+def _add(memory: Memory, ax: float, ay: float, sample: FloatArray) -> None:
     for channel in range(INPUTS):
         value = ax if channel == S.AX else ay if channel == S.AY else reading(sample, channel)
         if not math.isnan(value):
-            memory.sums[n, channel] += value
-            memory.counts[n, channel] += 1
+            memory.sums[channel] += value
+            memory.counts[channel] += 1
     for wheel in range(4):
         omega = reading(sample, S.OMEGA + wheel)
-        memory.last_omega[n, wheel] = memory.last_omega[n, wheel] if math.isnan(omega) else omega
-        if memory.counts[n, S.DELTA + wheel] > 0:
-            memory.last_delta[n, wheel] = memory.sums[n, S.DELTA + wheel] / memory.counts[n, S.DELTA + wheel]
+        memory.last_omega[wheel] = memory.last_omega[wheel] if math.isnan(omega) else omega
+        if memory.counts[S.DELTA + wheel] > 0:
+            memory.last_delta[wheel] = memory.sums[S.DELTA + wheel] / memory.counts[S.DELTA + wheel]
             if wheel >= 2:
-                memory.held[n, H.REAR_STEERING] = 1.0
+                memory.held[H.REAR_STEERING] = 1.0
 
 
 @compiled
-def forget_vehicle(memory: Memory, nominal: Nominal, n: int) -> None:
+def forget_vehicle(memory: Memory, nominal: Nominal) -> None:
     """The overall moments of what is a property of vehicle or sensor become those of its prior."""
-    covariance = memory.all_covariance[n]
+    covariance = memory.all_covariance
     for i in range(X.LN_KX, nominal.mean.shape[0]):
-        memory.all_mean[n, i] = nominal.mean[i]
+        memory.all_mean[i] = nominal.mean[i]
         for j in range(i + 1):
             covariance[i, j] = covariance[j, i] = 0.0
         covariance[i, i] = nominal.std[i] ** 2
-    clear(memory.paid[n])
+    clear(memory.paid)
 
 
 @compiled
-def fall_asleep(memory: Memory, prior: FloatArray, n: int) -> None:
+def fall_asleep(memory: Memory, prior: FloatArray) -> None:
     """The nodes of unlike sides take no part any more; prior (K,) of the others."""
-    if memory.held[n, H.UNLIKE] == 0.0:
+    if memory.held[H.UNLIKE] == 0.0:
         return
-    memory.held[n, H.UNLIKE] = 0.0
+    memory.held[H.UNLIKE] = 0.0
     chain = prior.shape[0]
-    for weight in (memory.weight[n], memory.visit[n]):
+    for weight in (memory.weight, memory.visit):
         total = 0.0
         for j in range(chain):
             total += weight[j]
@@ -269,46 +262,46 @@ def fall_asleep(memory: Memory, prior: FloatArray, n: int) -> None:
 
 
 @compiled
-def restart_motion(memory: Memory, n: int, speed: float, spread: float) -> None:
-    """All nodes of vehicle n go on at `speed` [m/s], or, where that is NaN, at the speed they have within `spread`."""
+def restart_motion(memory: Memory, speed: float, spread: float) -> None:
+    """All nodes go on at `speed` [m/s], or, where that is NaN, at the speed they have within `spread`."""
     if not math.isnan(speed):
-        memory.all_mean[n, X.VX], spread = speed, FIRST_VX_STD
-    memory.all_mean[n, X.VY] = 0.0
-    covariance = memory.all_covariance[n]
+        memory.all_mean[X.VX], spread = speed, FIRST_VX_STD
+    memory.all_mean[X.VY] = 0.0
+    covariance = memory.all_covariance
     for i in range(covariance.shape[0]):
         for axis in range(2):
             covariance[i, axis] = covariance[axis, i] = 0.0
     covariance[X.VX, X.VX], covariance[X.VY, X.VY] = spread**2, FIRST_VY_STD**2
-    for j in range(memory.mean.shape[1]):
-        put(memory.mean[n, j], memory.all_mean[n])
-        put_square(memory.covariance[n, j], covariance)
+    for j in range(memory.mean.shape[0]):
+        put(memory.mean[j], memory.all_mean)
+        put_square(memory.covariance[j], covariance)
 
 
 @compiled
 def _bridge(
-    memory: Memory, constants: FloatArray, prior: FloatArray, row: FloatArray, n: int, time: float, sample: FloatArray
+    memory: Memory, constants: FloatArray, prior: FloatArray, row: FloatArray, time: float, sample: FloatArray
 ) -> int:
     """After a silence: the friction is forgotten over the metres driven meanwhile, the motion starts anew."""
-    held = memory.held[n]
+    held = memory.held
     gone = time - held[H.TIME]
-    hazard = 1.0 - math.exp(-abs(memory.all_mean[n, X.VX]) * gone * constants[C.HAZARD])
-    fall_asleep(memory, prior, n)
+    hazard = 1.0 - math.exp(-abs(memory.all_mean[X.VX]) * gone * constants[C.HAZARD])
+    fall_asleep(memory, prior)
     for j in range(prior.shape[0]):
-        memory.weight[n, j] += hazard * (prior[j] - memory.weight[n, j])
-        memory.visit[n, j] += hazard * (prior[j] - memory.visit[n, j])
-    restart_motion(memory, n, rolling_speed(row, sample), min(GAP_ACCELERATION * gone, UNKNOWN_VX_STD))
+        memory.weight[j] += hazard * (prior[j] - memory.weight[j])
+        memory.visit[j] += hazard * (prior[j] - memory.visit[j])
+    restart_motion(memory, rolling_speed(row, sample), min(GAP_ACCELERATION * gone, UNKNOWN_VX_STD))
     rate = reading(sample, S.YAW_RATE)
     if not math.isnan(rate):
         held[H.YAW_RATE], held[H.YAW_RATE_VAR] = rate, YAW_STD**2
     held[H.TIME] = held[H.BLOCK_TIME] = time
     for k in range(H.ANGLE, H.SAMPLES + 1):
         held[k] = 0.0
-    clear_rows(memory.gain[n])
-    clear_rows(memory.gain_sum[n])
+    clear_rows(memory.gain)
+    clear_rows(memory.gain_sum)
     held[H.START_YAW_RATE] = held[H.YAW_RATE]
     for channel in range(INPUTS):
-        memory.sums[n, channel] = 0.0
-        memory.counts[n, channel] = 0
+        memory.sums[channel] = 0.0
+        memory.counts[channel] = 0
     for wheel in range(4):
-        memory.start_omega[n, wheel] = memory.last_omega[n, wheel] = reading(sample, S.OMEGA + wheel)
+        memory.start_omega[wheel] = memory.last_omega[wheel] = reading(sample, S.OMEGA + wheel)
     return flags.RESET

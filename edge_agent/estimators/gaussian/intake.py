@@ -8,16 +8,19 @@ last value, torque by the share of m*a_x; a wheel without speed stays NaN and is
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
 
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import GRAVITY, P, body
+from edge_agent.dynamics.parameters import GRAVITY, P, body, parameter_table
 from edge_agent.estimators import flags
-from edge_agent.estimators.friction_mixture.sample import GAP_S, POSITION_S, limit, reading, rolling_speed
-from schemas.numeric import BoolArray, FloatArray, IntArray, compiled
+from edge_agent.estimators.friction_mixture.sample import GAP_S, LIMITS, POSITION_S, rolling_speed
+from schemas.numeric import FloatArray, compiled
+from schemas.records import RecordArray, records
 from schemas.signals import S
+from schemas.vehicle import Vehicle
 
 INPUTS = 15  # channels before the position
 RING = 64  # grip used: so many slots of at least SLOT_S hold the last second
@@ -26,126 +29,139 @@ EXCITED_S = 1.0  # memory of the grip used, by contract
 
 REFUSED, BEGUN, STEPPED = 0, 1, 2  # what became of a sample
 
-
-class Track(NamedTuple):
-    """What is carried of the samples of N vehicles."""
-
-    started: BoolArray  # (N,)
-    time: FloatArray  # (N,) of the last sample [s]
-    position_time: FloatArray  # (N,) of the last position [s]
-    now: FloatArray  # (N, 15) readings, NaN where there is none
-    use: FloatArray  # (N, 15) inputs
-    before: FloatArray  # (N, 15) inputs of the sample before
-    ring_time: FloatArray  # (N, RING) [s]
-    ring_used: FloatArray  # (N, RING) [1]
-    ring_next: IntArray  # (N,)
+# health flags of a channel without a reading; the rear wheels' steering is optional
+MISSING = np.array(
+    [flags.NO_INERTIAL] * 3 + [flags.NO_STEERING] * 2 + [0] * 2 + [flags.NO_WHEEL_SPEED] * 4 + [flags.NO_TORQUE] * 4
+)
 
 
-def new_track(count: int) -> Track:
-    """The track of `count` vehicles that have not sent a sample."""
-    return Track(
-        started=np.zeros(count, np.bool_),
-        time=np.zeros(count),
-        position_time=np.full(count, -np.inf),
-        now=np.zeros((count, INPUTS)),
-        use=np.zeros((count, INPUTS)),
-        before=np.zeros((count, INPUTS)),
-        ring_time=np.full((count, RING), -np.inf),
-        ring_used=np.zeros((count, RING)),
-        ring_next=np.zeros(count, np.int64),
-    )
+class Track:
+    """What is carried of the samples of one vehicle."""
+
+    started: bool
+    time: float  # of the last sample [s]
+    position_time: float  # of the last position [s]
+    now: Annotated[FloatArray, INPUTS]  # readings, NaN where there is none
+    use: Annotated[FloatArray, INPUTS]  # inputs
+    before: Annotated[FloatArray, INPUTS]  # inputs of the sample before
+    turned: Annotated[FloatArray, 2, 4]  # cosine and sine of the steering in `use`
+    turned_before: Annotated[FloatArray, 2, 4]
+    ring_time: Annotated[FloatArray, RING]  # [s]
+    ring_used: Annotated[FloatArray, RING]  # [1]
+    ring_next: int
+    used: float  # largest of the ring within the last second [1]
+    used_time: float  # of its slot [s]
+
+
+def new_filters(kind: type, vehicles: Sequence[Vehicle]) -> RecordArray:
+    """A record of `kind` per vehicle, with its `row`; all else is zero, as `take` expects it."""
+    filters = records(kind, len(vehicles))
+    filters["row"] = parameter_table(vehicles)
+    return filters
 
 
 @compiled
-def take(track: Track, row: FloatArray, n: int, time: float, sample: FloatArray) -> tuple[int, int, float]:
-    """Take sample (18,) of vehicle n at `time` [s]: (health flags, REFUSED | BEGUN | STEPPED, seconds gone)."""
-    begins = not track.started[n]
-    gone = time - track.time[n]
+def take(track: Track, row: FloatArray, time: float, sample: FloatArray) -> tuple[int, int, float]:
+    """Take sample (18,) of a vehicle at `time` [s]: (health flags, REFUSED | BEGUN | STEPPED, seconds gone)."""
+    begins = not track.started
+    gone = time - track.time
     if not math.isfinite(time) or not (begins or gone > 0.0):
         return flags.TIME_GAP, REFUSED, 0.0
     silent = not begins and gone > GAP_S
-    health = _checks(track, n, time, sample)
+    if begins:
+        _begin(track)
+    health = _checks(track, time, sample)
+    _remember(track)
+    _inputs(track, row, sample, begins or silent)
+    track.time = time
+    _excitation(track, row, time)
     if begins or silent:
-        track.started[n] = True
-        track.use[n] = 0.0
-    track.before[n] = track.use[n]
-    _inputs(track, row, n, sample)
-    track.time[n] = time
-    _excitation(track, row, n, time)
-    if begins or silent:
-        track.before[n] = track.use[n]
+        _remember(track)
         return health | flags.RESET | (flags.TIME_GAP if silent else 0), BEGUN, 0.0
     return health, STEPPED, gone
 
 
 @compiled
-def _checks(track: Track, n: int, time: float, sample: FloatArray) -> int:
-    health = 0
-    for channel in range(INPUTS):
-        value = sample[channel]
-        track.now[n, channel] = reading(sample, channel)
-        if not math.isnan(value) and not abs(value) <= limit(channel):
-            health |= flags.OUTLIER
-    now = track.now[n]
-    if math.isfinite(sample[S.LATITUDE]) and math.isfinite(sample[S.LONGITUDE]):
-        track.position_time[n] = time
-    if not time - track.position_time[n] <= POSITION_S:
-        health |= flags.NO_POSITION
-    if math.isnan(now[S.AX] + now[S.AY] + now[S.YAW_RATE]):
-        health |= flags.NO_INERTIAL
-    if math.isnan(now[S.DELTA] + now[S.DELTA + 1]):
-        health |= flags.NO_STEERING
+def _begin(track: Track) -> None:
+    """Nothing has been seen so far; the wheels are straight."""
+    track.started = True
+    track.position_time = track.used_time = -math.inf
     for wheel in range(4):
-        if math.isnan(now[S.OMEGA + wheel]):
-            health |= flags.NO_WHEEL_SPEED
-        if math.isnan(now[S.TORQUE + wheel]):
-            health |= flags.NO_TORQUE
-    return health
+        track.turned[0, wheel], track.turned[1, wheel] = 1.0, 0.0
+    for k in range(RING):
+        track.ring_time[k] = -math.inf
 
 
 @compiled
-def _inputs(track: Track, row: FloatArray, n: int, sample: FloatArray) -> None:
-    now, use = track.now[n], track.use[n]
-    if not math.isnan(now[S.YAW_RATE]):
-        use[S.YAW_RATE] = now[S.YAW_RATE]
+def _checks(track: Track, time: float, sample: FloatArray) -> int:
+    now, odd, missing = track.now, 0, 0
+    for channel in range(INPUTS):
+        value = sample[channel]
+        there, believed = value == value, abs(value) <= LIMITS[channel]
+        now[channel] = value if believed else math.nan
+        odd |= flags.OUTLIER if there and not believed else 0
+        missing |= 0 if believed else MISSING[channel]
+    if math.isfinite(sample[S.LATITUDE]) and math.isfinite(sample[S.LONGITUDE]):
+        track.position_time = time
+    return odd | missing | (0 if time - track.position_time <= POSITION_S else flags.NO_POSITION)
+
+
+@compiled
+def _remember(track: Track) -> None:
+    """The inputs become those of the sample before."""
+    for k in range(INPUTS):
+        track.before[k] = track.use[k]
+    for wheel in range(4):
+        track.turned_before[0, wheel], track.turned_before[1, wheel] = track.turned[0, wheel], track.turned[1, wheel]
+
+
+@compiled
+def _inputs(track: Track, row: FloatArray, sample: FloatArray, anew: bool) -> None:
+    """Fill `use`; anew: what was used before counts no more."""
+    now, use = track.now, track.use
+    for k in range(S.YAW_RATE, S.OMEGA):
+        value = now[k] if now[k] == now[k] else 0.0 if anew else use[k]
+        if k >= S.DELTA and value != use[k]:
+            track.turned[0, k - S.DELTA], track.turned[1, k - S.DELTA] = math.cos(value), math.sin(value)
+        use[k] = value
     speed = rolling_speed(row, sample)
     use[S.AX] = 0.0 if math.isnan(now[S.AX]) else now[S.AX]
     turning = 0.0 if math.isnan(speed) else use[S.YAW_RATE] * speed
     use[S.AY] = turning if math.isnan(now[S.AY]) else now[S.AY]
     share = 0.25 * row[P.MASS] * use[S.AX] * row[P.RADIUS]
     for wheel in range(4):
-        if not math.isnan(now[S.DELTA + wheel]):
-            use[S.DELTA + wheel] = now[S.DELTA + wheel]
-        use[S.OMEGA + wheel] = now[S.OMEGA + wheel]
         torque = now[S.TORQUE + wheel]
+        use[S.OMEGA + wheel] = now[S.OMEGA + wheel]
         use[S.TORQUE + wheel] = share if math.isnan(torque) else torque
 
 
 @compiled
-def _excitation(track: Track, row: FloatArray, n: int, time: float) -> None:
+def _excitation(track: Track, row: FloatArray, time: float) -> None:
     """Grip used by the hardest-working wheel now: hypot of torque over radius and load, and lateral g."""
-    use = track.use[n]
-    loads = wheel_loads(body(row), use[S.AX], use[S.AY])
-    used = 0.0
+    use = track.use
+    loads, most = wheel_loads(body(row), use[S.AX], use[S.AY]), 0.0
     for wheel in range(4):
-        along = use[S.TORQUE + wheel] / (row[P.RADIUS] * loads[wheel])
-        used = max(used, math.hypot(along, use[S.AY] / GRAVITY))
-    place = track.ring_next[n]
-    if not time - track.ring_time[n, place] < SLOT_S:
+        most = max(most, abs(use[S.TORQUE + wheel]) / loads[wheel])
+    used = math.sqrt((most / row[P.RADIUS]) ** 2 + (use[S.AY] / GRAVITY) ** 2)
+    place = track.ring_next
+    if not time - track.ring_time[place] < SLOT_S:
         place = (place + 1) % RING
-        track.ring_next[n], track.ring_time[n, place], track.ring_used[n, place] = place, time, used
+        track.ring_next, track.ring_time[place], track.ring_used[place] = place, time, used
     else:
-        track.ring_used[n, place] = max(track.ring_used[n, place], used)
+        track.ring_used[place] = max(track.ring_used[place], used)
+    if track.ring_used[place] >= track.used:
+        track.used, track.used_time = track.ring_used[place], track.ring_time[place]
+    elif not track.used_time > time - EXCITED_S:
+        _look_back(track, time)
 
 
 @compiled
-def grip_used(track: Track, n: int) -> float:
-    """Largest grip that any wheel of vehicle n used in the last second [1]."""
-    used = 0.0
+def _look_back(track: Track, time: float) -> None:
+    """The largest of the ring has grown old: which is it now?"""
+    track.used = 0.0
     for k in range(RING):
-        if track.ring_time[n, k] > track.time[n] - EXCITED_S:
-            used = max(used, track.ring_used[n, k])
-    return used
+        if track.ring_time[k] > time - EXCITED_S and track.ring_used[k] >= track.used:
+            track.used, track.used_time = track.ring_used[k], track.ring_time[k]
 
 
 @compiled

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Annotated
 
 import numpy as np
 
@@ -21,9 +21,9 @@ from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import P, body
 from edge_agent.dynamics.slip import wheel_velocity
 from edge_agent.estimators.friction_mixture.sample import rolling_speed
-from edge_agent.estimators.gaussian.bank import FIRST_V_STD, UNKNOWN_V_STD
 from edge_agent.estimators.gaussian.intake import Track, wheel_force
-from edge_agent.estimators.gaussian.planar import carry
+from edge_agent.estimators.gaussian.planar import POINTS, carry
+from edge_agent.estimators.gaussian.telling import FIRST_V_STD, UNKNOWN_V_STD
 from edge_agent.filters.federated import fuse, share
 from edge_agent.filters.sigma import cubature
 from edge_agent.filters.squareroot import deviations, predict, update, weighted_mean
@@ -32,6 +32,8 @@ from schemas.numeric import FloatArray, compiled
 from schemas.signals import S
 
 STATES, ROWS = 6, 4
+RULE = cubature(STATES)
+XI, WEIGHT = RULE.xi, RULE.w_cov
 STEP_S = 0.02  # process variances are per so much time
 # variances of the process per STEP_S: offsets of the accelerometers, drag and slopes that torque does not know, and the
 # error of the tyre model; the papers' 100, 1 and .01 for all states alike are in no unit
@@ -55,39 +57,25 @@ class X(IntEnum):
     TURN = 5  # yaw acceleration [rad/s^2]
 
 
-class Pair(NamedTuple):
-    """The master's state of N filters, their shares, and room for a turn."""
+class Pair:
+    """The master's state of one filter, its shares, and what the turn told."""
 
-    mean: FloatArray  # (N, 6)
-    root: FloatArray  # (N, 6, 6)
-    beta: FloatArray  # (N,) share of sub-filter 1
-    factor: FloatArray  # (N, 2) on R of each sub-filter
-    gamma: FloatArray  # (N, 2) squared innovation over its expectation, per sub-filter
-    innovation: FloatArray  # (N, 2, 4)
-    expected: FloatArray  # (N, 2, 4) innovation variances if R were nominal
-    told: FloatArray  # (N, 2) NIS, log-likelihood
-    size: FloatArray  # (N, 2) trace of the sub-filters' covariances over the starting variances
-    xi: FloatArray  # (12, 6)
-    weight: FloatArray  # (12,)
-    process: FloatArray  # (6,)
-    start: FloatArray  # (6,)
-    noise: FloatArray  # (3,)
-
-
-def new_pair(count: int) -> Pair:
-    """`count` pairs that have not begun."""
-    rule, halves = cubature(STATES), (count, 2)
-    return Pair(
-        np.zeros((count, STATES)), np.zeros((count, STATES, STATES)), np.full(count, 0.5), np.ones(halves),
-        np.ones(halves), np.zeros((*halves, ROWS)), np.ones((*halves, ROWS)), np.zeros(halves), np.ones(halves),
-        rule.xi, rule.w_cov, PROCESS, START, NOISE,
-    )  # fmt: skip
+    mean: Annotated[FloatArray, STATES]
+    root: Annotated[FloatArray, STATES, STATES]
+    beta: float  # share of sub-filter 1
+    factor: Annotated[FloatArray, 2]  # on R of each sub-filter
+    gamma: Annotated[FloatArray, 2]  # squared innovation over its expectation, per sub-filter
+    innovation: Annotated[FloatArray, 2, ROWS]
+    expected: Annotated[FloatArray, 2, ROWS]  # innovation variances if R were nominal
+    size: Annotated[FloatArray, 2]  # trace of the sub-filters' covariances over the starting variances
+    nis: float
+    log_likelihood: float
 
 
 @compiled
-def begin(pair: Pair, track: Track, row: FloatArray, n: int, sample: FloatArray) -> None:
+def begin(pair: Pair, track: Track, row: FloatArray, sample: FloatArray) -> None:
     """Begin vehicle n at the speed of its wheels."""
-    mean, root, use = pair.mean[n], pair.root[n], track.use[n]
+    mean, root, use = pair.mean, pair.root, track.use
     speed = rolling_speed(row, sample)
     known = not math.isnan(speed)
     mean[:] = 0.0
@@ -95,72 +83,76 @@ def begin(pair: Pair, track: Track, row: FloatArray, n: int, sample: FloatArray)
     mean[X.AX], mean[X.AY], mean[X.YAW_RATE] = use[S.AX], use[S.AY], use[S.YAW_RATE]
     root[:, :] = 0.0
     for i in range(STATES):
-        root[i, i] = pair.start[i]
+        root[i, i] = START[i]
     if not known:
         root[X.VX, X.VX] = UNKNOWN_V_STD
-    pair.beta[n], pair.factor[n], pair.gamma[n], pair.told[n] = 0.5, 1.0, 1.0, 0.0
+    pair.beta, pair.factor[:], pair.gamma[:] = 0.5, 1.0, 1.0
+    pair.nis = pair.log_likelihood = 0.0
 
 
 @compiled
-def turn(pair: Pair, track: Track, row: FloatArray, n: int, gone: float, friction: FloatArray) -> None:
+def turn(pair: Pair, track: Track, row: FloatArray, gone: float, friction: FloatArray) -> None:
     """Share, predict and update in both sub-filters, and fuse; friction (4,) is given. `gone` [s]."""
     root, process = np.empty((STATES, STATES)), np.zeros((STATES, STATES))
     mean, first_mean, first_root = np.empty(STATES), np.empty(STATES), np.empty((STATES, STATES))
     points, work = np.empty((2 * STATES, STATES)), np.empty((2 * STATES, 4 * STATES))
-    pair.told[n] = 0.0
+    columns = np.empty((STATES, POINTS))
+    pair.nis = pair.log_likelihood = 0.0
     for sub in range(2):
-        beta = pair.beta[n] if sub == 0 else 1.0 - pair.beta[n]
-        share(pair.root[n], beta, root)
-        axis_points(pair.mean[n], root, pair.xi, points)
-        carry(row, points, friction, track.before[n], track.use[n], gone, True)
+        beta = pair.beta if sub == 0 else 1.0 - pair.beta
+        share(pair.root, beta, root)
+        axis_points(pair.mean, root, XI, points)
+        columns[:] = points.T
+        carry(row, columns, friction, track, gone, True)
+        points[:] = columns.T
         for i in range(STATES):
-            process[i, i] = pair.process[i] * math.sqrt(gone / STEP_S / beta)
-        predict(points, pair.weight, pair.weight, process, mean, root, work)
-        _measure(pair, track, row, n, sub, gone, mean, root, points, work)
+            process[i, i] = PROCESS[i] * math.sqrt(gone / STEP_S / beta)
+        predict(points, WEIGHT, WEIGHT, process, mean, root, work)
+        _measure(pair, track, row, sub, gone, mean, root, points, work)
         if sub == 0:
             first_mean[:], first_root[:] = mean, root
     fuse(first_mean, first_root, mean, root, work)
-    pair.mean[n], pair.root[n] = first_mean, first_root
+    pair.mean[:], pair.root[:] = first_mean, first_root
 
 
 @compiled
 def _measure(
-    pair: Pair, track: Track, row: FloatArray, n: int, sub: int, gone: float, mean: FloatArray, root: FloatArray,
+    pair: Pair, track: Track, row: FloatArray, sub: int, gone: float, mean: FloatArray, root: FloatArray,
     points: FloatArray, work: FloatArray,
 ) -> None:  # fmt: skip
-    now = track.now[n]
+    now = track.now
     outcomes, predicted, std = np.empty((2 * STATES, ROWS)), np.empty(ROWS), np.empty(ROWS)
     state, measured = np.empty((STATES, 2 * STATES)), np.empty((ROWS, 2 * STATES))
-    axis_points(mean, root, pair.xi, points)
+    axis_points(mean, root, XI, points)
     for p in range(points.shape[0]):
         for r in range(3):
             outcomes[p, r] = points[p, X.AX + r]
-        outcomes[p, 3] = rolling(row, track.use[n], points[p], X.YAW_RATE)
-    weighted_mean(outcomes, pair.weight, predicted)
-    deviations(points, mean, pair.weight, state, 0)
-    deviations(outcomes, predicted, pair.weight, measured, 0)
-    innovation = pair.innovation[n, sub]
+        outcomes[p, 3] = rolling(row, track.use, points[p], X.YAW_RATE)
+    weighted_mean(outcomes, WEIGHT, predicted)
+    deviations(points, mean, WEIGHT, state, 0)
+    deviations(outcomes, predicted, WEIGHT, measured, 0)
+    innovation = pair.innovation[sub]
     twice = np.array([1.0, 2.0, 2.0])
     for r in range(3):
         innovation[r] = now[r] - predicted[r]
-        std[r] = math.sqrt(twice[r] * pair.factor[n, sub] * pair.noise[r])
-    speed, std[3] = freed_speed(row, track.before[n], track.use[n], gone)
+        std[r] = math.sqrt(twice[r] * pair.factor[sub] * NOISE[r])
+    speed, std[3] = freed_speed(row, track.before, track.use, gone)
     innovation[3] = speed - predicted[3]
     std[3] = doubted(std[3], innovation[3])
     if sub == 1:
         innovation[0] = innovation[3] = math.nan
     for r in range(ROWS):
-        pair.expected[n, sub, r] = std[r] ** 2 / (pair.factor[n, sub] if r < 3 else 1.0)
+        pair.expected[sub, r] = std[r] ** 2 / (pair.factor[sub] if r < 3 else 1.0)
         for p in range(points.shape[0]):
-            pair.expected[n, sub, r] += measured[r, p] ** 2
+            pair.expected[sub, r] += measured[r, p] ** 2
     used, log_likelihood, square = update(mean, root, state, measured, innovation, std, work)
-    pair.gamma[n, sub] = square / max(used, 1)
-    pair.told[n, 0] += 0.5 * pair.gamma[n, sub]
-    pair.told[n, 1] += log_likelihood
-    pair.size[n, sub] = 0.0
+    pair.gamma[sub] = square / max(used, 1)
+    pair.nis += 0.5 * pair.gamma[sub]
+    pair.log_likelihood += log_likelihood
+    pair.size[sub] = 0.0
     for i in range(STATES):
         for j in range(i + 1):
-            pair.size[n, sub] += (root[i, j] / pair.start[i]) ** 2
+            pair.size[sub] += (root[i, j] / START[i]) ** 2
 
 
 @compiled

@@ -15,7 +15,7 @@ import numpy as np
 from edge_agent.dynamics.body import advance_velocity
 from edge_agent.dynamics.chassis import response
 from edge_agent.dynamics.parameters import Body, Four, body, four
-from edge_agent.estimators.gaussian.intake import wheel_force
+from edge_agent.estimators.gaussian.intake import Track, wheel_force
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray, compiled, inlined
 from schemas.signals import S
@@ -23,7 +23,8 @@ from schemas.signals import S
 LONGEST_S = 0.02  # of one of Heun's steps, at a speed of
 CALM_M_S = 2.0  # or more: below, the pole of lateral motion, about 170/v [1/s], asks for shorter ones
 SHORTEST_SHARE = 0.2
-ABREAST = 8  # points are filled up to a multiple of it: the widest vectors of today's processors, in doubles
+POINTS = 12  # of the cubature rule in six dimensions, side by side in a row
+ABREAST = 8  # of them are moved at once, then the rest: constants, so that each loop becomes vectors and nothing else
 Inputs: TypeAlias = tuple[Four, Four, Four]  # wheel speeds, cosines and sines of the steering
 
 
@@ -34,50 +35,43 @@ def substeps(speed: float, gone: float) -> int:
     return max(1, math.ceil(gone / longest - 1e-6))
 
 
-@compiled
+@inlined
 def carry(
-    row: FloatArray,
-    points: FloatArray,
-    friction: FloatArray,
-    before: FloatArray,
-    use: FloatArray,
-    gone: float,
-    torque: bool,
-) -> None:
-    """Move the states points (P, 6) on by `gone` [s], in place; inputs (15,) run straight from `before` to `use`.
+    row: FloatArray, columns: FloatArray, friction: FloatArray, track: Track, gone: float, torque: bool
+) -> None:  # fmt: skip
+    """Move the states `columns` (6, POINTS) on by `gone` [s], in place; inputs run straight from before to now.
 
     torque: longitudinal forces come from the wheels' torque, z is the yaw acceleration and friction (4,) is given; the
     velocity follows a_x and a_y of the state alone, which measurements correct for drag and slopes. Else forces come
     from slip and z is the friction of all wheels.
     """
-    count = points.shape[0]
-    columns = np.empty((6, -(-count // ABREAST) * ABREAST))
-    for p in range(columns.shape[1]):
-        for i in range(6):
-            columns[i, p] = points[min(p, count - 1), i]
-    times = substeps(np.abs(columns[0]).min(), gone)
+    slowest = abs(columns[0, 0])
+    for p in range(1, POINTS):
+        slowest = min(slowest, abs(columns[0, p]))
+    times = substeps(slowest, gone)
     unknown = (math.nan, math.nan, math.nan, math.nan)
-    known = _forces(row, before, use, gone) if torque else unknown
+    known = _forces(row, track.before, track.use, gone) if torque else unknown
     told = four(np.minimum(np.maximum(friction, LOWER), UPPER)) if torque else unknown
-    begin = _inputs(before, use, 0.0)
+    begin = (four(track.before[S.OMEGA : S.TORQUE]), four(track.turned_before[0]), four(track.turned_before[1]))
     for k in range(times):
-        end = _inputs(before, use, (k + 1) / times)
-        _heun(body(row), columns, begin, end, known, told, gone / times, torque)
+        end = (four(track.use[S.OMEGA : S.TORQUE]), four(track.turned[0]), four(track.turned[1]))
+        if k + 1 < times:
+            end = _between(track.before, track.use, (k + 1) / times)
+        _heun(body(row), columns, 0, ABREAST, begin, end, known, told, gone / times, torque)
+        _heun(body(row), columns, ABREAST, POINTS, begin, end, known, told, gone / times, torque)
         begin = end
-    for p in range(count):
-        for i in range(6):
-            points[p, i] = columns[i, p]
 
 
-@compiled
+@inlined
 def _heun(
-    vehicle: Body, columns: FloatArray, begin: Inputs, end: Inputs, known: Four, told: Four, step: float, torque: bool
-) -> None:
-    """One of Heun's steps of the states in `columns` (6, P), in place. Arithmetic alone: the points go side by side."""
+    vehicle: Body, columns: FloatArray, first: int, last: int, begin: Inputs, end: Inputs, known: Four, told: Four,
+    step: float, torque: bool,
+) -> None:  # fmt: skip
+    """One of Heun's steps of the columns [first, last), in place. Arithmetic alone: the points go side by side."""
     (omega_from, cos_from, sin_from), (omega, cos, sin) = begin, end
     column_v, column_u, column_x, column_y = columns[0], columns[1], columns[2], columns[3]
     column_r, column_z = columns[4], columns[5]
-    for p in range(columns.shape[1]):
+    for p in range(first, last):
         v, u, ax, ay, r, z = column_v[p], column_u[p], column_x[p], column_y[p], column_r[p], column_z[p]
         one = min(max(z, LOWER), UPPER)
         mu = told if torque else (one, one, one, one)
@@ -97,7 +91,7 @@ def _heun(
 
 
 @inlined
-def _inputs(before: FloatArray, use: FloatArray, share: float) -> Inputs:
+def _between(before: FloatArray, use: FloatArray, share: float) -> Inputs:
     """Wheel speeds, cosines and sines of the steering at a share of the way from one sample to the next."""
     keep, delta, omega = 1.0 - share, S.DELTA, S.OMEGA
     fl, fr = keep * before[delta] + share * use[delta], keep * before[delta + 1] + share * use[delta + 1]

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from edge_agent.estimators.gaussian.bank import PRIOR_MU, PRIOR_MU_STD
+from edge_agent.estimators.gaussian.telling import PRIOR_MU, PRIOR_MU_STD
 from edge_agent.filters.squareroot import triangularize
 from schemas.numeric import FloatArray, compiled
 

@@ -11,6 +11,7 @@ import pytest
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.banks import bank_of
 from edge_agent.estimators import Estimates, create
+from edge_agent.estimators.estimates import COLUMNS
 from schemas.errors import InputError
 from schemas.mugrid import CENTRES
 from schemas.numeric import FloatArray
@@ -18,7 +19,6 @@ from schemas.signals import Health, S
 from tests.edge_agent.estimators.drives import drive, joined
 
 PRIOR_WIDTH = 0.9 * 1.15
-ARRAYS = [name for name in Estimates._fields if name not in ("mu_wheel", "evidence")]
 
 
 def run(name: str, t: FloatArray, signals: FloatArray, vehicle: object, closes: FloatArray | None = None) -> Estimates:
@@ -59,7 +59,7 @@ def test_a_vehicle_has_the_same_numbers_alone_and_among_many() -> None:
     crowd = np.repeat(signals[:, None], many, axis=1)
     crowd[:, 1:] += 0.01 * np.random.default_rng(0).normal(size=(1, many - 1, crowd.shape[2]))
     together = bank.advance(np.repeat(t[:, None], many, axis=1), crowd)
-    for name in ARRAYS:
+    for name in COLUMNS:
         assert np.array_equal(getattr(together, name)[:, 0], getattr(alone, name)[:, 0]), name
 
 
@@ -69,7 +69,7 @@ def test_however_the_samples_are_cut_the_numbers_are_the_same() -> None:
     bank = create("fckf", [vehicle], memberships=Memberships())
     cuts = [0, 1, 2, 5, 6, 83, 200, 201, 599, len(t)]
     parts = [bank.advance(t[a:b, None], signals[a:b, None]) for a, b in pairwise(cuts)]
-    for name in ARRAYS:
+    for name in COLUMNS:
         assert np.array_equal(np.concatenate([getattr(p, name) for p in parts]), getattr(whole, name)), name
 
 
@@ -77,7 +77,7 @@ def test_closing_visits_does_not_change_the_estimates() -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=6.0)
     closes = np.arange(len(t)) % 100 == 50
     plain, closed = run("fckf", t, signals, vehicle), run("fckf", t, signals, vehicle, closes)
-    for name in ARRAYS:
+    for name in COLUMNS:
         assert np.array_equal(getattr(plain, name), getattr(closed, name)), name
     assert closed.evidence is not None
     assert np.isfinite(closed.evidence[closes]).all()
@@ -170,7 +170,7 @@ def test_no_fault_makes_a_nan_and_health_says_what_happened(fault: str) -> None:
     harm, flag = FAULTS[fault]
     harm(t, signals)
     said = run("fckf", t, signals, vehicle)
-    for name in ARRAYS:
+    for name in COLUMNS:
         assert np.isfinite(getattr(said, name)).all(), name
     assert (said.health & int(flag)).any()
     assert (said.mu_lower <= said.mu).all()

@@ -9,7 +9,7 @@ import pytest
 
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.dynamics.parameters import parameter_table
-from edge_agent.estimators import EstimatorBank
+from edge_agent.estimators.friction_mixture.bank import mixture_bank
 from edge_agent.estimators.friction_mixture.constants import C, constant_row
 from edge_agent.estimators.registry import design_of
 from schemas.numeric import FloatArray
@@ -38,7 +38,7 @@ def said(place: int | None) -> bytes:
     row = constant_row()
     if place is not None:
         row[place] = 3.0 * row[place] if row[place] != 0.0 else 0.1
-    bank = EstimatorBank(parameter_table(vehicles), design_of(Memberships(), adaptive=True, constants=row))
+    bank = mixture_bank(parameter_table(vehicles), design_of(Memberships(), adaptive=True, constants=row))
     told = bank.advance(t, signals)
     return b"".join(
         array.tobytes() for array in (told.vx, told.vx_std, told.vy_std, told.mu, told.mu_lower, told.mu_upper)

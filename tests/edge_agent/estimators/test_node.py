@@ -10,9 +10,10 @@ import pytest
 from edge_agent.dynamics.tyres import magic_formula
 from edge_agent.estimators.friction_mixture.constants import ACTIVE, NODES, STATES, C, constant_row
 from edge_agent.estimators.friction_mixture.curve import curve_tables, ratio_at, theta_at
-from edge_agent.estimators.friction_mixture.node import factorize, new_room, take_rows, unfelt
+from edge_agent.estimators.friction_mixture.node import Room, factorize, take_rows, unfelt
 from edge_agent.estimators.friction_mixture.nodes import node_table, projected, side_table
 from edge_agent.estimators.friction_mixture.residuals import ROWS
+from schemas.records import records
 
 SEEDS = (0, 1, 2)
 
@@ -20,6 +21,11 @@ SEEDS = (0, 1, 2)
 def covariance(seed: int) -> np.ndarray:
     factor = np.random.default_rng(seed).normal(size=(STATES, STATES))
     return np.asarray(factor @ factor.T + 0.1 * np.eye(STATES))
+
+
+def new_room() -> Room:
+    """Scratch of one update."""
+    return Room(*records(Room, 1)[0])
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -11,6 +11,7 @@ import pytest
 
 from edge_agent.cli import main
 from edge_agent.estimators import ESTIMATORS, Estimates
+from edge_agent.estimators.estimates import ONE_FRICTION, Y
 from edge_agent.evaluation import measures
 from edge_agent.evaluation.bars import BARS, figures
 from edge_agent.evaluation.batch import Batch, Scenario, ideal, realistic, repeated
@@ -44,15 +45,14 @@ ASKED = {
 
 def fake(mu: float, lower: float, upper: float, like: Batch) -> Estimates:
     """Estimates that tell the same friction all the time, and the true motion."""
-    shape, truth = like.t.shape, like.truth
-    still = {name: np.zeros(shape) for name in ("mu_utilised", "adaptation", "innovation_log_likelihood")}
-    stds = {f"{name}_std": np.ones(shape) for name in ("vx", "vy", "yaw_rate", "sideslip")}
-    return Estimates(
-        vx=truth["true_vx"], vy=truth["true_vy"], yaw_rate=truth["true_yaw_rate"],
-        sideslip=np.arctan2(truth["true_vy"], truth["true_vx"]), mu=np.full(shape, mu), mu_lower=np.full(shape, lower),
-        mu_upper=np.full(shape, upper), innovation_nis=np.ones(shape), health=np.zeros(shape, np.int32),
-        mu_wheel=None, evidence=None, **still, **stds,
-    )  # fmt: skip
+    told, truth = np.zeros((*like.t.shape, ONE_FRICTION)), like.truth
+    told[..., Y.VX], told[..., Y.VY], told[..., Y.YAW_RATE] = (
+        truth[f"true_{name}"] for name in ("vx", "vy", "yaw_rate")
+    )
+    told[..., Y.SIDESLIP] = np.arctan2(truth["true_vy"], truth["true_vx"])
+    told[..., Y.MU], told[..., Y.MU_LOWER], told[..., Y.MU_UPPER] = mu, lower, upper
+    told[..., Y.VX_STD : Y.MU], told[..., Y.INNOVATION_NIS] = 1.0, 1.0
+    return Estimates(told)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,77 @@
+"""The estimator bank: N vehicles side by side through one compiled path.
+
+No vehicle's numbers meet another's, and all that is carried lies in the vehicle's own record, so results are bit-equal
+whatever N is and however the samples are cut into calls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import numpy as np
+
+from edge_agent.estimators.estimates import ONE_FRICTION, Estimates
+from edge_agent.estimators.shares import checked, in_shares
+from schemas.mugrid import BINS
+from schemas.numeric import BoolArray, FloatArray, entry
+from schemas.records import RecordArray
+
+Kernel: TypeAlias = Callable[..., None]
+"""kernel(filters, desks, t, signals, told, share, first, last), or with (closes, evidence) after told.
+
+Takes t (T, N) and signals (T, N, 18) of the vehicles [first, last), changes their filters (N,), writes told (T, N, …)
+indexed by Y and, where closes (T, N) says so, evidence (T, N, 32); closes (0, N) says nowhere. `desks[share]` holds the
+tables that all filters read, and room for what a step writes before it reads it; it is of this thread alone.
+"""
+
+
+class EstimatorBank:
+    """N estimators of one kind; made by `create`."""
+
+    def __init__(
+        self,
+        filters: RecordArray,
+        desk: RecordArray,
+        kernel: Kernel,
+        *,
+        tells: int = ONE_FRICTION,
+        evidence: bool = False,
+    ) -> None:
+        self._filters, self._desks, self._kernel, self._tells = filters, desk, kernel, tells
+        self._entered, count = kernel, len(filters)
+        self._nowhere = (np.zeros((0, count), np.bool_), np.zeros((0, count, BINS))) if evidence else ()
+
+    def advance(
+        self, t: FloatArray, signals: FloatArray, closes: BoolArray | None = None, *, threads: int = 1
+    ) -> Estimates:
+        """Take the next samples of all vehicles.
+
+        Args:
+            t: (T, N) measurement time [s]; a sample whose time does not increase is left out, and health says so.
+            signals: (T, N, 18) in the order of schemas.signals.CHANNELS; NaN is a missing reading.
+            closes: (T, N), True at the first sample that belongs to a new visit; None for no visits.
+            threads: how many share the vehicles among them; changes no bit of the result.
+
+        Returns:
+            Estimates at the same samples; none of them is NaN, except evidence away from closes.
+
+        Raises:
+            InputError: shapes do not agree with the bank, or threads is below 1.
+        """
+        count = len(self._filters)
+        t, signals = checked(t, signals, closes, count)
+        told, visits, evidence = np.empty((*t.shape, self._tells)), self._nowhere, None
+        if visits and closes is not None:
+            evidence = np.full((*t.shape, BINS), np.nan)
+            visits = np.ascontiguousarray(closes, np.bool_), evidence
+        if threads == 1:
+            self._entered(self._filters, self._desks, t, signals, told, *visits, 0, 0, count)
+            if self._entered is self._kernel:
+                self._entered = entry(self._kernel)  # `checked` sees to it that all arguments are of one kind
+            return Estimates(told, evidence)
+        if threads > len(self._desks):
+            self._desks = np.repeat(self._desks[:1], threads)
+        whole = (self._filters, self._desks, t, signals, told, *visits)
+        in_shares(lambda share, first, last: self._kernel(*whole, share, first, last), count, threads)
+        return Estimates(told, evidence)

@@ -1,0 +1,91 @@
+"""What a bank says: numbers per sample and vehicle, written by the kernels, and its columns by name."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.numeric import FloatArray
+
+FlagArray: TypeAlias = NDArray[np.int64]
+
+
+class Y(IntEnum):
+    """Index of a number told; none of them is NaN."""
+
+    VX = 0  # [m/s]
+    VY = 1  # [m/s]
+    YAW_RATE = 2  # [rad/s]
+    SIDESLIP = 3  # [rad]
+    VX_STD = 4
+    VY_STD = 5
+    YAW_RATE_STD = 6
+    SIDESLIP_STD = 7
+    MU = 8  # median [1]
+    MU_LOWER = 9  # 5 %
+    MU_UPPER = 10  # 95 %
+    MU_UTILISED = 11  # largest grip used by any wheel in the last second [1]
+    INNOVATION_NIS = 12  # per row of measurement; 1 is expected
+    ADAPTATION = 13  # largest factor on R
+    INNOVATION_LOG_LIKELIHOOD = 14  # of what was measured at the sample, 0 where nothing was [nat]
+    HEALTH = 15  # schemas.signals.Health
+    WHEELS = 16  # median, lower, upper of each wheel, where the estimator has them
+
+
+COLUMNS = tuple(y.name.lower() for y in Y if y < Y.WHEELS)
+ONE_FRICTION, FOUR_FRICTIONS = int(Y.WHEELS), int(Y.WHEELS) + 12  # how many numbers an estimator tells
+
+
+class _Column:
+    """A number of all samples, as a view: made when asked for, since a live loop reads few."""
+
+    def __init__(self, place: Y) -> None:
+        self._place = int(place)
+
+    def __get__(self, said: Estimates, owner: type) -> FloatArray:
+        return said.told[..., self._place]
+
+
+def _column(place: Y) -> Any:  # noqa: ANN401 the annotation beside it says the type
+    return _Column(place)
+
+
+class Estimates:
+    """What a bank says of T samples of N vehicles; columns are arrays of shape (T, N), documented in `Y`."""
+
+    __slots__ = ("evidence", "told")
+
+    vx: FloatArray = _column(Y.VX)
+    vy: FloatArray = _column(Y.VY)
+    yaw_rate: FloatArray = _column(Y.YAW_RATE)
+    sideslip: FloatArray = _column(Y.SIDESLIP)
+    vx_std: FloatArray = _column(Y.VX_STD)
+    vy_std: FloatArray = _column(Y.VY_STD)
+    yaw_rate_std: FloatArray = _column(Y.YAW_RATE_STD)
+    sideslip_std: FloatArray = _column(Y.SIDESLIP_STD)
+    mu: FloatArray = _column(Y.MU)
+    mu_lower: FloatArray = _column(Y.MU_LOWER)
+    mu_upper: FloatArray = _column(Y.MU_UPPER)
+    mu_utilised: FloatArray = _column(Y.MU_UTILISED)
+    innovation_nis: FloatArray = _column(Y.INNOVATION_NIS)
+    adaptation: FloatArray = _column(Y.ADAPTATION)
+    innovation_log_likelihood: FloatArray = _column(Y.INNOVATION_LOG_LIKELIHOOD)
+
+    def __init__(self, told: FloatArray, evidence: FloatArray | None = None) -> None:
+        self.told = told  # (T, N, ONE_FRICTION or FOUR_FRICTIONS) indexed by Y
+        self.evidence = evidence  # (T, N, 32) at closes, else NaN: log-likelihood of the visit on the friction grid
+
+    @property
+    def health(self) -> FlagArray:
+        """(T, N) of schemas.signals.Health."""
+        return self.told[..., Y.HEALTH].astype(np.int64)
+
+    @property
+    def mu_wheel(self) -> FloatArray | None:
+        """(T, N, 4, 3) median, lower, upper per wheel; None where the estimator has one friction."""
+        if self.told.shape[-1] == ONE_FRICTION:
+            return None
+        return self.told[..., Y.WHEELS :].reshape(*self.told.shape[:-1], 4, 3)

@@ -1,0 +1,47 @@
+"""Samples made fit for the papers' filters: the grip used in the last second, and the steering's cosines."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from edge_agent.dynamics.parameters import GRAVITY
+from edge_agent.estimators.gaussian.intake import BEGUN, EXCITED_S, SLOT_S, STEPPED, new_filters, take
+from edge_agent.estimators.paper_aco_fckf import Memory
+from edge_agent.simulation.presets import PRESETS
+from schemas.signals import CHANNELS, S
+
+CAR = PRESETS["sedan"].vehicle
+
+
+@pytest.mark.parametrize("every_s", [0.004, 0.01, 0.05, 0.3])
+def test_the_grip_used_is_the_largest_of_the_slots_of_the_last_second(every_s: float) -> None:
+    (memory,) = new_filters(Memory, [CAR])
+    rng, slots = np.random.default_rng(5), [(-math.inf, 0.0)]
+    for k in range(600):
+        sample, time = np.zeros(len(CHANNELS)), -1.0 + k * every_s
+        sample[S.AY] = 8.0 * rng.random() ** 3 * (0.2 if k > 300 else 1.0)
+        _, kind, _ = take(memory["track"], memory["row"], time, sample)
+        assert kind == (BEGUN if k == 0 else STEPPED)
+        used = sample[S.AY] / GRAVITY
+        if time - slots[-1][0] < SLOT_S:
+            slots[-1] = (slots[-1][0], max(slots[-1][1], used))
+        else:
+            slots.append((time, used))
+        expected = max(grip for began, grip in slots if began > time - EXCITED_S)
+        assert memory["track"]["used"] == pytest.approx(expected, rel=1e-12)
+
+
+def test_the_cosines_are_those_of_the_angles_in_use_now_and_before() -> None:
+    (memory,) = new_filters(Memory, [CAR])
+    track = memory["track"]
+    for k, angle in enumerate((0.1, 0.1, math.nan, -0.3, 9.0, 0.0)):
+        sample = np.zeros(len(CHANNELS))
+        sample[S.DELTA] = angle
+        take(track, memory["row"], 0.01 * k + (1.0 if k > 4 else 0.0), sample)
+        for turned, inputs in ((track["turned"], track["use"]), (track["turned_before"], track["before"])):
+            delta = inputs[S.DELTA : S.DELTA + 4]
+            assert turned == pytest.approx(np.stack([np.cos(delta), np.sin(delta)]), abs=1e-15)
+    assert track["use"][S.DELTA] == 0.0
