@@ -61,9 +61,10 @@ class EstimatorBank:
         """
         count = len(self._filters)
         t, signals = checked(t, signals, closes, count)
-        told, visits, evidence = np.empty((*t.shape, self._tells)), self._nowhere, None
+        samples, visits, evidence = t.shape[0], self._nowhere, None
+        told = np.empty((samples, count, self._tells))
         if visits and closes is not None:
-            evidence = np.full((*t.shape, BINS), np.nan)
+            evidence = np.full((samples, count, BINS), np.nan)
             visits = np.ascontiguousarray(closes, np.bool_), evidence
         if threads == 1:
             self._entered(self._filters, self._desks, t, signals, told, *visits, 0, 0, count)

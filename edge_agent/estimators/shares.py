@@ -15,6 +15,7 @@ from schemas.numeric import BoolArray, FloatArray
 from schemas.signals import CHANNELS
 
 CHANNEL_COUNT = len(CHANNELS)
+DOUBLE = np.dtype(np.float64)
 
 
 def checked(t: FloatArray, signals: FloatArray, closes: BoolArray | None, count: int) -> tuple[FloatArray, FloatArray]:
@@ -23,7 +24,7 @@ def checked(t: FloatArray, signals: FloatArray, closes: BoolArray | None, count:
     Raises:
         InputError: shapes do not agree with the bank or with each other.
     """
-    t, signals = np.ascontiguousarray(t, np.float64), np.ascontiguousarray(signals, np.float64)
+    t, signals = np.ascontiguousarray(t, DOUBLE), np.ascontiguousarray(signals, DOUBLE)
     shape = t.shape
     if len(shape) != 2 or shape[1] != count:
         raise InputError("t", f"shape {shape} for a bank of {count}", "give (T, N)")
