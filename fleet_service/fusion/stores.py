@@ -30,6 +30,7 @@ from schemas.numeric import IntArray
 
 _NOTHING = np.zeros(0, np.int32)
 _HOUR = 3600
+_AHEAD = 120  # s; a checkpoint with little lateness may be ahead of the clock by the rest of an epoch
 
 
 class Stores:
@@ -160,7 +161,7 @@ class Stores:
         if hour != self.hour:
             self.hour = hour
             self._rebuild_pairs(hour - int(c.FORGOTTEN_S), 0)
-            self._rebuild_voices(hour - _HOUR)
+            self._rebuild_voices(hour - _HOUR - _AHEAD)
 
     def _rebuild_pairs(self, least: int, most: int) -> None:
         """Drop pairs last heard before `least` [s], and make room for `most`."""
