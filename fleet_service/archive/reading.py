@@ -78,7 +78,8 @@ def _inbox(
 ) -> list[tuple[Path, pa.Table]]:
     for _ in range(_TURNS):
         try:
-            loaded = [(path, load(path, columns, where)) for path in segments.paths(root, kind) if new(path)]
+            paths = [path for path in segments.paths(root, kind) if new(path)]
+            loaded = [(path, load(path, columns, where, whole=True)) for path in paths]
         except FileNotFoundError:  # compacted meanwhile
             continue
         return [(path, table) for path, table in loaded if table is not None]
@@ -122,20 +123,27 @@ def sources_of(path: Path) -> set[str]:
     return {layout.segment_name(prefix, number) for prefix, first, last in runs for number in range(first, last + 1)}
 
 
-def load(path: Path, columns: list[str] | None = None, where: pc.Expression | None = None) -> pa.Table | None:
+def load(
+    path: Path, columns: list[str] | None = None, where: pc.Expression | None = None, *, whole: bool = False
+) -> pa.Table | None:
     """Rows of one file; None if any byte of them is not what was written: it is set aside then, and said so.
+
+    Only the columns wanted are looked at, unless it is read `whole`.
 
     Raises:
         FileNotFoundError: it is gone.
         OSError: the system cannot read.
     """
+    read = None if whole else columns
     try:
         if where is not None and pq.read_metadata(path).num_row_groups > 1:
             options: dict[str, Any] = {"filters": where, "partitioning": None}
-            return _sound(pq.read_table(path, columns=columns, page_checksum_verification=True, **options), columns)
-        with pq.ParquetFile(path, page_checksum_verification=True) as file:  # for many small files half of read_table
-            table = _sound(file.read(columns), columns)
-            return table if where is None else table.filter(where)
+            table = _sound(pq.read_table(path, columns=read, page_checksum_verification=True, **options), columns)
+        else:
+            with pq.ParquetFile(path, page_checksum_verification=True) as file:  # for small files half of read_table
+                table = _sound(file.read(read), columns)
+            table = table if where is None else table.filter(where)
+        return table.select(columns) if whole and columns is not None else table
     except MemoryError:
         raise
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
