@@ -32,6 +32,7 @@ bank.advance(block.t[:1], block.signals[:1])
 """
 LOOK_S = 0.05
 LIVE_S = 20.0
+WARM_S = 1.0  # of a run that only fills the cache of compiled code
 START_S = 5.0  # of a run that only pays for its start
 FLEET, FLEET_RATE_HZ, FLEET_S = 100, 50, 20.0
 LOGS, LOG_S = 16, 60.0
@@ -105,6 +106,7 @@ def live(folder: Path, endpoint: str) -> list[Figure]:
     """One vehicle at 100 Hz: CPU between a short and a long run, so that the start does not count."""
     log, vehicle = drive(folder, "live", 0, START_S + LIVE_S + 1.0)
     words = ("run", "--source", str(log), "--vehicle", str(vehicle), "--name", "bench-car", "--duration")
+    used(folder, endpoint, *words, str(WARM_S))
     short, _ = used(folder, endpoint, *words, str(START_S))
     long, memory = used(folder, endpoint, *words, str(START_S + LIVE_S))
     return [
@@ -116,6 +118,7 @@ def live(folder: Path, endpoint: str) -> list[Figure]:
 def fleet(folder: Path, endpoint: str) -> list[Figure]:
     """How many vehicles a core carries in real time: plant, estimator, publishing; the CPU of a whole fleet says it."""
     words = ("fleet", "--rate", str(FLEET_RATE_HZ), "--vehicles", str(FLEET), "--duration")
+    used(folder, endpoint, *words, str(WARM_S))
     short, _ = used(folder, endpoint, *words, str(START_S))
     long, _ = used(folder, endpoint, *words, str(START_S + FLEET_S))
     return [
