@@ -9,7 +9,7 @@ import numpy as np
 from fleet_service.alerts import Alerts
 from fleet_service.fusion import Fusion, Observations
 from fleet_service.fusion.constants import EPOCH_NS
-from fleet_service.fusion.likelihoods import at_least
+from fleet_service.fusion.likelihoods import at_least, levelled
 from fleet_service.fusion.shape import unshaped
 from fleet_service.fusion.space import shares
 from fleet_service.map_state import cell_table
@@ -26,6 +26,7 @@ def warm_up() -> None:
         Alerts(fusion).folded(fusion.fold(o).slots)
         fusion.slots_of(o.cell, o.sector)
     at_least(np.zeros(1))
+    levelled(np.zeros((1, mugrid.BINS), np.uint8), np.zeros(1))
     shares(np.ones(1), np.ones(1))
     cell_table(fusion, np.arange(2), 10 * EPOCH_NS)
 

@@ -9,6 +9,7 @@ Legend
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,7 +20,7 @@ from fleet_service.fusion import constants as c
 from fleet_service.fusion.normal import log_distribution
 from fleet_service.fusion.shape import Told, unshaped
 from schemas import mugrid
-from schemas.numeric import BoolArray, ByteArray, FloatArray
+from schemas.numeric import BoolArray, ByteArray, FloatArray, compiled
 
 _QUANTILE_95 = 1.6448536269514722  # of the standard normal: what lies between median and 95 %
 
@@ -36,7 +37,7 @@ def evidence(columns: Mapping[str, NDArray[Any]], told: BoolArray) -> Told:
     mu_utilised" remains. A visit with none of them is flat.
     """
     sent = columns["log_likelihood"]
-    taken, said = unshaped(sent - sent.min(axis=1, keepdims=True), columns["mu_utilised"])
+    taken, said = unshaped(sent, columns["mu_utilised"])
     out = levelled(taken, columns["mu_utilised"])
     rest = np.flatnonzero(~told)
     if len(rest):
@@ -54,14 +55,20 @@ def levelled(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
 
     A bound is made flat above `used`. A value stays as it is, and so does everything where `used` is NaN.
     """
-    known = ~np.isnan(used)
-    level = np.nan_to_num(used)
-    above = level[:, None] <= mugrid.CENTRES
-    bound = steps[:, -1] < c.VALUE_DROP_STEPS
-    place = np.clip(np.searchsorted(mugrid.EDGES, level) - 1, 0, mugrid.BINS - 1)[:, None]
-    floor = np.take_along_axis(np.minimum.accumulate(steps, axis=1), place, axis=1)
-    flat = np.where(above, 0, np.maximum(steps, floor) - floor)
-    return np.where((known & bound)[:, None], flat, steps).astype(np.uint8)
+    out = steps.copy()
+    _level(out, np.asarray(used, np.float64))
+    return out
+
+
+@compiled
+def _level(steps: ByteArray, used: FloatArray) -> None:
+    for n in range(len(steps)):
+        if math.isnan(used[n]) or steps[n, mugrid.BINS - 1] >= c.VALUE_DROP_STEPS:
+            continue
+        place = min(max(np.searchsorted(mugrid.EDGES, used[n]) - 1, 0), mugrid.BINS - 1)
+        floor = steps[n, : place + 1].min()
+        for i in range(mugrid.BINS):
+            steps[n, i] = 0 if used[n] <= mugrid.CENTRES[i] else max(steps[n, i], floor) - floor
 
 
 def at_least(used: FloatArray) -> FloatArray:
