@@ -41,9 +41,11 @@ def keep_small(*without: str) -> None:
     Arrow loads pandas, where that is installed, to look whether what it is handed is a data frame: half a second, and
     30 MB for good. The linear algebra behind numpy starts a thread a core, which wait for each other by turning: on
     products as small as ours they double the processor time. And the allocator learns from the first large array that
-    is given back to keep the next ones, among which small things stay behind: a tenth of a gigabyte.
+    is given back to keep the next ones, among which small things stay behind: a tenth of a gigabyte. Arrow's own
+    allocator keeps some for each thread that ever used it.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     with suppress(AttributeError, OSError):  # where it is another allocator than glibc's
         ctypes.CDLL(None).mallopt(_MMAP_THRESHOLD, _LARGE)
     sys.meta_path.insert(0, _Without({"pandas", *without}))

@@ -20,7 +20,8 @@ def test_arrow_reads_and_hands_out_numbers_where_pandas_is_kept_out() -> None:
     words = (
         "import sys; from schemas.operator import keep_small; keep_small(); import pyarrow as pa, numpy as np\n"
         "assert pa.array([1.5, None]).to_numpy(zero_copy_only=False)[0] == 1.5\n"
-        "assert pa.array(np.array([2])).to_pylist() == [2]; assert 'pandas' not in sys.modules"
+        "assert pa.array(np.array([2])).to_pylist() == [2]; assert 'pandas' not in sys.modules\n"
+        "assert pa.default_memory_pool().backend_name == 'system'"
     )
     assert subprocess.run([sys.executable, "-W", "error", "-c", words], check=False).returncode == 0
 
