@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -14,11 +18,27 @@ from fleet_service.fusion.shape import unshaped
 from fleet_service.fusion.space import shares
 from fleet_service.map_state import cell_table
 from schemas import mugrid
+from schemas.numeric import kernel_cache
 
 CELLS: Final = 1 << 14  # more than a map has room for at first
+COMPILE: Final = "from fleet_service.warm import live; live()"
+DONE: Final = "fleet_service.compiled"  # in the cache, once all of it is there
 
 
 def warm_up() -> None:
+    """Load the kernels. If they were never compiled, a process of its own does it: the compiler leaves a hundred
+    megabytes of holes, into which a service would grow for hours."""
+    done = Path(kernel_cache("fleet_service")) / DONE
+    if not done.exists():
+        beside = subprocess.run([sys.executable, "-c", COMPILE], stderr=subprocess.DEVNULL, check=False)
+        if beside.returncode == 0:
+            with suppress(OSError):  # then it is looked for again at the next start
+                done.parent.mkdir(parents=True, exist_ok=True)
+                done.touch()
+    live()
+
+
+def live() -> None:
     """Take a throw-away map through its life: fold, grow, advance, fold late within the window, settle, believe."""
     fusion = Fusion(2 * EPOCH_NS * 1e-9)
     for epoch, cells in ((1, 2), (2, CELLS), (1, 2), (9, 2)):

@@ -101,7 +101,7 @@ def _compile(
     function: Callable[P, R], *, nogil: bool = False, forceinline: bool = False, references: bool = True
 ) -> Callable[P, R]:  # fmt: skip
     if "NUMBA_CACHE_DIR" not in os.environ:
-        numba.config.CACHE_DIR = _kernel_cache(function.__module__.partition(".")[0])  # type: ignore[attr-defined]
+        numba.config.CACHE_DIR = kernel_cache(function.__module__.partition(".")[0])  # type: ignore[attr-defined]
     options: dict[str, Any] = {"nogil": nogil, "forceinline": forceinline, "_nrt": references}
     kernel = numba.njit(cache=True, error_model="numpy", **options)(function)
     kernel._cache = _Cache(function)  # type: ignore[no-untyped-call] # no public way
@@ -118,7 +118,7 @@ class _Cache(FunctionCache):
 
 
 @functools.cache
-def _kernel_cache(package: str) -> str:
+def kernel_cache(package: str) -> str:
     """Folder of a package's compiled kernels, in the user's cache, named by a digest of the sources.
 
     Numba's own cache looks only at the file of a kernel and not at those that it calls or takes constants from, and

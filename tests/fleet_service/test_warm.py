@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
+
+import pytest
+
+from fleet_service import warm
 
 SCRIPT = """
 import gc, pathlib, tempfile, time
@@ -51,3 +56,16 @@ print(sorted(kernels() - warm))
 def test_a_ready_service_compiles_nothing() -> None:
     heard = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False)
     assert heard.stdout.strip() == "[]", heard.stdout + heard.stderr
+
+
+def test_what_was_never_compiled_is_compiled_by_a_process_of_its_own_and_once(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    ran = tmp_path / "ran"
+    monkeypatch.setattr(warm, "kernel_cache", lambda package: str(tmp_path / package))
+    monkeypatch.setattr(warm, "COMPILE", "raise SystemExit(1)")
+    warm.warm_up()
+    monkeypatch.setattr(warm, "COMPILE", f"open({str(ran)!r}, 'a').write('once')")
+    for _ in range(3):
+        warm.warm_up()
+    assert ran.read_text() == "once"

@@ -166,12 +166,12 @@ def test_a_reader_that_is_overtaken_begins_again(tmp_path: Path, monkeypatch: py
     whole = identities(tmp_path, Kind.OBSERVATION)
     load, loaded = reading.load, []
 
-    def overtaken(path: Path, *args: object) -> pa.Table | None:
+    def overtaken(path: Path, *args: object, **named: object) -> pa.Table | None:
         loaded.append(path)
         if len(loaded) == 2:
             monkeypatch.setattr(reading, "load", load)
             compact(tmp_path)
-        return load(path, *args)  # type: ignore[arg-type]
+        return load(path, *args, **named)  # type: ignore[arg-type]
 
     monkeypatch.setattr(reading, "load", overtaken)
     assert identities(tmp_path, Kind.OBSERVATION) == whole
