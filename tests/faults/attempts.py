@@ -180,6 +180,7 @@ def declared_publisher_on_another_key(ground: Ground) -> bool:
 @attempt
 def wildcard_put_on_ones_own_name(ground: Ground) -> bool:
     session = ground.open(ROGUE, ROUTERS[1])
+    ground.judged()  # else the refusals of attacks before it are counted as its own
     before, refused = ground.admitted, ground.service.engine.counts["refused.key"]
     payload = wire.encode(batch(ROGUE, 1, 0, [0.1]))
     session.put(f"{keys.ROOT}/obs/*/*/*/{ROGUE}", payload, encoding=wire.ENCODING[wire.Kind.OBSERVATION])
@@ -190,6 +191,7 @@ def wildcard_put_on_ones_own_name(ground: Ground) -> bool:
 @attempt
 def another_name_within_ones_own_key(ground: Ground) -> bool:
     session = ground.open(ROGUE, ROUTERS[1])
+    ground.judged()
     before = ground.admitted
     payload = wire.encode(batch(HONEST, 10**6, 0, [0.1]))
     session.put(key(ROGUE), payload, encoding=wire.ENCODING[wire.Kind.OBSERVATION])

@@ -1,7 +1,9 @@
 """The ground of the attacks: two routers with TLS and access list, a running service, honest parties, and ears.
 
 Nothing is waited for by sleeping. Samples of one priority keep their order on each way, so that a marker which is put
-after an attack has gone through, and is heard, shows that nothing of the attack is still to come.
+after an attack has gone through, and is heard, shows that nothing of the attack is still to come. What has reached the
+service waits there for its worker, which takes it in order: only a later batch that is acknowledged shows that it was
+judged and counted.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ import zenoh
 from fleet_service.service import Service
 from schemas import keys, wire
 from schemas.config import ServiceConfig
+from schemas.errors import WireError
 from tests.fleet_service.examples import SECOND, TILE, batch, key
 from tests.secured import READER, ROUTERS, SERVICE, VEHICLES, Network, settings
 from tests.waiting import matched, until
@@ -70,21 +73,36 @@ class Ground:
 
     def drive(self, session: zenoh.Session | None = None, name: str = HONEST) -> None:
         """Put a good batch of one observation until the service has it on disk, as a spool does."""
-        before, self._seq = self.monitor_acks(name), self._seq + 1
+        self._seq += 1
         sent = batch(name, self._seq, time.time_ns() - SECOND, [0.8])
         session = session or self.honest.session
 
         def settled() -> bool:
             session.put(key(name), wire.encode(sent), encoding=wire.ENCODING[sent.kind])
             with suppress(TimeoutError):
-                until(lambda: self.monitor_acks(name) > before, RESEND_S)
-            return self.monitor_acks(name) > before
+                until(lambda: self._durable(sent), RESEND_S)
+            return self._durable(sent)
 
         until(settled)
 
-    def monitor_acks(self, name: str) -> int:
-        """Acknowledgements for a vehicle so far."""
-        return sum(told == keys.ack_key(name) for told, _, _ in list(self.monitor.heard))
+    def _durable(self, sent: wire.Batch) -> bool:
+        """Whether this very batch was acknowledged.
+
+        What else lies on the key counts for nothing: the acknowledgement of a batch before that was sent twice, or one
+        that an attack forged.
+        """
+        for place, _, payload in list(self.monitor.heard):
+            if place == keys.ack_key(sent.vehicle):
+                with suppress(WireError):
+                    _, streams = wire.decode_ack(payload)
+                    durable = [reach for stream in streams if stream.boot == sent.boot for reach in stream.durable]
+                    if any(first <= sent.seq <= last for first, last in durable):
+                        return True
+        return False
+
+    def judged(self) -> None:
+        """Return when the service has judged and counted everything that reached it before."""
+        self.drive()
 
     def passed(self, session: zenoh.Session, *ears: Ears) -> None:
         """Return when everything that `session` did has gone through and the ears heard what it brought."""
