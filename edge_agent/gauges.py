@@ -7,7 +7,7 @@ from typing import Final
 
 from edge_agent.agent import Progress
 from edge_agent.publisher import Publisher
-from schemas.monitor import Metric, gauge
+from schemas.runtime.metrics import Metric, gauge
 from schemas.wire import Kind
 
 BEHIND_S: Final = 1.0  # of real time, from which on the agent is too slow for its vehicles

@@ -12,7 +12,7 @@ import zenoh
 from edge_agent.spool import Held
 from schemas import keys
 from schemas.config import ZenohSettings
-from schemas.transport import open_session
+from schemas.runtime.zenoh_session import open_session
 from schemas.wire import ENCODING, Kind
 
 log = logging.getLogger(__name__)

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from edge_agent.visits import NOWHERE, Located
 from schemas import mugrid
 from schemas.config import AgentConfig
-from schemas.numeric import BoolArray, FloatArray, IntArray, compiled
+from schemas.numeric import BoolArray, FloatArray, IntArray
+from schemas.runtime.jit import compiled
 from schemas.wire import Columns, Kind, column_types
 
 if TYPE_CHECKING:

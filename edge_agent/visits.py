@@ -14,7 +14,8 @@ from typing import Final
 import numpy as np
 
 from schemas import grid
-from schemas.numeric import BoolArray, FloatArray, IntArray, compiled
+from schemas.numeric import BoolArray, FloatArray, IntArray
+from schemas.runtime.jit import compiled
 from schemas.signals import S
 
 FIX_HELD_S: Final = 1.0  # a 10 Hz receiver that misses ten fixes is lost; at 15 m/s the next cell has been reached

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Iterator
 from typing import Final
 
 from fleet_service.streams import BatchId, Stream
-from schemas.decoding import Head
 from schemas.wire import Kind, StreamAck, encode_ack
+from schemas.wire.batches import Head
 
 # A message is never larger than its receiver reads (wire.MAX_BYTES): 16 streams of 24 refusals of 150 bytes.
 STREAMS_PER_ACK: Final = 16

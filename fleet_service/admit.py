@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas import grid, keys
-from schemas.decoding import Heads
 from schemas.errors import InputError
 from schemas.numeric import IntArray
 from schemas.wire import Columns, Kind
+from schemas.wire.batches import Heads
 
 BATCH: Final = -1  # row number of a refusal that concerns the batch as a whole
 MAX_VISIT_NS: Final = 86_400_000_000_000  # a car may park in its cell for a day

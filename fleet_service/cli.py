@@ -18,7 +18,7 @@ from fleet_service.analytics import cli as analytics_cli
 from fleet_service.archive import cli as archive_cli
 from fleet_service.enrolment import command
 from schemas.errors import InputError
-from schemas.operator import keep_small, log_as, teller
+from schemas.runtime.process import limit_memory, line_logger, log_as
 
 SWITCH_S = 0.0005  # after which a busy worker lets an answer go first; ten times that is Python's own
 # 25 MB that a running service's libraries load where they find them: for matrix products in kernels, of which there are
@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = _parser().parse_args(argv)
     if argv is None and arguments.command is _run:
-        keep_small(*UNUSED)
+        limit_memory(*UNUSED)
     try:
         return int(arguments.command(arguments))
     except InputError as error:
@@ -99,7 +99,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.weather is not None:
         config = config.model_copy(update={"weather": arguments.weather})
     try:
-        say = teller(config.log, sys.stdout, service=config.name)
+        say = line_logger(config.log, sys.stdout, service=config.name)
         service = Service(config, arguments.archive, say)
     except OSError as error:
         problem = f"cannot use {error.filename} ({error.strerror})"
@@ -150,7 +150,7 @@ def _watch(arguments: argparse.Namespace) -> int:
 
 def _evaluate(arguments: argparse.Namespace) -> int:
     from fleet_service.evaluation import campaign
-    from schemas import figures
+    from schemas.runtime import figures
 
     drive = None if arguments.skip_whole_way else campaign.whole_way_of(arguments.quick)
     try:

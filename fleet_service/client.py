@@ -12,11 +12,12 @@ from typing import Final
 import pyarrow as pa
 import zenoh
 
-from schemas import grid, keys, query, tables, transport, wire
+from schemas import grid, keys, query, tables, wire
 from schemas.config import ServiceConfig, ZenohSettings, load
 from schemas.errors import InputError
 from schemas.query import Format
-from schemas.tiles import decode_tile
+from schemas.runtime import zenoh_session
+from schemas.wire.tile import decode_tile
 
 TIMEOUT_S: Final = 10.0
 SHOWN: Final = ("latitude", "longitude", "sector", "mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehicles",
@@ -59,7 +60,7 @@ def ask(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
 
 def _session(connection: ZenohSettings) -> zenoh.Session:
     try:
-        return zenoh.open(transport.configuration(connection))
+        return zenoh.open(zenoh_session.configuration(connection))
     except zenoh.ZError as error:
         raise InputError("connect", f"no router at {connection.connect}", "start one, or name its endpoint") from error
 
@@ -132,7 +133,7 @@ def watch(connection: ZenohSettings, bbox: str | None, stop: threading.Event, sa
         if near(str(sample.key_expr)) is not None:
             say(_alert_line(wire.decode_alert(sample.payload.to_bytes())))
 
-    session = transport.open_session(connection, stop)
+    session = zenoh_session.open_session(connection, stop)
     if session is None:
         return
     with session:

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 from fleet_service.archive import segments
 from fleet_service.engine import Engine
 from schemas.config import ServiceConfig
-from schemas.monitor import Metric, gauge
+from schemas.runtime.metrics import Metric, gauge
 from schemas.wire import Kind
 
 STALLED_S: Final = 5.0  # without a turn of the worker, which takes milliseconds

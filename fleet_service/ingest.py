@@ -23,10 +23,11 @@ from fleet_service.archive.pseudonyms import Pseudonyms, number, texts
 from fleet_service.archive.segments import Rows, stepped
 from fleet_service.limits import Limits
 from fleet_service.streams import BatchId, Stream, Streams
-from schemas.decoding import Decoded, Head, Heads, decode_many
 from schemas.grid import cell_of
 from schemas.numeric import BoolArray, IntArray
+from schemas.runtime.batch_decoder import decode_many
 from schemas.wire import Kind
+from schemas.wire.batches import Decoded, Head, Heads
 
 FIRST_TIME: Final = {Kind.OBSERVATION: "enter_time", Kind.STATE: "time"}  # by which a batch is too old
 # Of a turn of the worker, so that a flood does not delay alerts, answers and segments by more than a moment. Most of
@@ -236,7 +237,7 @@ class Intake:
 
 def _chosen(found: Decoded, places: list[int]) -> tuple[Rows, Heads, IntArray]:
     """Rows, heads and sizes of the batches at these places, which are in order."""
-    rows: Rows = {**found.columns, "told": found.told}
+    rows: Rows = {**found.columns, "told": found.with_likelihood}
     if len(places) == len(found.sizes):
         return rows, found.heads, found.sizes
     kept = np.zeros(len(found.sizes), bool)

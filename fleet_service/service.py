@@ -26,11 +26,12 @@ from fleet_service.limits import Limits
 from fleet_service.replies import Replies
 from fleet_service.upkeep import archive_jobs, upkeep
 from fleet_service.weather import Heard
-from schemas import grid, keys, transport, wire
+from schemas import grid, keys, wire
 from schemas.config import ServiceConfig, load
-from schemas.monitor import serving
-from schemas.operator import Line
 from schemas.query import MapQuery
+from schemas.runtime import zenoh_session
+from schemas.runtime.metrics import serving
+from schemas.runtime.process import Line
 from schemas.wire import Alert, Kind
 
 IDLE_S: Final = 0.05  # longest wait for a message; bounds how late a segment or a tile can be
@@ -67,7 +68,7 @@ class Service:
         """Serve until `stop` is set; then flush, acknowledge and leave."""
         try:
             with self._seen() as address:
-                session = transport.open_session(self._config.zenoh, stop, self._config.name)
+                session = zenoh_session.open_session(self._config.zenoh, stop, self._config.name)
                 if session is not None:
                     self._serve(session, stop, f", {address}" if address else "")
         finally:

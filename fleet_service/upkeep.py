@@ -19,7 +19,7 @@ from fleet_service.archive.retention import retire
 from fleet_service.engine import Engine
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
-from schemas.operator import give_back
+from schemas.runtime.process import trim_memory
 from schemas.wire import Kind
 
 ROUND_ROWS: Final = 250_000  # of one round of compaction: a second of work, 150 MB
@@ -119,6 +119,6 @@ def _keep(jobs: Sequence[Job], counts: Counter[str], say: Callable[[str], None],
         except (OSError, InputError) as error:
             counts[f"{job.name}_failures"] += 1
             line = f"{job.name} failed: {error}"
-        give_back()
+        trim_memory()
         if line:
             say(line)

@@ -18,7 +18,7 @@ from fleet_service.fusion.shape import unshaped
 from fleet_service.fusion.space import shares
 from fleet_service.map_state import cell_table
 from schemas import mugrid
-from schemas.numeric import kernel_cache
+from schemas.runtime.jit import kernel_cache
 
 CELLS: Final = 1 << 14  # more than a map has room for at first
 COMPILE: Final = "from fleet_service.warm import live; live()"

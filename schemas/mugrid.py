@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.numeric import ByteArray, FloatArray, compiled
+from schemas.numeric import ByteArray, FloatArray
 
 BINS: Final = 32
 LOWER: Final = 0.05
@@ -41,25 +41,14 @@ def quantiles(probability: NDArray[np.floating[Any]], q: float) -> FloatArray:
         (…,) values in [LOWER, UPPER].
     """
     p = np.asarray(probability, dtype=np.float64)
-    return _quantiles(np.ascontiguousarray(p).reshape(-1, BINS), float(q)).reshape(p.shape[:-1])
-
-
-@compiled
-def _quantiles(p: FloatArray, q: float) -> FloatArray:
-    out = np.empty(len(p))
-    width = (UPPER - LOWER) / BINS
-    for row in range(len(p)):
-        total = 0.0
-        for i in range(BINS):
-            total += p[row, i]
-        target, below, bin_ = q * total, 0.0, 0
-        while bin_ < BINS - 1 and below + p[row, bin_] < target:
-            below += p[row, bin_]
-            bin_ += 1
-        mass = p[row, bin_]
-        share = (target - below) / mass if mass > 0.0 else 0.0
-        out[row] = LOWER + width * (bin_ + min(max(share, 0.0), 1.0))
-    return out
+    upto = np.cumsum(p, axis=-1)
+    target = q * upto[..., -1:]
+    place = np.minimum((upto < target).sum(axis=-1, keepdims=True), BINS - 1)
+    mass = np.take_along_axis(p, place, -1)
+    below = np.where(place > 0, np.take_along_axis(upto, np.maximum(place - 1, 0), -1), 0.0)
+    share = np.divide(target - below, mass, out=np.zeros_like(mass), where=mass > 0.0)
+    found: FloatArray = LOWER + (UPPER - LOWER) / BINS * (place + np.clip(share, 0.0, 1.0))
+    return found[..., 0]
 
 
 def encode_log_likelihood(log_likelihood: NDArray[np.floating[Any]]) -> ByteArray:

@@ -1,21 +1,10 @@
-"""Array types and the one way of compiling a kernel, shared by the packages."""
+"""Array types that the packages share."""
 
 from __future__ import annotations
 
-import functools
-import hashlib
-import os
-from collections.abc import Callable
-from contextlib import suppress
-from pathlib import Path
-from typing import Any, Final, ParamSpec, TypeAlias, TypeVar, cast
+from typing import TypeAlias
 
-import numba
 import numpy as np
-from llvmlite import ir  # type: ignore[import-untyped]
-from numba.core import cgutils, types
-from numba.core.caching import FunctionCache
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 FloatArray: TypeAlias = NDArray[np.float64]
@@ -23,110 +12,3 @@ Float32Array: TypeAlias = NDArray[np.float32]
 IntArray: TypeAlias = NDArray[np.int64]
 ByteArray: TypeAlias = NDArray[np.uint8]
 BoolArray: TypeAlias = NDArray[np.bool_]
-
-LINE: Final = 64  # bytes that a processor reads at once
-
-P = ParamSpec("P")
-R = TypeVar("R")
-
-
-def compiled(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile `function` with numba: cached on disk, no fast-math, IEEE division (x/0 is inf, not an exception).
-
-    Without fast-math and threads the result of a row does not depend on how many rows there are,
-    which is what makes a bank of N = 1 and of N = thousands bit-equal. Where the cache's disk is full, a kernel is
-    compiled at each start.
-    """
-    return _compile(function)
-
-
-def inlined(function: Callable[P, R]) -> Callable[P, R]:
-    """`compiled` into each of its callers: for a few lines of arithmetic in a loop, where a call costs more than they.
-
-    The optimiser then works on the four wheels side by side. Callers hand such functions numbers and tuples: what is
-    read from an array has to be read again after every write to another.
-    """
-    return _compile(function, forceinline=True)
-
-
-def released(function: Callable[P, R]) -> Callable[P, R]:
-    """`compiled`, and other Python threads run meanwhile: for long kernels that touch only what they are handed."""
-    return _compile(function, nogil=True)
-
-
-def lean(function: Callable[P, R]) -> Callable[P, R]:
-    """`released`, without counting references to arrays: two locked additions for each array at each call.
-
-    For functions that make no array and return none, so that all they touch belongs to the caller; what they call must
-    be lean too.
-    """
-    return _compile(function, nogil=True, references=False)
-
-
-def lean_inlined(function: Callable[P, R]) -> Callable[P, R]:
-    """`lean` into each of its callers: handing an array over a call costs seven words, and a vector its registers."""
-    return _compile(function, nogil=True, forceinline=True, references=False)
-
-
-def _asked(context: Any, array: Any, row: Any, line: Any) -> Any:  # noqa: ANN401, ARG001 numba's own types
-    def generate(target: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ANN401
-        kind, long, whole = signature.args[0], ir.IntType(64), ir.IntType(32)
-        data = target.make_array(kind)(target, builder, values[0])
-        place = [values[1], *[long(0)] * (kind.ndim - 1)]
-        begin = builder.ptrtoint(cgutils.get_item_pointer(target, builder, kind, data, place), long)  # type: ignore[no-untyped-call]
-        address = builder.inttoptr(builder.add(begin, builder.mul(values[2], long(LINE))), cgutils.voidptr_t)
-        hint = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, whole, whole, whole])
-        function = cgutils.get_or_insert_function(builder.module, hint, "llvm.prefetch.p0")  # type: ignore[no-untyped-call]
-        builder.call(function, [address, whole(0), whole(3), whole(1)])  # to read, into every cache, data
-        return target.get_dummy_value()
-
-    return types.void(array, types.int64, types.int64), generate
-
-
-# `ask(array, row, line)` in compiled code: let a LINE of `array[row]` come while the processor goes on. For arrays of
-# one or two dimensions; a hint, so that `row` may lie outside.
-ask = cast(Callable[[NDArray[Any], Any, int], None], intrinsic(_asked))
-
-
-def entry(kernel: Callable[P, R]) -> Callable[P, R]:
-    """The machine code of a compiled function that has been called, without numba's look at the arguments (.3 us).
-
-    Every argument must be of the kind that it had in that call: nobody checks it again.
-    """
-    made = next(iter(kernel.overloads.values()))  # type: ignore[attr-defined]
-    return cast(Callable[P, R], made.entry_point)
-
-
-def _compile(
-    function: Callable[P, R], *, nogil: bool = False, forceinline: bool = False, references: bool = True
-) -> Callable[P, R]:  # fmt: skip
-    if "NUMBA_CACHE_DIR" not in os.environ:
-        numba.config.CACHE_DIR = kernel_cache(function.__module__.partition(".")[0])  # type: ignore[attr-defined]
-    options: dict[str, Any] = {"nogil": nogil, "forceinline": forceinline, "_nrt": references}
-    kernel = numba.njit(cache=True, error_model="numpy", **options)(function)
-    kernel._cache = _Cache(function)  # type: ignore[no-untyped-call] # no public way
-    return cast(Callable[P, R], kernel)
-
-
-class _Cache(FunctionCache):
-    """Numba's own, but for a full disk: it raises there, and would take the process with it."""
-
-    def save_overload(self, sig: object, data: object) -> None:
-        """Save, if the disk lets us."""
-        with suppress(OSError):
-            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
-
-
-@functools.cache
-def kernel_cache(package: str) -> str:
-    """Folder of a package's compiled kernels, in the user's cache, named by a digest of the sources.
-
-    Numba's own cache looks only at the file of a kernel and not at those that it calls or takes constants from, and
-    would go on with what was compiled before a change. Old folders may be deleted at any time.
-    """
-    root, digest = Path(__file__).parents[1], hashlib.blake2b(digest_size=8)
-    for folder in (root / "schemas", root / package):
-        for path in sorted(folder.rglob("*.py")):
-            digest.update(path.read_bytes())
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return str(cache / "gripmap" / f"{package}-{digest.hexdigest()}")

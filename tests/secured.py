@@ -19,7 +19,7 @@ from fleet_service.enrolment.enrol import Registry, Terms
 from fleet_service.enrolment.fleet import Enrolment, Router
 from schemas import keys
 from schemas.config import ZenohSettings
-from schemas.transport import configuration
+from schemas.runtime.zenoh_session import configuration
 from tests.waiting import until
 
 SERVICE, READER, WEATHER, VEHICLES = "shard-0", "reader-0", "weather-0", ("sim-000", "sim-001")

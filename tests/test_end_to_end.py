@@ -16,7 +16,7 @@ from fleet_service.archive import reading
 from fleet_service.service import Service
 from schemas import mugrid
 from schemas.config import ServiceConfig, ZenohSettings
-from schemas.transport import open_session
+from schemas.runtime.zenoh_session import open_session
 from schemas.wire import Kind
 from tests.waiting import matched, until
 

@@ -14,7 +14,7 @@ from fleet_service.engine import Engine
 from fleet_service.ingest import Message
 from schemas import wire
 from schemas.config import ServiceConfig
-from schemas.figures import Figure
+from schemas.runtime.figures import Figure
 from schemas.wire import Batch
 from tests.faults.bars import BARS, figure
 from tests.faults.campaigns import CAMPAIGNS

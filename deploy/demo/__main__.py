@@ -19,9 +19,9 @@ from deploy.demo import compare, page, picture, processes
 from deploy.demo.listener import Listener
 from edge_agent.simulation.scenarios import scenario_named
 from fleet_service.archive.compaction import compact
-from schemas import figures
 from schemas.config import ZenohSettings
-from schemas.transport import open_session
+from schemas.runtime import figures
+from schemas.runtime.zenoh_session import open_session
 
 FOLDER = Path(".demo")
 TELL_S = 5.0

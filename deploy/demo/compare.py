@@ -14,8 +14,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_service.archive import reading
-from schemas.figures import Figure
 from schemas.numeric import BoolArray, FloatArray, IntArray
+from schemas.runtime.figures import Figure
 from schemas.wire import Alert, Kind
 
 EXCITED = 0.6

@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import math
 
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 
 LEAST_FACTOR = 0.8  # R holds model error too, which a calm stretch does not disprove
 LARGEST_FACTOR = 10.0

@@ -21,7 +21,8 @@ from typing import Final
 import numpy as np
 
 from schemas.errors import InputError
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 
 LEVELS: Final = {"PVS": 0.5, "PS": 0.7, "PSM": 1.0, "PM": 1.5, "PMB": 2.5, "PB": 4.0, "PVB": 8.0}
 PRINTED: Final = (

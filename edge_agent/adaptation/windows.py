@@ -7,7 +7,8 @@ The half is the departure that makes it right: of a normal variable E|e|^3 / E|e
 
 from __future__ import annotations
 
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 
 
 @compiled

@@ -52,10 +52,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
     from schemas.errors import InputError
-    from schemas.operator import keep_small
+    from schemas.runtime.process import limit_memory
 
     if argv is None and chosen in LIVE:
-        keep_small()
+        limit_memory()
     try:
         return int(args.run(args))
     except InputError as error:

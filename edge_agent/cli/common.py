@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from schemas.config import NAME_PATTERN, AgentConfig
 from schemas.errors import InputError
-from schemas.operator import Line, tell
+from schemas.runtime.process import Line, print_line
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -44,7 +44,7 @@ def publisher_of(names: Sequence[str], config: AgentConfig, estimator: str) -> P
     """
     from edge_agent.publisher import Publisher
     from edge_agent.spool import Spool
-    from schemas.transport import configuration
+    from schemas.runtime.zenoh_session import configuration
 
     for name in names:  # a bad setting, or a missing certificate, is to be an error here, not in a thread
         configuration(config.zenoh, name)
@@ -83,7 +83,7 @@ def leave(publisher: Publisher, progress: Progress, drain_s: float) -> None:
 
     clean = publisher.close(drain_s)
     if not clean:
-        tell("warning: a session did not close; leaving it behind", sys.stderr)
+        print_line("warning: a session did not close; leaving it behind", sys.stderr)
     print(json.dumps(summary(progress, publisher)), flush=True)
     if not clean:
         os._exit(0)

@@ -16,8 +16,8 @@ from edge_agent.pipeline import Pipeline
 from edge_agent.publisher import Publisher
 from edge_agent.sources import Block
 from schemas.config import AgentConfig
-from schemas.monitor import serving
-from schemas.operator import log_as, tell, teller
+from schemas.runtime.metrics import serving
+from schemas.runtime.process import line_logger, log_as, print_line
 from schemas.signals import CHANNELS
 from schemas.vehicle import Vehicle
 
@@ -53,11 +53,11 @@ def drive_live(
         ) as address,
     ):
         if address:
-            tell(f"metrics: {address}/metrics", sys.stderr)
+            print_line(f"metrics: {address}/metrics", sys.stderr)
         pipeline = Pipeline(bank_of(chosen, vehicles), len(vehicles), config)
         publisher = publisher_of(names, config, chosen)
         running.append(publisher)
-        report = partial(status, publisher=publisher, say=teller(config.log, sys.stderr))
+        report = partial(status, publisher=publisher, say=line_logger(config.log, sys.stderr))
         drive(blocks, pipeline, publisher, stop, report, duration_s=duration_s, progress=progress)
         at_end()
         leave(publisher, progress, STOPPED_DRAIN_S if stop.is_set() else ENDED_DRAIN_S)

@@ -12,7 +12,8 @@ import math
 
 from edge_agent.dynamics.parameters import P
 from edge_agent.dynamics.slip import wheel_position
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 
 
 @compiled

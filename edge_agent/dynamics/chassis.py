@@ -14,7 +14,8 @@ from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import Body, Four, P, body
 from edge_agent.dynamics.slip import slips, wheel_position
 from edge_agent.dynamics.tyres import combined_dugoff, combined_magic
-from schemas.numeric import FloatArray, compiled, inlined
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled, inlined
 
 DUGOFF = 0.0  # in place of a Magic Formula shape c, which is above 1
 

@@ -15,7 +15,8 @@ from __future__ import annotations
 
 import math
 
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 
 ELECTRIC_S = 0.125 / 0.688  # T_e, paper 002, table 1
 SLIDING_GAIN, SLIDING_RATE = 2000.0, 10.0  # k1, k2; not given

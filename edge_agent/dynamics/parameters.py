@@ -11,7 +11,8 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from schemas.numeric import FloatArray, inlined
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import inlined
 from schemas.vehicle import Vehicle
 
 GRAVITY = 9.81  # [m/s^2]

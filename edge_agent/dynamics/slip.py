@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 
 from edge_agent.dynamics.parameters import P
-from schemas.numeric import FloatArray, compiled, inlined
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled, inlined
 
 SLOWEST_M_S = 0.5  # slip's denominator is kept above it: near standstill slip has no meaning
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 
-from schemas.numeric import compiled, inlined
+from schemas.runtime.jit import compiled, inlined
 
 TINY = 1e-12  # below it a slip has no direction and no force
 

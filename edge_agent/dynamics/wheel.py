@@ -7,7 +7,7 @@ measurement, never an exact input (errata, what held up).
 
 from __future__ import annotations
 
-from schemas.numeric import compiled
+from schemas.runtime.jit import compiled
 
 
 @compiled

@@ -37,8 +37,9 @@ from edge_agent.estimators.gaussian.telling import (
     tell_rest,
     variance,
 )
-from schemas.numeric import FloatArray, compiled, released
-from schemas.records import Records, records
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled, nogil
+from schemas.runtime.records import Records, records
 from schemas.vehicle import Vehicle
 
 DRY = 0.85  # the friction that is set: the paper's first experiment
@@ -71,7 +72,7 @@ def bank(vehicles: Sequence[Vehicle], friction: float = DRY) -> EstimatorBank:
     return EstimatorBank(new_filters(Memory, vehicles), design, _advance)
 
 
-@released
+@nogil
 def _advance(
     filters: Records[Memory], desks: Records[Design], t: FloatArray, signals: FloatArray, tolds: FloatArray,
     share: int, first: int, last: int,

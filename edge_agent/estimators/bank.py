@@ -14,8 +14,9 @@ import numpy as np
 from edge_agent.estimators.estimates import ONE_FRICTION, Estimates
 from edge_agent.estimators.shares import checked, in_shares
 from schemas.mugrid import BINS
-from schemas.numeric import BoolArray, FloatArray, entry
-from schemas.records import RecordArray
+from schemas.numeric import BoolArray, FloatArray
+from schemas.runtime.jit import entry_point
+from schemas.runtime.records import RecordArray
 
 Kernel: TypeAlias = Callable[..., None]
 """kernel(filters, desks, t, signals, told, share, first, last), or with (closes, evidence) after told.
@@ -69,7 +70,7 @@ class EstimatorBank:
         if threads == 1:
             self._entered(self._filters, self._desks, t, signals, told, *visits, 0, 0, count)
             if self._entered is self._kernel:
-                self._entered = entry(self._kernel)  # `checked` sees to it that all arguments are of one kind
+                self._entered = entry_point(self._kernel)  # `checked` sees to it that all arguments are of one kind
             return Estimates(told, evidence)
         if threads > len(self._desks):
             self._desks = np.repeat(self._desks[:1], threads)

@@ -50,8 +50,9 @@ from edge_agent.estimators.gaussian.telling import (
 )
 from edge_agent.filters.sigma import cubature
 from edge_agent.filters.squareroot import deviations, predict, sigma_points, update, weighted_mean
-from schemas.numeric import FloatArray, compiled, released
-from schemas.records import Records, records
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled, nogil
+from schemas.runtime.records import Records, records
 from schemas.signals import S
 from schemas.vehicle import Vehicle
 
@@ -109,7 +110,7 @@ def bank(vehicles: Sequence[Vehicle], friction: float = DRY) -> EstimatorBank:
     return EstimatorBank(new_filters(Memory, vehicles), design, _advance)
 
 
-@released
+@nogil
 def _advance(
     filters: Records[Memory], desks: Records[Design], t: FloatArray, signals: FloatArray, tolds: FloatArray,
     share: int, first: int, last: int,

@@ -47,8 +47,9 @@ from edge_agent.estimators.gaussian.telling import (
 )
 from edge_agent.filters.columns import gather, look, spread
 from edge_agent.filters.squareroot import LOG_TWO_PI
-from schemas.numeric import FloatArray, compiled, released
-from schemas.records import Records, records
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled, nogil
+from schemas.runtime.records import Records, records
 from schemas.signals import S
 from schemas.vehicle import Vehicle
 
@@ -135,7 +136,7 @@ def bank(vehicles: Sequence[Vehicle], memberships: Memberships, setting: Setting
     return EstimatorBank(new_filters(Memory, vehicles), desk, _advance)
 
 
-@released
+@nogil
 def _advance(
     filters: Records[Memory], desks: Records[Desk], t: FloatArray, signals: FloatArray, tolds: FloatArray,
     share: int, first: int, last: int,

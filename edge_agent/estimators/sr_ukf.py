@@ -56,8 +56,9 @@ from edge_agent.filters.downdate import update_by_downdate
 from edge_agent.filters.sigma import unscented
 from edge_agent.filters.squareroot import deviations, predict, sigma_points, weighted_mean
 from schemas.mugrid import LOWER, UPPER
-from schemas.numeric import FloatArray, compiled, released
-from schemas.records import Nothing, Records, records
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled, nogil
+from schemas.runtime.records import Nothing, Records, records
 from schemas.signals import S
 from schemas.vehicle import Vehicle
 
@@ -97,7 +98,7 @@ def bank(vehicles: Sequence[Vehicle]) -> EstimatorBank:
     return EstimatorBank(new_filters(Memory, vehicles), records(Nothing, 1), _advance, tells=FOUR_FRICTIONS)
 
 
-@released
+@nogil
 def _advance(
     filters: Records[Memory], _desks: Records[Nothing], t: FloatArray, signals: FloatArray, tolds: FloatArray,
     _share: int, first: int, last: int,

@@ -11,8 +11,8 @@ import numpy as np
 from edge_agent.evaluation.campaign import DEFAULT, Results
 from edge_agent.evaluation.measures import COMPONENTS, bounds
 from edge_agent.evaluation.reliability import LEVELS, shares
-from schemas.figures import Figure
 from schemas.numeric import FloatArray
+from schemas.runtime.figures import Figure
 
 PRIOR_WIDTH: Final = 0.9 * 1.15  # of the 90 % interval of the uniform prior
 

@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.evaluation.bars import figures as figures_of
     from edge_agent.evaluation.campaign import run as campaign
     from edge_agent.evaluation.report import report
-    from schemas.figures import write
+    from schemas.runtime.figures import write
 
     count = args.seeds if args.seeds is not None else QUICK_SEEDS if args.quick else LEAST_SEEDS
     if count < 2:

@@ -13,7 +13,7 @@ from edge_agent.estimators import TUNED
 from edge_agent.evaluation.campaign import DEFAULT, Drive, Results
 from edge_agent.evaluation.measures import bounds, nees
 from edge_agent.tuning.tuned import shipped
-from schemas.figures import Figure
+from schemas.runtime.figures import Figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,7 +9,7 @@ from typing import Final
 from edge_agent.evaluation.faults import CASES
 from edge_agent.evaluation.printed import DEFAULT, OWN, PRINTED, WHY_NOT
 from edge_agent.evaluation.reliability import LEVELS
-from schemas.figures import Figure, markdown
+from schemas.runtime.figures import Figure, markdown
 
 PAPERS_HEAD: Final = """\
 ## The papers' figures

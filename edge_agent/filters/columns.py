@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import math
 
-from schemas.numeric import FloatArray, inlined
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import inlined
 
 
 @inlined

@@ -11,7 +11,8 @@ import math
 import numpy as np
 
 from edge_agent.filters.squareroot import LOG_TWO_PI, triangularize, update
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 
 LEAST_LEFT = 1e-12  # of the variance in the direction of v; below it rounding decides the sign
 

@@ -18,7 +18,8 @@ from __future__ import annotations
 import math
 
 from edge_agent.filters.squareroot import triangularize
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 
 
 @compiled

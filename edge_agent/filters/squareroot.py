@@ -17,7 +17,8 @@ from __future__ import annotations
 
 import math
 
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 
 LOG_TWO_PI = math.log(2.0 * math.pi)
 

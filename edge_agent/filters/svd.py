@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 
 
 @compiled

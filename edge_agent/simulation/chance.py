@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from schemas.errors import InputError
-from schemas.numeric import compiled
+from schemas.runtime.jit import compiled
 
 STEP: Final = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio, odd
 MULTIPLY_1: Final = np.uint64(0xBF58476D1CE4E5B9)

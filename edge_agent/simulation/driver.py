@@ -20,7 +20,8 @@ from edge_agent.simulation.chance import uniform
 from edge_agent.simulation.friction import F, look_up
 from edge_agent.simulation.plant import W, X, strongest_pull
 from edge_agent.simulation.roads import L
-from schemas.numeric import FloatArray, IntArray, compiled
+from schemas.numeric import FloatArray, IntArray
+from schemas.runtime.jit import compiled
 
 Lanes: TypeAlias = tuple[FloatArray, IntArray, IntArray, FloatArray, IntArray]
 """The arrays of a `Network`: points, first, size, spacing, ways."""

@@ -28,7 +28,8 @@ from edge_agent.simulation.roads import L, Network
 from edge_agent.simulation.scenarios import Scenario, scenario_named
 from edge_agent.simulation.sensors import Sensors, error_row, noise_keys, sense, sensors_named
 from schemas.errors import InputError
-from schemas.numeric import FloatArray, IntArray, compiled
+from schemas.numeric import FloatArray, IntArray
+from schemas.runtime.jit import compiled
 
 VEHICLE_STREAM = 0
 GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0  # multiples of it, modulo 1, are spread evenly however many there are

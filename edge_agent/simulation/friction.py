@@ -13,7 +13,8 @@ from enum import IntEnum
 import numpy as np
 
 from schemas.errors import InputError
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 
 # what the surfaces of the scenarios are made of: peak adhesion of a passenger-car tyre, middle of the usual ranges
 DRY, WET, SNOW, ICE = 0.90, 0.60, 0.35, 0.18

@@ -18,7 +18,8 @@ from edge_agent.simulation.chance import key_of, normal, uniform
 from edge_agent.simulation.place import Origin
 from edge_agent.simulation.plant import R
 from schemas.errors import InputError
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 from schemas.signals import CHANNELS, S
 
 KeyArray: TypeAlias = NDArray[np.uint64]

@@ -20,8 +20,8 @@ from edge_agent.tuning import colony, random_search
 from edge_agent.tuning.objectives import HELD_OUT, OBJECTIVES, TRAIN, Recorded, choices, objective_on, record, worth
 from edge_agent.tuning.search import Iteration, Objective, Progress, Result
 from edge_agent.tuning.tuned import WAYS, Budget, Comparison, Document, Provenance, Score, save
-from schemas import figures
 from schemas.errors import InputError
+from schemas.runtime import figures
 
 ESTIMATOR: Final = "aco-fckf"
 ANTS, ITERATIONS, DURATION_S = 12, 10, 6.0

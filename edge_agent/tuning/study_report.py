@@ -14,7 +14,7 @@ from edge_agent.tuning import study
 from edge_agent.tuning.search import Progress, Result
 from edge_agent.tuning.study import CONDITIONS, WAYS, Recorded, Worth, memberships_of, overall, worth
 from edge_agent.tuning.tuned import Score
-from schemas.figures import Figure
+from schemas.runtime.figures import Figure
 
 UNITS: Final = {"log_likelihood": "nat/s", "nis": "1", "rmse_vx": "m/s", "rmse_vy": "m/s", "rmse_yaw_rate": "rad/s"}
 TITLES: Final = {"right": "R right", "too-small": "ten times too small", "too-large": "ten times too large",

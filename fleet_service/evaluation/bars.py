@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Final, Literal, NamedTuple
 
-from schemas.figures import Figure
+from schemas.runtime.figures import Figure
 
 Side = Literal["less", "more", "within"]
 

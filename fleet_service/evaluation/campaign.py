@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 
 from fleet_service.evaluation import attacks, bars, changes, exact, fleets, plots, whole_way
-from schemas import figures
-from schemas.figures import Figure
+from schemas.runtime import figures
+from schemas.runtime.figures import Figure
 
 SEEDS, QUICK_SEEDS = 40, 1
 WHOLE_WAY_VEHICLES, WHOLE_WAY_S = 200, 60.0

@@ -11,9 +11,8 @@ from fleet_service.evaluation.drive import rows_of
 from fleet_service.evaluation.town import NS, START, Visits
 from fleet_service.ingest import Message
 from schemas import grid, keys, wire
-from schemas.decoding import decode
 from schemas.numeric import IntArray
-from schemas.wire import Batch, Kind
+from schemas.wire import Batch, Kind, decode
 
 BATCH_ROWS = 12  # the cells of one road
 

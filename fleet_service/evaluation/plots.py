@@ -9,7 +9,7 @@ from typing import Any
 from fleet_service.evaluation.bars import COUNTS
 from fleet_service.evaluation.rules import RULES
 from schemas.errors import InputError
-from schemas.figures import Figure
+from schemas.runtime.figures import Figure
 
 SIZE = (5.5, 4.2)
 

@@ -20,7 +20,8 @@ import numpy as np
 from fleet_service.evaluation.score import Scores, excited_vehicles, joined, of_intervals
 from fleet_service.evaluation.town import CELLS, Town, Visits
 from schemas import mugrid
-from schemas.numeric import FloatArray, IntArray, compiled
+from schemas.numeric import FloatArray, IntArray
+from schemas.runtime.jit import compiled
 
 RULES: Final = ("newest report", "inverse variance", "one per pass", "covariance intersection", "federated reset")
 SAMPLES: Final = 10  # posteriors that an agent at 10 Hz sends while it is in a cell

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from fleet_service.fusion import constants as c
 from schemas import mugrid
-from schemas.numeric import ByteArray, Float32Array, FloatArray, lean_inlined
+from schemas.numeric import ByteArray, Float32Array, FloatArray
+from schemas.runtime.jit import refcount_free_inlined
 
 PackedArray = NDArray[np.uint16]
 Bins = NDArray[np.floating[Any]]
@@ -86,7 +87,7 @@ def read(p: FloatArray) -> FloatArray:
     return np.asarray(road / road.sum(axis=1, keepdims=True))
 
 
-@lean_inlined
+@refcount_free_inlined
 def total(p: Bins) -> float:
     """Sum of 32 numbers, in eight strands: a single one waits for itself."""
     a, b, d, e, f, g, h, j = p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7]
@@ -102,7 +103,7 @@ def total(p: Bins) -> float:
     return ((a + f) + (b + g)) + ((d + h) + (e + j))  # type: ignore[no-any-return]
 
 
-@lean_inlined
+@refcount_free_inlined
 def largest(p: Bins) -> float:
     """Largest of 32 numbers, in eight strands."""
     a, b, d, e, f, g, h, j = p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7]
@@ -118,7 +119,7 @@ def largest(p: Bins) -> float:
     return max(max(max(a, b), max(d, e)), max(max(f, g), max(h, j)))  # type: ignore[no-any-return]
 
 
-@lean_inlined
+@refcount_free_inlined
 def unpack(belief: PackedArray, row: int, p: Bins) -> None:
     """p of a belief at rest."""
     whole = np.uint32(0)
@@ -129,7 +130,7 @@ def unpack(belief: PackedArray, row: int, p: Bins) -> None:
         p[i] = np.float32(belief[row, i]) * scale
 
 
-@lean_inlined
+@refcount_free_inlined
 def pack(p: Bins, belief: PackedArray, row: int) -> None:
     """Put a belief at rest; it need not be normalised. Rounding keeps a rising one rising and a uniform one uniform."""
     scale = np.float32(FULL) / np.float32(largest(p))
@@ -137,7 +138,7 @@ def pack(p: Bins, belief: PackedArray, row: int) -> None:
         belief[row, i] = np.uint16(np.float32(p[i]) * scale + np.float32(0.5))
 
 
-@lean_inlined
+@refcount_free_inlined
 def mix(p: Bins, change: float, prior: Float32Array) -> None:
     """p ← (1 - h)·p + h·prior, in place."""
     h = np.float32(change)
@@ -145,7 +146,7 @@ def mix(p: Bins, change: float, prior: Float32Array) -> None:
         p[i] += h * (prior[i] - p[i])
 
 
-@lean_inlined
+@refcount_free_inlined
 def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded: Bins) -> None:
     """Let time pass: diffusion over `drift_s` with reflecting ends, then the hazard of a change over `change_s`.
 
@@ -166,7 +167,7 @@ def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded
         mix(p, -math.expm1(-change_s / c.CHANGE_S), prior)
 
 
-@lean_inlined
+@refcount_free_inlined
 def doubt(p: Bins, change_s: float, power: float, prior: Float32Array) -> None:
     """Make up what `forget` over `change_s` lacks to CHANGE_LEAST, for a value of which `power` is new. In place."""
     lacking = c.CHANGE_LEAST * power + math.expm1(-max(change_s, 0.0) / c.CHANGE_S)
@@ -174,7 +175,7 @@ def doubt(p: Bins, change_s: float, power: float, prior: Float32Array) -> None:
         mix(p, lacking, prior)
 
 
-@lean_inlined
+@refcount_free_inlined
 def kind_of(evidence: ByteArray) -> int:
     """VALUE where the likelihood falls towards the upper end by more than senders differ; else BOUND."""
     least = np.uint8(255)
@@ -183,7 +184,7 @@ def kind_of(evidence: ByteArray) -> int:
     return VALUE if evidence[_BINS - 1] >= int(least) + c.VALUE_DROP_STEPS else BOUND
 
 
-@lean_inlined
+@refcount_free_inlined
 def spread(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> None:
     """L̃ of a visit into `out` (32), mean 1. The fall of a BOUND above its maximum is noise and is levelled.
 
@@ -207,7 +208,7 @@ def spread(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> None:
         out[i] *= scale
 
 
-@lean_inlined
+@refcount_free_inlined
 def vote(p: Bins, spread_likelihood: Bins, strength: float) -> None:
     """p ← p·(s·L̃ + 1 - s), in place and not normalised."""
     s, rest = np.float32(strength), np.float32(1.0 - strength)
@@ -215,7 +216,7 @@ def vote(p: Bins, spread_likelihood: Bins, strength: float) -> None:
         p[i] *= s * spread_likelihood[i] + rest
 
 
-@lean_inlined
+@refcount_free_inlined
 def mean_of(likelihood: Bins) -> float:
     """Mean of a likelihood of mean 1 against the uniform prior."""
     a, b, d, e = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
@@ -232,7 +233,7 @@ def mean_of(likelihood: Bins) -> float:
     return float(((a + f) + (b + g)) + ((d + h) + (e + j))) / _BINS
 
 
-@lean_inlined
+@refcount_free_inlined
 def describe(likelihood: Bins, mean: float) -> tuple[float, float]:
     """Standard deviation about `mean`, and P(slippery), of a likelihood of mean 1 against the uniform prior."""
     second, slippery = 0.0, 0.0

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from fleet_service.fusion.belief import FULL, PackedArray
 from schemas import mugrid
-from schemas.numeric import LINE, Float32Array, IntArray, lean, lean_inlined
+from schemas.numeric import Float32Array, IntArray
+from schemas.runtime.jit import LINE, refcount_free, refcount_free_inlined
 
 NONE: Final = -1
 NOBODY: Final = -1
@@ -79,7 +80,7 @@ def no_beliefs(rows: int) -> PackedArray:
     return rows_of_lines(rows, np.dtype(np.uint16), mugrid.BINS)
 
 
-@lean
+@refcount_free
 def begin(belief: PackedArray, cells: Records, slot: int, key: int) -> None:
     """A slot that holds the prior."""
     belief[slot] = FULL
@@ -88,7 +89,7 @@ def begin(belief: PackedArray, cells: Records, slot: int, key: int) -> None:
     cells[slot].voice = NONE
 
 
-@lean_inlined
+@refcount_free_inlined
 def copy_slot(
     belief: PackedArray, cells: Records, at: int, to_belief: PackedArray, to_cells: Records, to: int
 ) -> None:  # fmt: skip

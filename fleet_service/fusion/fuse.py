@@ -20,7 +20,8 @@ from fleet_service.fusion.votes import PADDED, SCRATCH, P
 from fleet_service.fusion.weather import Reports, Weather, aged, no_reports, weather_of
 from fleet_service.fusion.window import absorb, settle
 from schemas import grid
-from schemas.numeric import BoolArray, ByteArray, Float32Array, FloatArray, IntArray, compiled
+from schemas.numeric import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
+from schemas.runtime.jit import compiled
 
 SmallArray = NDArray[np.int8]
 _ANY = 1 << 62

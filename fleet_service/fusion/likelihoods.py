@@ -20,7 +20,8 @@ from fleet_service.fusion import constants as c
 from fleet_service.fusion.normal import log_distribution
 from fleet_service.fusion.shape import Told, unshaped
 from schemas import mugrid
-from schemas.numeric import BoolArray, ByteArray, FloatArray, compiled
+from schemas.numeric import BoolArray, ByteArray, FloatArray
+from schemas.runtime.jit import compiled
 
 _QUANTILE_95 = 1.6448536269514722  # of the standard normal: what lies between median and 95 %
 

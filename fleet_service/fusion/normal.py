@@ -7,7 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 
 _FAR: Final = -12.0  # below, the logarithm's series is better than a part in 10⁶, and its argument may not be held
 

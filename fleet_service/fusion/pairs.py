@@ -8,12 +8,13 @@ from fleet_service.fusion.belief import VALUE
 from fleet_service.fusion.cells import NONE, SECOND, Records
 from fleet_service.fusion.pools import PAIRS
 from fleet_service.fusion.table import AHEAD, pair_place
-from schemas.numeric import IntArray, ask, compiled, lean_inlined
+from schemas.numeric import IntArray
+from schemas.runtime.jit import compiled, prefetch, refcount_free_inlined
 
 _FIBONACCI = np.uint64(0x9E3779B97F4A7C15)  # 2⁶⁴ over the golden ratio: its multiples lie far apart
 
 
-@lean_inlined
+@refcount_free_inlined
 def earlier(entries: Records, a: int, b: int) -> bool:
     """Whether entry `a` is folded before `b`: by time, then by identity."""
     if entries[a].time != entries[b].time:
@@ -25,7 +26,7 @@ def earlier(entries: Records, a: int, b: int) -> bool:
     return bool(entries[a].place < entries[b].place)
 
 
-@lean_inlined
+@refcount_free_inlined
 def pair_of(pairs: Records, used: IntArray, slot: int, vehicle: int) -> int:
     """Place of a pair; makes it where there is none."""
     pair = pair_place(pairs, slot, vehicle)
@@ -40,7 +41,7 @@ def pair_of(pairs: Records, used: IntArray, slot: int, vehicle: int) -> int:
     return pair
 
 
-@lean_inlined
+@refcount_free_inlined
 def chain(entries: Records, pairs: Records, pair: int, entry: int) -> None:
     """Put an entry among those of its vehicle in its window."""
     pairs[pair].waiting += 1
@@ -58,7 +59,7 @@ def chain(entries: Records, pairs: Records, pair: int, entry: int) -> None:
         entries[after].before = entry
 
 
-@lean_inlined
+@refcount_free_inlined
 def remember(entries: Records, pairs: Records, entry: int) -> None:
     """What an entry said becomes what its vehicle said before the checkpoint; later ones stand alone."""
     pair, kind = int(entries[entry].pair), int(entries[entry].kind)
@@ -74,7 +75,7 @@ def remember(entries: Records, pairs: Records, entry: int) -> None:
         entries[entries[entry].after].before = NONE
 
 
-@lean_inlined
+@refcount_free_inlined
 def _stays(pairs: Records, place: int, least: int) -> bool:
     """Whether a pair spoke since `least` [s], or waits in the window."""
     pair = pairs[place]
@@ -98,7 +99,7 @@ def moved(entries: Records, old: Records, new: Records, least: int) -> IntArray:
         end = min(begin + AHEAD, len(old))
         for place in range(begin, end):
             if old[place].slot != NONE and old[place].last != NONE:
-                ask(entries, old[place].last, 0)
+                prefetch(entries, old[place].last, 0)
         for place in range(begin, end):
             if old[place].slot == NONE:
                 continue
@@ -115,7 +116,7 @@ def moved(entries: Records, old: Records, new: Records, least: int) -> IntArray:
     return gone[:count]
 
 
-@lean_inlined
+@refcount_free_inlined
 def returning(number: int) -> np.uint64:
     """The bit of `Cells.returned` that a vehicle has."""
     return np.uint64(1) << ((np.uint64(number) * _FIBONACCI) >> np.uint64(58))

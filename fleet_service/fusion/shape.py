@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import SLIPPERY_SHARE, largest
 from schemas import mugrid
-from schemas.numeric import ByteArray, Float32Array, FloatArray, compiled, lean_inlined
+from schemas.numeric import ByteArray, Float32Array, FloatArray
+from schemas.runtime.jit import compiled, refcount_free_inlined
 
 _USED_STEP: Final = 0.02  # half a bin; of the grip used when a kernel is looked up
 _USED_MOST: Final = mugrid.UPPER
@@ -100,7 +101,7 @@ def _unshape(steps: ByteArray, used: FloatArray, said: Float32Array) -> None:
             steps[n, i] = np.uint8(min(below, _FLOOR))
 
 
-@lean_inlined
+@refcount_free_inlined
 def _ln(x: np.float32) -> np.float32:
     """Natural logarithm of a normal number, in arithmetic that takes many at once."""
     bits = np.float32(x).view(np.int32)

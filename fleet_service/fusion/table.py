@@ -15,7 +15,8 @@ import numpy as np
 
 from fleet_service.fusion.belief import PackedArray
 from fleet_service.fusion.cells import NONE, Records, begin
-from schemas.numeric import IntArray, ask, compiled, lean_inlined
+from schemas.numeric import IntArray
+from schemas.runtime.jit import compiled, prefetch, refcount_free_inlined
 
 LEAST: Final = 1024  # places of a new table
 ROWS_MOST: Final = 0.8  # share of the places that rows take: eight of them are a line, and probes cost little
@@ -25,7 +26,7 @@ _TAG: Final = 0x7FFFFFFF
 AHEAD: Final = 128  # rows whose memory is asked for before they are worked on, so that it comes for all at once
 
 
-@lean_inlined
+@refcount_free_inlined
 def _mixed(key: int | np.int64) -> np.uint64:
     """Hash of a key: mixing steps of the splitmix64 generator, so that every bit of it moves all."""
     h = np.uint64(key)
@@ -34,25 +35,25 @@ def _mixed(key: int | np.int64) -> np.uint64:
     return h ^ (h >> np.uint64(31))
 
 
-@lean_inlined
+@refcount_free_inlined
 def _first(mixed: np.uint64, places: int) -> int:
     """Where a key is sought first."""
     return int(np.int64(((mixed >> np.uint64(32)) * np.uint64(places)) >> np.uint64(32)))
 
 
-@lean_inlined
+@refcount_free_inlined
 def _row(held: int) -> int:
     """Row that a place holds; NONE in a free one."""
     return int(np.int32(held & _LOWER))
 
 
-@lean_inlined
+@refcount_free_inlined
 def _held(mixed: np.uint64, row: int) -> int:
     """What a place holds for a key and its row; never NONE."""
     return int((np.int64(mixed & np.uint64(_TAG)) << 32) | row)
 
 
-@lean_inlined
+@refcount_free_inlined
 def locate(table: IntArray, rows: Records, key: int) -> int:
     """Place of the row with `key`, or the free place where it belongs."""
     mixed = _mixed(key)
@@ -70,9 +71,9 @@ def rows_of(table: IntArray, rows: Records, wanted: IntArray) -> IntArray:
         end = min(group + AHEAD, len(wanted))
         for i in range(group, end):
             out[i] = _first(_mixed(wanted[i]), len(table))
-            ask(table, out[i], 0)
+            prefetch(table, out[i], 0)
         for i in range(group, end):
-            ask(rows, _row(table[out[i]]), 0)
+            prefetch(rows, _row(table[out[i]]), 0)
         for i in range(group, end):
             out[i] = _row(table[locate(table, rows, wanted[i])])
     return out
@@ -115,13 +116,13 @@ def fill(table: IntArray, rows: Records, used: int) -> None:
         table[locate(table, rows, rows[row].key)] = _held(_mixed(rows[row].key), row)
 
 
-@lean_inlined
+@refcount_free_inlined
 def first_place(pairs: Records, slot: int, vehicle: int) -> int:
     """Where a pair is sought first."""
     return _first(_mixed((np.int64(slot) << np.int64(32)) | np.int64(vehicle)), len(pairs))
 
 
-@lean_inlined
+@refcount_free_inlined
 def pair_place(pairs: Records, slot: int, vehicle: int) -> int:
     """Place of a pair in a table that holds the pairs themselves, or the free place (slot NONE) where it belongs."""
     place = first_place(pairs, slot, vehicle)

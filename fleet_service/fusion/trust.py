@@ -21,7 +21,8 @@ import numpy as np
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.cells import NOBODY, SECOND, Records
 from fleet_service.fusion.pools import PEER
-from schemas.numeric import BoolArray, Float32Array, FloatArray, lean
+from schemas.numeric import BoolArray, Float32Array, FloatArray
+from schemas.runtime.jit import refcount_free
 
 
 def no_peers(vehicles: int) -> Records:
@@ -31,7 +32,7 @@ def no_peers(vehicles: int) -> Records:
     return peers
 
 
-@lean
+@refcount_free
 def meet(voices: Records, voice: int, peers: Records, names: Records, entries: Records, entry: int) -> None:
     """Let a value meet those that others gave here lately, and take the place of its vehicle's own, or the oldest.
 
@@ -67,7 +68,7 @@ def meet(voices: Records, voice: int, peers: Records, names: Records, entries: R
     voices[voice].std[place] = std
 
 
-@lean
+@refcount_free
 def _rank(vehicle: int, other: int) -> int:
     """A fixed random number of a pair, by their own numbers and not by the order in which they came.
 
@@ -79,7 +80,7 @@ def _rank(vehicle: int, other: int) -> int:
     return int(np.int64(mixed >> np.uint64(33)))
 
 
-@lean
+@refcount_free
 def _note(peers: Records, vehicle: int, other: int, rank: int, agreement: float) -> None:
     place = rank % c.PEERS
     known = peers[vehicle].other[place]

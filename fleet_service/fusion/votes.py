@@ -30,7 +30,8 @@ from fleet_service.fusion.pairs import returning
 from fleet_service.fusion.pools import FINE, GRIP, ICE, WITNESSES
 from fleet_service.fusion.weather import Weather, aged
 from schemas import mugrid
-from schemas.numeric import Float32Array, lean, lean_inlined
+from schemas.numeric import Float32Array
+from schemas.runtime.jit import refcount_free, refcount_free_inlined
 
 # Rows of scratch, (3, SCRATCH) single precision: the belief, what `forget` and `spread` need, and the likelihood.
 P, PADDED, LIKELIHOOD = 0, 1, 2
@@ -41,7 +42,7 @@ _NO_WITNESS: Final = 0.5  # P(slippery) that is neither ice nor grip
 _FORGOTTEN: Final = int(c.FORGOTTEN_S)
 
 
-@lean_inlined
+@refcount_free_inlined
 def voice_of(entries: Records, entry: int, said: Float32Array, scratch: Bins) -> None:
     """Kind of an entry's vote, and what describes it; leaves its likelihood in the scratch.
 
@@ -67,21 +68,21 @@ def voice_of(entries: Records, entry: int, said: Float32Array, scratch: Bins) ->
         entries[entry].slippery = slippery
 
 
-@lean
+@refcount_free
 def respread(entries: Records, entry: int, scratch: Bins) -> None:
     """The likelihood of an entry into the scratch again."""
     _clear(scratch)
     spread(entries[entry].evidence, int(entries[entry].kind), scratch[PADDED], scratch[LIKELIHOOD])
 
 
-@lean_inlined
+@refcount_free_inlined
 def _clear(scratch: Bins) -> None:
     for i in range(REACH):
         scratch[PADDED, i] = 0.0
         scratch[PADDED, SCRATCH - 1 - i] = 0.0
 
 
-@lean_inlined
+@refcount_free_inlined
 def recall(entries: Records, pairs: Records, entry: int) -> None:
     """How much of a vote is new, from what its vehicle said here before: in the window, or before the checkpoint.
 
@@ -122,19 +123,19 @@ def recall(entries: Records, pairs: Records, entry: int) -> None:
     entries[entry].fresh = 0 if seen else 1
 
 
-@lean_inlined
+@refcount_free_inlined
 def _fine(number: float | np.floating[Any]) -> np.uint16:
     """A number in parts of 1/FINE."""
     return np.uint16(min(max(number * np.float32(FINE) + np.float32(0.5), np.float32(0.0)), np.float32(65535.0)))
 
 
-@lean_inlined
+@refcount_free_inlined
 def _coarse(parts: int) -> np.float32:
     """The number of so many parts."""
     return np.float32(parts) * np.float32(1.0 / FINE)
 
 
-@lean_inlined
+@refcount_free_inlined
 def _novelty(kind: int, mean: float, std: float, new_mean: float, new_std: float) -> float:
     if kind == BOUND:  # the mean of "at least u" against the uniform prior moves by half of u
         share = 2.0 * (new_mean - mean) / c.NOVELTY_UTILISED
@@ -144,7 +145,7 @@ def _novelty(kind: int, mean: float, std: float, new_mean: float, new_std: float
     return min(max(share, 0.0), 1.0)
 
 
-@lean
+@refcount_free
 def fold(
     belief: PackedArray, cells: Records, row: int, voices: Records, voice: int, entries: Records, entry: int,
     weather: Weather, scratch: Bins,
@@ -187,13 +188,13 @@ def fold(
             _witness(voices, voice, GRIP, entries[entry].vehicle, time)
 
 
-@lean_inlined
+@refcount_free_inlined
 def speaks(entries: Records, entry: int) -> bool:
     """Whether a cell needs voices for an entry: it is a value, or bears witness."""
     return bool(entries[entry].kind == VALUE or entries[entry].slippery <= 1.0 - c.WITNESS_SHARE)
 
 
-@lean_inlined
+@refcount_free_inlined
 def _count(cells: Records, row: int, entries: Records, entry: int) -> None:
     """Visits and vehicles; who was probably elsewhere is not counted."""
     if entries[entry].share < c.HERE_SHARE:
@@ -203,7 +204,7 @@ def _count(cells: Records, row: int, entries: Records, entry: int) -> None:
         cells[row].vehicles += np.uint32(1)
 
 
-@lean_inlined
+@refcount_free_inlined
 def _crowded(cells: Records, row: int, kind: int, power: float, weight: float, passed: float) -> float:
     """Weight of a vote among others that are not trusted either: the k-th new one counts 1/k², all together 1.6 votes.
 
@@ -219,7 +220,7 @@ def _crowded(cells: Records, row: int, kind: int, power: float, weight: float, p
     return weight / float((np.float32(1.0) + crowd) ** 2)
 
 
-@lean
+@refcount_free
 def _witness(voices: Records, voice: int, side: int, vehicle: int, time: int) -> None:
     """Note a witness: at its own place if it has one, else at that of the oldest."""
     witness, witnessed = voices[voice].witness, voices[voice].witnessed

@@ -17,7 +17,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from schemas import grid, mugrid
-from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray, lean
+from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray
+from schemas.runtime.jit import refcount_free
 
 VALID_NS: Final = 3 * 3600 * 10**9  # a service's forecasts and stations renew hourly; two may fail
 WET_MM_H: Final = 0.1  # least that a gauge tells from nothing
@@ -133,7 +134,7 @@ def no_reports() -> Reports:
 _SHIFT: Final = 2 * (grid.CELL_ZOOM - grid.REGION_ZOOM) + 2  # from a slot's key to its region
 
 
-@lean
+@refcount_free
 def aged(weather: Weather, key: int, begin: int, end: int) -> tuple[float, float, int]:
     """Road time of drift and change between two times [ns], and the row whose prior holds at the end; 0 without one."""
     seconds = (end - begin) * 1e-9

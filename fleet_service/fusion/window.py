@@ -19,7 +19,8 @@ from fleet_service.fusion.table import AHEAD, first_place
 from fleet_service.fusion.trust import meet
 from fleet_service.fusion.votes import SCRATCH, fold, recall, respread, speaks, voice_of
 from fleet_service.fusion.weather import Weather
-from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray, ask, compiled, lean, lean_inlined
+from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray
+from schemas.runtime.jit import compiled, prefetch, refcount_free, refcount_free_inlined
 
 
 def absorb(
@@ -42,7 +43,7 @@ def absorb(
     return left_out
 
 
-@lean
+@refcount_free
 def _absorb(
     state: State, weather: Weather, slots: IntArray, rows: IntArray, share: Float32Array,
     time: IntArray, number: IntArray, boot: IntArray, place: IntArray, vehicle: IntArray, weight: Float32Array,
@@ -92,7 +93,7 @@ def _absorb(
     return waiting
 
 
-@lean_inlined
+@refcount_free_inlined
 def _ask(state: State, slots: IntArray, rows: IntArray, vehicle: IntArray, begin: int, end: int) -> None:
     """Ask for all that observations `begin` to `end` will touch; last for what lies behind a number that comes first.
 
@@ -101,28 +102,28 @@ def _ask(state: State, slots: IntArray, rows: IntArray, vehicle: IntArray, begin
     cells, windows, used = state.cells, state.windows, state.used
     for k in range(begin, end):
         slot = slots[k]
-        ask(cells, slot, 0)
-        ask(state.belief, slot, 0)
+        prefetch(cells, slot, 0)
+        prefetch(state.belief, slot, 0)
         pair = first_place(state.pairs, slot, vehicle[rows[k]])
-        ask(state.pairs, pair, 0)
-        ask(state.pairs, pair, 1)
+        prefetch(state.pairs, pair, 0)
+        prefetch(state.pairs, pair, 1)
         entry = state.free_entries[used[FREE_ENTRIES] - 1 - (k - begin)]
-        ask(state.entries, entry, 0)
-        ask(state.entries, entry, 1)
+        prefetch(state.entries, entry, 0)
+        prefetch(state.entries, entry, 1)
         window = state.free_windows[used[FREE_WINDOWS] - 1 - (k - begin)]
-        ask(state.kept, window, 0)
-        ask(state.kept_belief, window, 0)
-        ask(windows, window, 0)
+        prefetch(state.kept, window, 0)
+        prefetch(state.kept_belief, window, 0)
+        prefetch(windows, window, 0)
     for k in range(begin, end):
-        ask(windows, max(cells[slots[k]].window, 0), 0)
+        prefetch(windows, max(cells[slots[k]].window, 0), 0)
         voice = max(cells[slots[k]].voice, 0)
-        ask(state.voices, voice, 1)
-        ask(state.voices, voice, 2)
+        prefetch(state.voices, voice, 1)
+        prefetch(state.voices, voice, 2)
     for k in range(begin, end):
-        ask(state.entries, windows[max(cells[slots[k]].window, 0)].tail, 0)
+        prefetch(state.entries, windows[max(cells[slots[k]].window, 0)].tail, 0)
 
 
-@lean_inlined
+@refcount_free_inlined
 def _open(state: State, slot: int) -> int:
     """A window for a slot that has none, with its row as it is."""
     state.used[FREE_WINDOWS] -= 1
@@ -137,7 +138,7 @@ def _open(state: State, slot: int) -> int:
     return window
 
 
-@lean_inlined
+@refcount_free_inlined
 def _copy_witnesses(voices: Records, voice: int, to_voices: Records, to: int) -> None:
     for side in range(2):
         for k in range(WITNESSES):
@@ -145,7 +146,7 @@ def _copy_witnesses(voices: Records, voice: int, to_voices: Records, to: int) ->
             to_voices[to].witnessed[side, k] = voices[voice].witnessed[side, k]
 
 
-@lean
+@refcount_free
 def _speak(state: State, slot: int, window: int) -> None:
     """Voices for a slot, with a window, that gets its first value or witness for long."""
     voice = state.used[VOICES]
@@ -156,7 +157,7 @@ def _speak(state: State, slot: int, window: int) -> None:
     _copy_witnesses(state.voices, voice, state.kept_voices, window)
 
 
-@lean
+@refcount_free
 def _refold(state: State, weather: Weather, stale: Int32Array, scratch: Bins) -> None:
     cells, windows, entries, voices = state.cells, state.windows, state.entries, state.voices
     for window in stale:
@@ -196,34 +197,34 @@ def settle(
     _settle(state, weather, peers, names, due_windows, before, np.zeros((3, SCRATCH), np.float32))
 
 
-@lean_inlined
+@refcount_free_inlined
 def _ask_settled(state: State, settled: IntArray, begin: int, end: int) -> None:
     """Ask for all that settling windows `begin` to `end` will touch, in the same way."""
     windows, entries = state.windows, state.entries
     for k in range(begin, end):
-        ask(windows, settled[k], 0)
+        prefetch(windows, settled[k], 0)
     for k in range(begin, end):
-        ask(entries, windows[settled[k]].head, 0)
-        ask(entries, windows[settled[k]].tail, 0)
-        ask(state.cells, windows[settled[k]].slot, 0)
+        prefetch(entries, windows[settled[k]].head, 0)
+        prefetch(entries, windows[settled[k]].tail, 0)
+        prefetch(state.cells, windows[settled[k]].slot, 0)
     for k in range(begin, end):
         window = settled[k]
-        ask(state.pairs, entries[windows[window].head].pair, 0)
+        prefetch(state.pairs, entries[windows[window].head].pair, 0)
         if windows[window].values:
-            ask(state.voices, state.cells[windows[window].slot].voice, 0)
-            ask(state.voices, state.cells[windows[window].slot].voice, 1)
+            prefetch(state.voices, state.cells[windows[window].slot].voice, 0)
+            prefetch(state.voices, state.cells[windows[window].slot].voice, 1)
         if windows[window].tail != windows[window].head:
-            ask(entries, windows[window].head, 1)
-            ask(entries, entries[windows[window].head].following, 0)
-            ask(state.kept, window, 0)
-            ask(state.kept_belief, window, 0)
+            prefetch(entries, windows[window].head, 1)
+            prefetch(entries, entries[windows[window].head].following, 0)
+            prefetch(state.kept, window, 0)
+            prefetch(state.kept_belief, window, 0)
     for k in range(begin, end):
         window = settled[k]
         if windows[window].tail != windows[window].head:
-            ask(state.pairs, entries[entries[windows[window].head].following].pair, 0)
+            prefetch(state.pairs, entries[entries[windows[window].head].following].pair, 0)
 
 
-@lean
+@refcount_free
 def _settle(
     state: State, weather: Weather, peers: Records, names: Records, settled: IntArray, before: int, scratch: Bins
 ) -> None:  # fmt: skip
@@ -259,7 +260,7 @@ def _settle(
             windows[window].first = entries[entry].time
 
 
-@lean_inlined
+@refcount_free_inlined
 def _link(windows: Records, entries: Records, window: int, entry: int) -> None:
     """Put an entry at its place in time; from the end, where nearly all belong."""
     after = windows[window].tail

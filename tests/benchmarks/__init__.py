@@ -2,4 +2,6 @@
 
 import os
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as service and agent have it: `schemas.operator.keep_small`
+os.environ.setdefault(
+    "OPENBLAS_NUM_THREADS", "1"
+)  # as service and agent have it: `schemas.runtime.process.limit_memory`

@@ -11,8 +11,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from schemas import figures
-from schemas.figures import Figure
+from schemas.runtime import figures
+from schemas.runtime.figures import Figure
 from tests.benchmarks.agent import agent
 from tests.benchmarks.contract import contract
 from tests.benchmarks.estimators import estimators

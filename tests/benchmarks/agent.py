@@ -15,7 +15,7 @@ from edge_agent.backfill import backfill, tasks_of
 from edge_agent.banks import bank_of
 from edge_agent.cli import main as edge
 from edge_agent.sources.replay import read_log
-from schemas.figures import Figure
+from schemas.runtime.figures import Figure
 from schemas.vehicle import load_vehicle
 from tests.benchmarks.measure import median_s
 from tests.faults.processes import stage

@@ -32,8 +32,8 @@ from fleet_service.archive.export import Part
 from fleet_service.archive.rebuild import Since, replay
 from fleet_service.fusion import Fusion
 from fleet_service.map_state import cell_table
-from schemas import figures
-from schemas.figures import Figure
+from schemas.runtime import figures
+from schemas.runtime.figures import Figure
 from schemas.wire import Kind
 from tests.benchmarks.contract import size_of
 from tests.benchmarks.past import past

@@ -12,8 +12,8 @@ from fleet_service.analytics.synthetic import World
 from fleet_service.archive import segments
 from fleet_service.archive.compaction import compact
 from schemas import wire
-from schemas.decoding import decode_many
-from schemas.figures import Figure
+from schemas.runtime.batch_decoder import decode_many
+from schemas.runtime.figures import Figure
 from schemas.wire import Batch, Kind
 from tests.benchmarks.fabricated import visits
 from tests.benchmarks.measure import SEED, median_s

@@ -6,8 +6,8 @@ import numpy as np
 
 from edge_agent.banks import bank_of
 from edge_agent.simulation import simulate_manoeuvre
-from schemas.figures import Figure
 from schemas.numeric import FloatArray
+from schemas.runtime.figures import Figure
 from schemas.signals import CHANNELS
 from tests.benchmarks.measure import SEED, median_s
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from fleet_service.fusion import Fusion, Observations
 from schemas import grid, mugrid
-from schemas.figures import Figure
-from schemas.operator import give_back
+from schemas.runtime.figures import Figure
+from schemas.runtime.process import trim_memory
 from tests.benchmarks.measure import ROUNDS, SEED
 
 BATCH = 5_000  # rows of a turn of the service under load
@@ -24,8 +24,8 @@ START = 1_800_000_000 * SECOND
 CELLS = 1_000_000
 RESIDENT = """
 from fleet_service.cli import UNUSED
-from schemas.operator import keep_small
-keep_small(*UNUSED)  # as a service's process begins
+from schemas.runtime.process import limit_memory
+limit_memory(*UNUSED)  # as a service's process begins
 from tests.benchmarks.fusion import resident
 resident()
 """
@@ -85,7 +85,7 @@ def resident() -> None:
 
     fusion, _ = filled(CELLS, 3, 86_400.0)
     MapState(fusion).tiles()
-    give_back()  # as upkeep does
+    trim_memory()  # as upkeep does
     with open("/proc/self/status") as status:  # noqa: PTH123
         kilobytes = next(int(line.split()[1]) for line in status if line.startswith("VmRSS"))
     print(kilobytes * 1024 / 1e6, fusion.size)

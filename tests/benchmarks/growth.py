@@ -19,7 +19,7 @@ import numpy as np
 from fleet_service.engine import Engine
 from fleet_service.fusion.constants import EPOCH_NS
 from schemas.config import ServiceConfig
-from schemas.figures import Figure
+from schemas.runtime.figures import Figure
 from schemas.wire import Kind
 from tests.benchmarks.ingest import messages
 

@@ -25,8 +25,8 @@ from fleet_service.engine import Engine
 from fleet_service.ingest import TURN_BYTES, TURN_MESSAGES, Message
 from schemas import grid, keys, mugrid, wire
 from schemas.config import ServiceConfig
-from schemas.decoding import decode_many
-from schemas.figures import Figure
+from schemas.runtime.batch_decoder import decode_many
+from schemas.runtime.figures import Figure
 from schemas.wire import Batch, Kind
 from tests.benchmarks.measure import SEED
 from tests.faults.load import visits

@@ -21,9 +21,9 @@ from fleet_service.engine import Engine
 from fleet_service.service import Service
 from schemas import grid, keys
 from schemas.config import ServiceConfig, ZenohSettings
-from schemas.figures import Figure
 from schemas.numeric import FloatArray, IntArray
-from schemas.transport import open_session
+from schemas.runtime.figures import Figure
+from schemas.runtime.zenoh_session import open_session
 from tests.waiting import until
 
 WORLD = World(1_000_000, days=3)

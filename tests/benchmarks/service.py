@@ -21,10 +21,10 @@ import zenoh
 from deploy.router import open_router
 from schemas import grid, keys, mugrid, wire
 from schemas.config import ZenohSettings
-from schemas.figures import Figure
-from schemas.tiles import decode_tile
-from schemas.transport import open_session
+from schemas.runtime.figures import Figure
+from schemas.runtime.zenoh_session import open_session
 from schemas.wire import Batch, Kind
+from schemas.wire.tile import decode_tile
 
 RATE = 20_000  # observations/s of the load
 ROWS = 10  # of a message

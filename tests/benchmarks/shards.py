@@ -26,8 +26,8 @@ from fleet_service.engine import Engine
 from fleet_service.ingest import Message
 from schemas import keys, wire
 from schemas.config import ServiceConfig, ZenohSettings
-from schemas.figures import Figure
-from schemas.transport import open_session
+from schemas.runtime.figures import Figure
+from schemas.runtime.zenoh_session import open_session
 from schemas.wire import Kind
 from tests.benchmarks.ingest import messages
 from tests.faults.processes import Part

@@ -23,7 +23,7 @@ from fleet_service.checkpoint import tables_of
 from fleet_service.engine import ALERTS, Engine
 from fleet_service.ingest import Message
 from schemas.config import ServiceConfig
-from schemas.figures import Figure
+from schemas.runtime.figures import Figure
 from tests.benchmarks.fusion import CELLS, START, filled
 from tests.benchmarks.ingest import messages
 from tests.faults.processes import Part

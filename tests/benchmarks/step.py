@@ -13,8 +13,8 @@ from edge_agent.dynamics.parameters import parameter_table
 from edge_agent.estimators import TUNED, Estimates, EstimatorBank
 from edge_agent.simulation import simulate_manoeuvre
 from edge_agent.tuning.tuned import shipped
-from schemas.figures import Figure
 from schemas.numeric import FloatArray
+from schemas.runtime.figures import Figure
 from schemas.signals import CHANNELS, S
 from tests.benchmarks.limit import Limit
 from tests.benchmarks.measure import SEED, median_s, paired

@@ -24,8 +24,8 @@ from ruamel.yaml import YAML
 from fleet_service.client import ask
 from fleet_service.enrolment.fleet import Enrolment
 from schemas.config import AgentConfig, ServiceConfig, load
-from schemas.transport import configuration
-from tests.schemas.test_monitor import fetch
+from schemas.runtime.zenoh_session import configuration
+from tests.schemas.runtime.test_metrics import fetch
 from tests.waiting import until
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -14,7 +14,7 @@ from deploy import router
 from schemas import config
 from schemas.config import AgentConfig, ServiceConfig, ZenohSettings
 from schemas.errors import InputError
-from schemas.transport import open_session
+from schemas.runtime.zenoh_session import open_session
 from tests.waiting import matched
 
 

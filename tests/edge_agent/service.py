@@ -12,9 +12,8 @@ import zenoh
 
 from schemas import keys
 from schemas.config import ZenohSettings
-from schemas.decoding import decode
-from schemas.transport import open_session
-from schemas.wire import ACK_ENCODING, Batch, Kind, StreamAck, encode_ack
+from schemas.runtime.zenoh_session import open_session
+from schemas.wire import ACK_ENCODING, Batch, Kind, StreamAck, decode, encode_ack
 
 DEADLINE_S = 120.0  # the first start after a change compiles the kernels
 

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from schemas import figures
+from schemas.runtime import figures
 from tests.faults.campaigns import CAMPAIGNS
 from tests.faults.frame import conduct
 

@@ -20,7 +20,7 @@ from fleet_service.enrolment.fleet import Enrolment
 from schemas import keys, wire
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
-from schemas.transport import configuration
+from schemas.runtime.zenoh_session import configuration
 from tests.faults.ground import HONEST, ROGUE, Ears, Ground
 from tests.fleet_service.examples import REGION, TILE, batch, key
 from tests.secured import FREE, READER, ROUTERS, SERVICE, WEATHER, enrolment, registry, settings

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final, Literal, NamedTuple
 
-from schemas.figures import Figure
+from schemas.runtime.figures import Figure
 
 
 class Bar(NamedTuple):

@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 from fleet_service.archive import layout, reading
 from fleet_service.archive.compaction import compact
 from fleet_service.archive.log import Log
-from schemas.figures import Figure
+from schemas.runtime.figures import Figure
 from schemas.wire import Kind
 from tests.faults.bars import figure
 from tests.faults.crash_model import ROWS, Batch, rows_of

@@ -28,7 +28,7 @@ from fleet_service.archive.rebuild import restore_streams
 from fleet_service.archive.segments import Rows
 from fleet_service.streams import Streams
 from schemas import grid
-from schemas.figures import Figure
+from schemas.runtime.figures import Figure
 from schemas.wire import Kind
 from tests.faults.bars import figure
 from tests.faults.crash_disk import CrashDisk, PowerLoss

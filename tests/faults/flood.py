@@ -24,9 +24,9 @@ from fleet_service.engine import Engine
 from fleet_service.ingest import Message
 from schemas import grid, keys, query, wire
 from schemas.config import ServiceConfig
-from schemas.figures import Figure
-from schemas.tiles import decode_tile
+from schemas.runtime.figures import Figure
 from schemas.wire import Batch, Kind
+from schemas.wire.tile import decode_tile
 from tests.faults.bars import figure
 from tests.faults.frame import Site
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, SECOND, batch, key

@@ -15,7 +15,7 @@ import zenoh
 from schemas import wire
 from schemas.config import ZenohSettings
 from schemas.proto import gripmap_pb2 as pb
-from schemas.transport import configuration
+from schemas.runtime.zenoh_session import configuration
 from schemas.wire import Kind
 from tests.fleet_service.examples import SECOND, batch, key
 

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from schemas import figures
-from schemas.figures import Figure
+from schemas.runtime import figures
+from schemas.runtime.figures import Figure
 from tests.faults.bars import figure
 
 

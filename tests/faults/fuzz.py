@@ -21,9 +21,9 @@ from fleet_service.ingest import Message
 from schemas import grid, query, wire
 from schemas.config import ServiceConfig
 from schemas.errors import InputError, WireError
-from schemas.figures import Figure
-from schemas.tiles import decode_tile
+from schemas.runtime.figures import Figure
 from schemas.wire import Kind
+from schemas.wire.tile import decode_tile
 from tests.faults.bars import figure
 from tests.faults.frame import Site
 from tests.faults.mutants import Mutants

@@ -10,7 +10,7 @@ import random
 import time
 from typing import Final
 
-from schemas.figures import Figure
+from schemas.runtime.figures import Figure
 from tests.faults.bars import figure
 from tests.faults.census import Census, take
 from tests.faults.frame import Site

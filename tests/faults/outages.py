@@ -7,7 +7,7 @@ import signal
 import time
 from typing import Final
 
-from schemas.figures import Figure
+from schemas.runtime.figures import Figure
 from tests.faults.bars import figure
 from tests.faults.census import Census, take, told
 from tests.faults.frame import Site

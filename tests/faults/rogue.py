@@ -15,7 +15,7 @@ import zenoh
 
 from schemas import keys
 from schemas.config import ZenohSettings
-from schemas.transport import configuration
+from schemas.runtime.zenoh_session import configuration
 
 
 def main() -> None:

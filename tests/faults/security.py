@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from schemas.figures import Figure
+from schemas.runtime.figures import Figure
 from tests.faults.attempts import ATTEMPTS
 from tests.faults.bars import figure
 from tests.faults.frame import Site

@@ -11,9 +11,9 @@ from typing import Final
 
 import numpy as np
 
-from schemas import figures
-from schemas.figures import Figure
 from schemas.numeric import FloatArray
+from schemas.runtime import figures
+from schemas.runtime.figures import Figure
 from tests.faults.bars import figure
 from tests.faults.census import take
 from tests.faults.frame import Campaign, Site, conduct

@@ -23,7 +23,7 @@ from fleet_service.ingest import Message
 from fleet_service.streams import Streams
 from schemas import wire
 from schemas.config import ServiceConfig
-from schemas.figures import Figure
+from schemas.runtime.figures import Figure
 from schemas.wire import Batch, Kind
 from tests.faults.bars import figure
 from tests.faults.frame import Site

@@ -15,7 +15,7 @@ from hypothesis import settings
 from deploy.router import open_router
 from fleet_service.service import Service
 from schemas.config import ServiceConfig, ZenohSettings
-from schemas.transport import open_session
+from schemas.runtime.zenoh_session import open_session
 from tests.waiting import until
 
 settings.register_profile("compiled", deadline=None)  # the first example waits for the compiler

@@ -18,7 +18,7 @@ from deploy.router import open_router
 from fleet_service.cli import main
 from schemas import wire
 from schemas.config import ZenohSettings
-from schemas.transport import open_session
+from schemas.runtime.zenoh_session import open_session
 from tests.fleet_service.conftest import Running, running
 from tests.fleet_service.examples import CELL, SECOND, batch, key
 from tests.fleet_service.test_service import Fleet

@@ -17,7 +17,7 @@ from schemas.config import ServiceConfig, ZenohSettings
 from schemas.wire import Kind
 from tests.fleet_service.conftest import running
 from tests.fleet_service.examples import SECOND, batch, key
-from tests.schemas.test_monitor import fetch
+from tests.schemas.runtime.test_metrics import fetch
 from tests.waiting import matched, until
 
 

@@ -15,9 +15,9 @@ from fleet_service.limits import LEAST_BYTES, Limits
 from fleet_service.streams import Stream
 from schemas import wire
 from schemas.config import ServiceConfig, ZenohSettings
-from schemas.decoding import Head
 from schemas.errors import InputError
 from schemas.wire import Kind
+from schemas.wire.batches import Head
 from tests.fleet_service.conftest import running
 from tests.fleet_service.examples import SECOND, batch, key
 from tests.secured import enrolment

@@ -14,7 +14,7 @@ from fleet_service.map_state import MapState
 from fleet_service.tiles import Tiles
 from schemas import grid
 from schemas.query import MapQuery
-from schemas.tiles import decode_tile
+from schemas.wire.tile import decode_tile
 from tests.fleet_service.examples import SECOND, START, TILE, observations, value
 
 NOW = START + 60 * SECOND

@@ -29,7 +29,8 @@ from edge_agent.estimators.friction_mixture.sample import (
     start,
     take_sample,
 )
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 from schemas.signals import S
 
 SLIDING_THETA = 3.0  # normalised slip beyond the peak of every passenger tyre's curve

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 
 
 @compiled

@@ -14,8 +14,9 @@ from edge_agent.estimators.friction_mixture.nodes import evidence as evidence_of
 from edge_agent.estimators.friction_mixture.nodes import projected, quantile
 from edge_agent.estimators.friction_mixture.sample import UNKNOWN_VX_STD
 from schemas.mugrid import CENTRES
-from schemas.numeric import BoolArray, FloatArray, compiled, released
-from schemas.records import Records, put_record, records
+from schemas.numeric import BoolArray, FloatArray
+from schemas.runtime.jit import compiled, nogil
+from schemas.runtime.records import Records, put_record, records
 
 SLOWEST_M_S = 0.5  # sideslip is taken against at least this speed
 YAW_RATE_OFFSET_STD = 0.001  # [rad/s]
@@ -35,7 +36,7 @@ def mixture_bank(rows: FloatArray, design: Design) -> EstimatorBank:
     return EstimatorBank(new_filters(rows), desk, _advance, tells=FOUR_FRICTIONS, evidence=True)
 
 
-@released
+@nogil
 def _advance(
     filters: Records[Memory], desks: Records[Desk], t: FloatArray, signals: FloatArray, tolds: FloatArray,
     closes: BoolArray, evidence: FloatArray, share: int, first: int, last: int,

@@ -30,7 +30,8 @@ from edge_agent.dynamics.wheel import force_from_torque
 from edge_agent.estimators import flags
 from edge_agent.estimators.friction_mixture.constants import C
 from edge_agent.estimators.friction_mixture.memory import H
-from schemas.numeric import FloatArray, IntArray, compiled
+from schemas.numeric import FloatArray, IntArray
+from schemas.runtime.jit import compiled
 from schemas.signals import S
 
 

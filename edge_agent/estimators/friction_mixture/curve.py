@@ -16,7 +16,8 @@ from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 
 CELLS: Final = 1024  # linear between: errors below 1e-6 of the force
 # (c, e) of the Magic Formula: tyres of passenger cars lie between, the brush model two spreads beyond the round one

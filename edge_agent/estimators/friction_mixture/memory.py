@@ -10,7 +10,7 @@ import numpy as np
 from edge_agent.dynamics.parameters import P
 from edge_agent.estimators.friction_mixture.constants import NODES, PAIRS, STATES
 from schemas.numeric import FloatArray, IntArray
-from schemas.records import RecordArray, records
+from schemas.runtime.records import RecordArray, records
 
 INPUTS = 15  # ax, ay, yaw rate, steering, wheel speed, torque: the channels before the position
 RING = 64  # blocks remembered for the grip used in the last second

@@ -17,7 +17,8 @@ import numpy as np
 from edge_agent.estimators.friction_mixture.arrays import clear, clear_rows, put, put_square
 from edge_agent.estimators.friction_mixture.constants import C, X
 from edge_agent.estimators.friction_mixture.nodes import SMALLEST
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 
 LEAST_MIXING = 1e-3  # a smaller share of foreign mass changes no digit that is read
 LEAST_WEIGHT = 1e-9  # nor does a node of less

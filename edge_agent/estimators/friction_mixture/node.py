@@ -29,7 +29,8 @@ from edge_agent.estimators.friction_mixture.residuals import (
     slips,
     steepness,
 )
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 
 LEAST_VARIANCE = 1e-18
 

@@ -18,7 +18,8 @@ import numpy as np
 
 from edge_agent.estimators.friction_mixture.constants import NODES, PAIRS
 from schemas.mugrid import LOWER, UPPER
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 
 APART = 1.45  # how much more friction the higher side has, at least, to count as unlike
 SMALLEST = 1e-12  # a probability that the re-injection of road change will raise again

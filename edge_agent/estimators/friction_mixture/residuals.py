@@ -25,7 +25,8 @@ from edge_agent.dynamics.tyres import TINY
 from edge_agent.estimators.friction_mixture.block import F
 from edge_agent.estimators.friction_mixture.constants import C, X
 from edge_agent.estimators.friction_mixture.curve import Curve, looked_up, ratio_at, theta_at
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 
 ROWS = 6
 FLATTEST = 0.03  # a sliding wheel's slip is not quite arbitrary: its inertia holds it for a block

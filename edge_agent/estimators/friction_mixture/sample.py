@@ -18,7 +18,8 @@ from edge_agent.estimators.friction_mixture.constants import C, X
 from edge_agent.estimators.friction_mixture.memory import INPUTS, G, H, Memory
 from edge_agent.estimators.friction_mixture.node import Nominal
 from edge_agent.estimators.friction_mixture.nodes import quantile
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 from schemas.signals import S
 
 # beyond these a reading is an error of the sensor, not of the driver

@@ -17,8 +17,9 @@ from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import GRAVITY, P, body, parameter_table
 from edge_agent.estimators import flags
 from edge_agent.estimators.friction_mixture.sample import GAP_S, LIMITS, POSITION_S, rolling_speed
-from schemas.numeric import FloatArray, compiled
-from schemas.records import RecordArray, records
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+from schemas.runtime.records import RecordArray, records
 from schemas.signals import S
 from schemas.vehicle import Vehicle
 

@@ -28,7 +28,8 @@ from edge_agent.filters.federated import fuse, share
 from edge_agent.filters.sigma import cubature
 from edge_agent.filters.squareroot import deviations, predict, update, weighted_mean
 from edge_agent.filters.svd import axis_points
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 from schemas.signals import S
 
 STATES, ROWS = 6, 4

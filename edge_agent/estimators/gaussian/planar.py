@@ -17,7 +17,8 @@ from edge_agent.dynamics.chassis import response
 from edge_agent.dynamics.parameters import Body, Four, body, four
 from edge_agent.estimators.gaussian.intake import Track, wheel_force
 from schemas.mugrid import LOWER, UPPER
-from schemas.numeric import FloatArray, compiled, inlined
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled, inlined
 from schemas.signals import S
 
 LONGEST_S = 0.02  # of one of Heun's steps, at a speed of

@@ -13,7 +13,8 @@ import numpy as np
 
 from edge_agent.estimators.gaussian.telling import PRIOR_MU, PRIOR_MU_STD
 from edge_agent.filters.squareroot import triangularize
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 
 FORGET_M = 190.0  # one road change per so many metres (errata)
 LOOK_S = 0.2  # one independent look at the tyre per so much time (errata)

@@ -15,7 +15,8 @@ from edge_agent.estimators import flags
 from edge_agent.estimators.estimates import Y
 from edge_agent.estimators.gaussian.intake import Track
 from schemas.mugrid import LOWER, UPPER
-from schemas.numeric import FloatArray, compiled
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
 from schemas.signals import S
 
 # what is known of the friction of a road nobody has measured: moments of the uniform prior

@@ -13,7 +13,7 @@ from edge_agent.estimators.friction_mixture.curve import curve_tables, ratio_at,
 from edge_agent.estimators.friction_mixture.node import Room, factorize, take_rows, unfelt
 from edge_agent.estimators.friction_mixture.nodes import node_table, projected, side_table
 from edge_agent.estimators.friction_mixture.residuals import ROWS
-from schemas.records import records
+from schemas.runtime.records import records
 
 SEEDS = (0, 1, 2)
 

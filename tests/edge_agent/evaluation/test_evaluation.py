@@ -21,7 +21,7 @@ from edge_agent.evaluation.paper_004 import noisy, variances
 from edge_agent.evaluation.printed import OWN, PRINTED
 from edge_agent.evaluation.report import report
 from edge_agent.evaluation.scenarios import FOREIGN, OTHERS, PAPERS, SEDAN, VEHICLES, foreign
-from schemas.figures import Figure
+from schemas.runtime.figures import Figure
 from schemas.signals import S
 
 # the bars as they were asked for: name -> (bar, better)

@@ -14,7 +14,7 @@ from edge_agent.simulation.white import SCHEDULE
 from edge_agent.tuning import study, study_report
 from edge_agent.tuning.study import CONDITIONS, HELD_OUT, TRAIN, VARIANCE, Recorded, overall, record, search, worth
 from edge_agent.tuning.tuned import WAYS, load
-from schemas.figures import Figure
+from schemas.runtime.figures import Figure
 from schemas.signals import S
 
 STILL = study_report.GIVEN["fixed"]

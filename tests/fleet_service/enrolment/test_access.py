@@ -14,7 +14,7 @@ from fleet_service.enrolment.access import access_control
 from fleet_service.enrolment.enrol import Registry, Terms
 from schemas import keys
 from schemas.errors import InputError
-from schemas.transport import configuration
+from schemas.runtime.zenoh_session import configuration
 from tests.faults.attempts import ATTEMPTS
 from tests.faults.ground import HONEST, Ground, ground
 from tests.fleet_service.examples import key

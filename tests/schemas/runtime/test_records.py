@@ -6,8 +6,9 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from schemas.numeric import FloatArray, IntArray, compiled
-from schemas.records import Records, put_record, record_type, records
+from schemas.numeric import FloatArray, IntArray
+from schemas.runtime.jit import compiled
+from schemas.runtime.records import Records, put_record, record_type, records
 
 SIZE = 3
 

@@ -1,4 +1,4 @@
-"""Batches, acknowledgements and alerts as bytes. Reading batches: `schemas.decoding`.
+"""Batches, acknowledgements and alerts as bytes. Reading batches: `schemas.wire.batches`.
 
 A batch travels as protobuf (`application/protobuf;gripmap.v1.ObservationBatch`) or as the JSON mapping of the same
 message (`application/json`), so that a person can publish with one line.

@@ -8,13 +8,13 @@ import sys
 from pathlib import Path
 
 CALLER = """from kernels.inner import inner
-from schemas.numeric import compiled
+from schemas.runtime.jit import compiled
 
 @compiled
 def outer(x: float) -> float:
     return inner(x) + 1.0
 """
-INNER = """from schemas.numeric import compiled
+INNER = """from schemas.runtime.jit import compiled
 
 @compiled
 def inner(x: float) -> float:
@@ -29,7 +29,7 @@ def run(folder: Path, factor: str, before: str = "") -> str:
     """What outer(1.0) gives in a new process, with `inner` multiplying by `factor`."""
     package = folder / "kernels"
     (package / "inner.py").write_text(INNER.format(factor=factor))
-    source = Path(__file__).parents[2] / "schemas"
+    source = Path(__file__).parents[3] / "schemas"
     if not (folder / "schemas").exists():
         (folder / "schemas").symlink_to(source, target_is_directory=True)
     environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from schemas.figures import Figure, markdown, write
+from schemas.runtime.figures import Figure, markdown, write
 
 
 @pytest.mark.parametrize(

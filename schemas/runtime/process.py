@@ -1,4 +1,4 @@
-"""Lines for the operator of a running agent or service: text for people, or JSON lines for programs."""
+"""Set-up of a long-lived process: memory, and its log lines, text for people or JSON lines for programs."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Line(str):
     values: dict[str, object]
 
 
-def keep_small(*without: str) -> None:
+def limit_memory(*without: str) -> None:
     """Keep from a process that lives long what its libraries would do for others; call it at its very start.
 
     Args:
@@ -51,7 +51,7 @@ def keep_small(*without: str) -> None:
     sys.meta_path.insert(0, _Without({"pandas", *without}))
 
 
-def give_back() -> None:
+def trim_memory() -> None:
     """Give the system what lies free between what is in use: after work that takes much memory for a short time."""
     with suppress(AttributeError, OSError):
         ctypes.CDLL(None).malloc_trim(0)
@@ -66,22 +66,22 @@ class _Without(MetaPathFinder):
             raise ModuleNotFoundError(f"{fullname} is kept out of this process", name=fullname)
 
 
-def tell(line: str, stream: TextIO) -> None:
+def print_line(line: str, stream: TextIO) -> None:
     """Print a line at once; what lies behind the stream (a full disk, a reader that left) never ends the process."""
     with suppress(OSError):
         print(line, file=stream, flush=True)
 
 
-def teller(form: Form, stream: TextIO, **who: object) -> Callable[[str], None]:
+def line_logger(form: Form, stream: TextIO, **who: object) -> Callable[[str], None]:
     """What takes the lines; as JSON each with time, process and `who`, the first word as its event."""
 
     def text(line: str) -> None:
-        tell(line, stream)
+        print_line(line, stream)
 
     def as_json(line: str) -> None:
         event = line.partition(":")[0] if ":" in line else line.partition(" ")[0]
         values = line.values if isinstance(line, Line) else {}
-        tell(_record("info", **{"event": event, "message": str(line), **who, **values}), stream)
+        print_line(_record("info", **{"event": event, "message": str(line), **who, **values}), stream)
 
     return text if form == "text" else as_json
 

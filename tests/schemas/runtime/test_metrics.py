@@ -14,8 +14,8 @@ import pytest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 
 from schemas.errors import InputError
-from schemas.monitor import Metric, gauge, serving
-from schemas.operator import Line, log_as, teller
+from schemas.runtime.metrics import Metric, gauge, serving
+from schemas.runtime.process import Line, line_logger, log_as
 
 HOSTILE = 'a"b\\c\nd<script>'
 
@@ -79,9 +79,9 @@ def test_a_taken_port_is_said() -> None:
 def test_lines_are_text_for_people_and_json_for_programs() -> None:
     line = Line("status: 3 rows", rows=3, counts={"late": 1})
     plain, structured = io.StringIO(), io.StringIO()
-    teller("text", plain)(line)
-    teller("json", structured, service="shard-0")(line)
-    teller("json", structured)("compacted: 7 rows\nof <many>")
+    line_logger("text", plain)(line)
+    line_logger("json", structured, service="shard-0")(line)
+    line_logger("json", structured)("compacted: 7 rows\nof <many>")
     assert plain.getvalue() == "status: 3 rows\n"
     first, second = (json.loads(text) for text in structured.getvalue().splitlines())
     assert (first["event"], first["rows"], first["counts"], first["service"]) == ("status", 3, {"late": 1}, "shard-0")

@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from schemas import mugrid
-from schemas.decoding import decode, decode_many
 from schemas.errors import WireError
 from schemas.proto import gripmap_pb2 as pb
-from schemas.reader import NUMBERS, TEXTS, gather, walk
-from schemas.wire import ENCODING, MESSAGES, NEEDED, Kind, column_types
+from schemas.runtime.batch_decoder import decode_many
+from schemas.runtime.protobuf_scan import NUMBERS, TEXTS, gather, walk
+from schemas.wire import ENCODING, MESSAGES, NEEDED, Kind, column_types, decode
 
 compiled = settings(deadline=None)  # the first example waits for the compiler
 KINDS = st.sampled_from(list(Kind))

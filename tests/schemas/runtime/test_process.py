@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-TALK = "import sys\nfrom schemas.operator import tell\nfor _ in range(3): tell('hello', sys.stderr)\nsys.exit(7)"
+TALK = "import sys\nfrom schemas.runtime.process import print_line\nfor _ in range(3): print_line('hello', sys.stderr)\nsys.exit(7)"
 
 
 def test_a_full_disk_behind_the_output_does_not_end_the_process() -> None:
@@ -18,7 +18,7 @@ def test_a_full_disk_behind_the_output_does_not_end_the_process() -> None:
 
 def test_arrow_reads_and_hands_out_numbers_where_pandas_is_kept_out() -> None:
     words = (
-        "import sys; from schemas.operator import keep_small; keep_small(); import pyarrow as pa, numpy as np\n"
+        "import sys; from schemas.runtime.process import limit_memory; limit_memory(); import pyarrow as pa, numpy as np\n"
         "assert pa.array([1.5, None]).to_numpy(zero_copy_only=False)[0] == 1.5\n"
         "assert pa.array(np.array([2])).to_pylist() == [2]; assert 'pandas' not in sys.modules\n"
         "assert pa.default_memory_pool().backend_name == 'system'"
@@ -28,9 +28,9 @@ def test_arrow_reads_and_hands_out_numbers_where_pandas_is_kept_out() -> None:
 
 def test_kernels_compile_where_what_they_can_do_without_is_kept_out() -> None:
     words = (
-        "import sys; from schemas.operator import give_back, keep_small; keep_small('scipy')\n"
+        "import sys; from schemas.runtime.process import trim_memory, limit_memory; limit_memory('scipy')\n"
         "import numpy as np; from fleet_service.fusion.normal import distribution\n"
         "assert abs(distribution(np.array([1.0]))[0] - 0.8413447) < 1e-6\n"
-        "assert 'scipy' not in sys.modules and not np.zeros(1 << 20).any(); give_back()"
+        "assert 'scipy' not in sys.modules and not np.zeros(1 << 20).any(); trim_memory()"
     )
     assert subprocess.run([sys.executable, "-W", "error", "-c", words], check=False).returncode == 0

@@ -11,9 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas import tables, tiles
+from schemas import tables
 from schemas.errors import WireError
-from schemas.tiles import decode_tile
+from schemas.wire import tile
+from schemas.wire.tile import decode_tile
 
 
 def table(rows: int) -> pa.Table:
@@ -38,15 +39,15 @@ def test_a_tile_comes_back_as_it_was_written(rows: int) -> None:
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
 def test_what_would_have_to_be_unpacked_is_refused_before_it_is(compression: Literal["zstd", "lz4"]) -> None:
-    bomb = stream(table(tiles.MAX_ROWS), compression)
-    assert len(bomb) < 0.2 * table(tiles.MAX_ROWS).nbytes
+    bomb = stream(table(tile.MAX_ROWS), compression)
+    assert len(bomb) < 0.2 * table(tile.MAX_ROWS).nbytes
     with pytest.raises(WireError, match="^tile: is compressed; "):
         decode_tile(bomb)
 
 
 def test_too_many_cells_are_refused() -> None:
     with pytest.raises(WireError, match="^tile: has more than 131072 cells"):
-        decode_tile(stream(table(tiles.MAX_ROWS + 1)))
+        decode_tile(stream(table(tile.MAX_ROWS + 1)))
 
 
 def test_other_columns_are_refused() -> None:
@@ -64,4 +65,4 @@ def test_no_bytes_raise_anything_but_a_wire_error(data: st.DataObject) -> None:
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
     cut = data.draw(st.integers(0, len(payload)))
     with contextlib.suppress(WireError):
-        assert decode_tile(bytes(payload[:cut] if cut % 2 else payload)).num_rows <= tiles.MAX_ROWS
+        assert decode_tile(bytes(payload[:cut] if cut % 2 else payload)).num_rows <= tile.MAX_ROWS

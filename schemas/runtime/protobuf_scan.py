@@ -17,7 +17,8 @@ from google.protobuf.descriptor import FieldDescriptor
 from numpy.typing import NDArray
 
 from schemas import mugrid
-from schemas.numeric import BoolArray, ByteArray, IntArray, lean
+from schemas.numeric import BoolArray, ByteArray, IntArray
+from schemas.runtime.jit import refcount_free
 from schemas.wire import MAX_ROWS, MESSAGES, NEEDED, Kind, column_types
 
 NUMBERS: Final = ("boot", "region", "seq", "first_held")
@@ -106,7 +107,7 @@ def gather(data: ByteArray, walked: Walked, column: int, kind: Kind, into: NDArr
         _unpack(data, begins, counts, walked.sizes, into)
 
 
-@lean
+@refcount_free
 def _varint(data: ByteArray, at: int, end: int) -> tuple[int, int]:
     """A number and where it ends; -1 where it is none of at most 64 bits."""
     value, shift = 0, 0
@@ -122,7 +123,7 @@ def _varint(data: ByteArray, at: int, end: int) -> tuple[int, int]:
     return 0, -1
 
 
-@lean
+@refcount_free
 def _walk(data: ByteArray, ends: IntArray, layout: _Layout, first: int, strict: bool, out: Walked) -> None:
     at = 0
     for k in range(len(ends)):
@@ -143,7 +144,7 @@ def _walk(data: ByteArray, ends: IntArray, layout: _Layout, first: int, strict: 
         out.understood[k], out.sizes[k], at = fine, n, end
 
 
-@lean
+@refcount_free
 def _field(
     data: ByteArray, at: int, end: int, role: int, wire: int, layout: _Layout, strict: bool, out: Walked, k: int
 ) -> int:  # fmt: skip
@@ -185,7 +186,7 @@ def _field(
     return at + length
 
 
-@lean
+@refcount_free
 def _copy(data: ByteArray, begins: IntArray, lengths: IntArray, rooms: IntArray, into: ByteArray) -> None:
     to = 0
     for k in range(len(begins)):
@@ -195,7 +196,7 @@ def _copy(data: ByteArray, begins: IntArray, lengths: IntArray, rooms: IntArray,
         to += rooms[k]
 
 
-@lean
+@refcount_free
 def _unpack(data: ByteArray, begins: IntArray, counts: IntArray, sizes: IntArray, into: IntArray) -> None:
     to = 0
     for k in range(len(begins)):

@@ -12,10 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from schemas import grid, tables, wire
-from schemas.decoding import decode
 from schemas.errors import WireError
 from schemas.proto import gripmap_pb2 as pb
-from schemas.wire import Batch, Kind
+from schemas.wire import Batch, Kind, decode
 from tests.schemas.examples import DATA, MESSAGES, acknowledgement, alert, batch
 
 NUMPY_OF = {"double": "float64", "float": "float32", "sfixed64": "int64"}

@@ -1,0 +1,111 @@
+"""Many payloads → one set of columns. Python is touched per message and per column, never per record.
+
+A compiled walk (`schemas.runtime.protobuf_scan`) finds the fields in the bytes of all messages; then column by column
+the values of all are taken together. What the walk does not understand, JSON among it, the protobuf library reads and
+writes anew in the plain form, so that there is one way from bytes to columns. What is wrong with a message is an error
+beside the others and never their loss.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas import mugrid
+from schemas.errors import WireError
+from schemas.numeric import BoolArray, IntArray
+from schemas.runtime.protobuf_scan import NUMBERS, TEXTS, Walked, gather, walk
+from schemas.wire import ENCODING, MAX_BYTES, PLAIN, Columns, Kind, column_types
+from schemas.wire.batches import ABSENT, LIKELIHOOD, Decoded, Heads, Sent, complete, message_of
+
+
+def decode_many(kind: Kind, payloads: Sequence[tuple[bytes, str]]) -> Decoded:
+    """Read batches of one kind from payloads and their encodings."""
+    errors: list[tuple[int, WireError]] = []
+    usual = {ENCODING[kind], *PLAIN}
+    plain = [payload if encoding in usual and len(payload) <= MAX_BYTES else b"" for payload, encoding in payloads]
+    data, walked = _walked(kind, plain, True)
+    places = list(range(len(plain)))
+    if not walked.understood.all():
+        for place in np.flatnonzero(~walked.understood).tolist():
+            try:
+                plain[place] = _plainly(kind, *payloads[place])
+            except WireError as error:
+                errors.append((place, error))
+        wrong = {place for place, _ in errors}
+        places = [place for place in places if place not in wrong]
+        data, walked = _walked(kind, [plain[place] for place in places], False)
+        assert walked.understood.all(), "the protobuf library writes what we do not read"
+    fields = _Fields(kind, data, walked)
+    return complete(Decoded(places, fields.heads(), *fields.columns(), errors), fields.sent())
+
+
+def _walked(kind: Kind, messages: list[bytes], strict: bool) -> tuple[NDArray[np.uint8], Walked]:
+    data = np.frombuffer(b"".join(messages), np.uint8)
+    return data, walk(kind, data, np.cumsum(np.fromiter(map(len, messages), np.int64, len(messages))), strict)
+
+
+def _plainly(kind: Kind, payload: bytes, encoding: str) -> bytes:
+    """A message as our own encoder writes it.
+
+    Raises:
+        WireError: it is none.
+    """
+    message = message_of(kind, payload, encoding)
+    message.DiscardUnknownFields()
+    data: bytes = message.SerializeToString()
+    return data
+
+
+class _Fields(NamedTuple):
+    """The fields of k messages, where they lie."""
+
+    kind: Kind
+    data: NDArray[np.uint8]
+    walked: Walked
+
+    @property
+    def sizes(self) -> IntArray:
+        """Records of each message."""
+        return self.walked.sizes
+
+    def sent(self) -> Sent:
+        """Which messages come with which column."""
+        given = self.walked.counts > 0
+        return Sent(self.kind, self.sizes, {name: given[:, at] for at, name in enumerate(column_types(self.kind))})
+
+    def heads(self) -> Heads:
+        """Heads, with the first of all sequence numbers held where the sender does not say which."""
+        data = self.data.tobytes()
+        texts = {
+            name: [
+                str(data[begin:end], "utf-8") for begin, end in zip(*self.walked.texts[:, at].T.tolist(), strict=True)
+            ]
+            for at, name in enumerate(TEXTS)
+        }
+        boot, region, seq, first_held = (self.walked.numbers[:, at].copy() for at in range(len(NUMBERS)))
+        first_held[first_held == 0] = 1
+        return Heads(self.kind, texts["vehicle"], boot, region, seq, first_held, texts["estimator"])
+
+    def columns(self) -> tuple[IntArray, Columns, BoolArray]:
+        """Sizes, columns as they were sent (integers wide) or filled, and which records have a likelihood."""
+        out: Columns = {}
+        n = int(self.sizes.sum())
+        likelihood = np.zeros(n, bool)
+        for at, (name, dtype) in enumerate(column_types(self.kind).items()):
+            column: NDArray[Any]
+            if name == LIKELIHOOD:
+                likelihood, column = (
+                    np.repeat(self.walked.counts[:, at] > 0, self.sizes),
+                    np.zeros((n, mugrid.BINS), np.uint8),
+                )
+            elif dtype.kind == "f":
+                column = np.full(n, np.nan, dtype)
+            else:
+                column = np.full(n, ABSENT.get(name, 0), np.int64)
+            gather(self.data, self.walked, at, self.kind, column)
+            out[name] = column
+        return self.sizes, out, likelihood

@@ -1,0 +1,230 @@
+"""One batch from its bytes, and what every decoder shares: heads, checks, and the columns that a sender may leave out.
+
+A column that is not sent is filled: floats with NaN, the cell and the sector from the pose, the leaving time from the
+entering one. Many batches at once, at speed: `schemas.runtime.batch_decoder`.
+"""
+
+from __future__ import annotations
+
+from itertools import compress
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas import grid, mugrid
+from schemas.errors import WireError
+from schemas.numeric import BoolArray, IntArray
+from schemas.wire.codec import ENCODING, MAX_ROWS, MESSAGES, NEEDED, Batch, Columns, Kind, column_types, parse
+
+ABSENT: Final = {"abs_active": -1}  # what an absent integer reads as, where it is not 0
+LIKELIHOOD: Final = "log_likelihood"
+
+
+class Head(NamedTuple):
+    """What a batch says of itself, beside its records."""
+
+    kind: Kind
+    vehicle: str
+    boot: int
+    region: int
+    seq: int
+    first_held: int
+    estimator: str
+
+
+class Heads(NamedTuple):
+    """The same of k batches, by column."""
+
+    kind: Kind
+    vehicle: list[str]
+    boot: IntArray
+    region: IntArray
+    seq: IntArray
+    first_held: IntArray
+    estimator: list[str]
+
+    def at(self, place: int) -> Head:
+        """The head of one."""
+        return Head(
+            self.kind, self.vehicle[place], int(self.boot[place]), int(self.region[place]), int(self.seq[place]),
+            int(self.first_held[place]), self.estimator[place],
+        )  # fmt: skip
+
+    def take(self, kept: BoolArray) -> Heads:
+        """Some of them."""
+        return Heads(
+            self.kind, list(compress(self.vehicle, kept)), self.boot[kept], self.region[kept], self.seq[kept],
+            self.first_held[kept], list(compress(self.estimator, kept)),
+        )  # fmt: skip
+
+
+class Decoded(NamedTuple):
+    """The good ones of several messages.
+
+    Attributes:
+        places: which messages these are, (k,).
+        heads: of each.
+        sizes: records of each, (k,).
+        columns: every column of the kind's table, all records one after the other, (n,); `log_likelihood` is (n, 32).
+        with_likelihood: whether a record came with one, (n,).
+        errors: place and reason of each message that is no batch.
+    """
+
+    places: list[int]
+    heads: Heads
+    sizes: IntArray
+    columns: Columns
+    with_likelihood: BoolArray
+    errors: list[tuple[int, WireError]]
+
+
+class Sent(NamedTuple):
+    """Which columns the senders of k batches gave.
+
+    Attributes:
+        kind: of all batches.
+        sizes: records of each, (k,).
+        columns: name of every column → whether each batch came with it, (k,).
+    """
+
+    kind: Kind
+    sizes: IntArray
+    columns: dict[str, BoolArray]
+
+    def records(self, name: str) -> BoolArray:
+        """Which records come with a column, (n,)."""
+        return np.repeat(self.columns[name], self.sizes)
+
+
+def message_of(kind: Kind, payload: bytes, encoding: str) -> Any:  # noqa: ANN401 protobuf messages are untyped
+    """A batch as the protobuf library reads it, its columns of one length.
+
+    Raises:
+        WireError: too large, not the message, no needed column, or columns of unequal length.
+    """
+    message = parse(payload, encoding, MESSAGES[kind], ENCODING[kind])
+    _check(message, kind)
+    return message
+
+
+def decode(payload: bytes, encoding: str, kind: Kind) -> Batch:
+    """Read one batch; the inverse of `encode` for every column that was sent.
+
+    Raises:
+        WireError: too large, not the message, no needed column, unequal columns, a number that does not fit.
+    """
+    message = message_of(kind, payload, encoding)
+    n = len(getattr(message, NEEDED[kind][0]))
+    given = {name: np.array([len(getattr(message, name)) > 0]) for name in column_types(kind)}
+    sent = Sent(kind, np.array([n]), given)
+    columns = {name: _column(message, name, dtype, n) for name, dtype in column_types(kind).items()}
+    numbers = (np.array([getattr(message, name)], np.int64) for name in ("boot", "region", "seq", "first_held"))
+    boot, region, seq, first_held = numbers
+    heads = Heads(
+        kind, [message.vehicle], boot, region, seq, np.where(first_held == 0, 1, first_held), [message.estimator]
+    )
+    likelihood = sent.records(LIKELIHOOD) if kind is Kind.OBSERVATION else np.zeros(n, bool)
+    found = complete(Decoded([0], heads, sent.sizes, columns, likelihood, []), sent)
+    for _, error in found.errors:
+        raise error
+    if kind is Kind.OBSERVATION and not likelihood.all():
+        found.columns[LIKELIHOOD] = found.columns[LIKELIHOOD][:, :0]
+    return Batch(kind, *found.heads.at(0)[1:-1], found.columns, message.estimator)
+
+
+def _column(message: Any, name: str, dtype: np.dtype[Any], n: int) -> NDArray[Any]:  # noqa: ANN401
+    """A column of a message as it was sent (integers wide), or filled."""
+    values = getattr(message, name)
+    if name == LIKELIHOOD:
+        return np.frombuffer(values or bytes(n * mugrid.BINS), np.uint8).reshape(n, mugrid.BINS)
+    if dtype.kind == "f":
+        return np.array(values, dtype) if values else np.full(n, np.nan, dtype)
+    return np.array(values, np.int64) if values else np.full(n, ABSENT.get(name, 0), np.int64)
+
+
+def _check(message: Any, kind: Kind) -> None:  # noqa: ANN401
+    """Whether a message's columns have the lengths that they should.
+
+    Raises:
+        WireError: they have not.
+    """
+    first = NEEDED[kind][0]
+    n = len(getattr(message, first))
+    if not 1 <= n <= MAX_ROWS:
+        raise WireError(first, f"{n} records", f"send 1 to {MAX_ROWS}")
+    for name in column_types(kind):
+        given = len(getattr(message, name))
+        if name == LIKELIHOOD:
+            if given not in (0, n * mugrid.BINS):
+                raise WireError(name, f"{given} bytes for {n} records", f"send {mugrid.BINS} a record, or none")
+        elif given != n and (given or name in NEEDED[kind]):
+            raise WireError(name, f"has {given} records, {first} has {n}", "give every column the same length")
+
+
+def complete(found: Decoded, sent: Sent) -> Decoded:
+    """Derive what follows from the pose; drop messages of which a number does not fit, or that have no place."""
+    kind, columns = sent.kind, found.columns
+    bad: dict[int, WireError] = {}
+    owner = np.repeat(np.arange(len(found.sizes)), found.sizes)
+
+    def refuse(rows: NDArray[np.bool_], error: WireError) -> None:
+        for at in np.unique(owner[rows]).tolist():
+            bad.setdefault(at, error)
+
+    for name, dtype in column_types(kind).items():
+        if dtype.kind == "i" and dtype.itemsize < 8:
+            limits = np.iinfo(dtype)
+            outside = (columns[name] < limits.min) | (columns[name] > limits.max)
+            refuse(outside, WireError(name, f"does not fit {dtype}", "use the values that the .proto names"))
+            columns[name] = np.where(outside, 0, columns[name]).astype(dtype)
+    placed = sent.records("cell") if kind is Kind.OBSERVATION else np.zeros(len(owner), bool)
+    homeless = np.repeat(found.heads.region == 0, found.sizes)
+    needs_place = ~placed & (homeless | (kind is Kind.OBSERVATION))
+    for name in ("latitude", "longitude"):
+        nowhere = ~(np.abs(columns[name]) <= 180.0) & needs_place
+        refuse(nowhere, WireError(name, "is not a position", "send finite degrees"))
+        needs_place &= ~nowhere
+    if kind is Kind.OBSERVATION:
+        _derive(columns, sent, needs_place)
+    heads = _with_regions(found, columns)
+    if not bad:
+        return found._replace(heads=heads)
+    kept = np.array([at not in bad for at in range(len(found.sizes))])
+    rows = kept[owner]
+    return Decoded(
+        list(compress(found.places, kept)), heads.take(kept), found.sizes[kept],
+        {name: column[rows] for name, column in columns.items()}, found.with_likelihood[rows],
+        found.errors + [(found.places[at], error) for at, error in bad.items()],
+    )  # fmt: skip
+
+
+def _derive(columns: Columns, sent: Sent, unplaced: BoolArray) -> None:
+    """Fill what a sender of observations may leave out. `unplaced`: rows without a cell, at a finite position."""
+    without = ~sent.records("leave_time")
+    columns["leave_time"] = np.where(without, columns["enter_time"], columns["leave_time"])
+    if unplaced.any():
+        at = np.flatnonzero(unplaced)
+        columns["cell"] = columns["cell"].copy()
+        columns["cell"][at] = grid.cell_of(columns["latitude"][at], columns["longitude"][at])
+    unsaid = ~sent.columns["sector"]
+    if unsaid.any():
+        starts = np.cumsum(sent.sizes) - sent.sizes
+        headed = np.logical_and.reduceat(np.isfinite(columns["yaw"]), starts)
+        rows = np.repeat(unsaid & headed, sent.sizes)
+        columns["sector"][rows] = grid.sector_of(columns["yaw"][rows])
+
+
+def _with_regions(found: Decoded, columns: Columns) -> Heads:
+    """Heads, with the region of the first record where the sender did not name it."""
+    heads, homeless = found.heads, found.heads.region == 0
+    if not homeless.any():
+        return heads
+    rows = (np.cumsum(found.sizes) - found.sizes)[homeless]
+    if "cell" in columns:
+        cell = columns["cell"][rows]
+    else:
+        cell = grid.cell_of(*(np.nan_to_num(columns[name][rows]) for name in ("latitude", "longitude")))
+    region = heads.region.copy()
+    region[homeless] = grid.region_of(cell)
+    return heads._replace(region=region)
