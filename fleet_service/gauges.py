@@ -59,7 +59,7 @@ def metrics(engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path) -> 
         gauge("cells", "cells and sectors with a belief", engine.fusion.size),
         gauge("window_observations", "observations younger than the checkpoint", engine.fusion.waiting),
         gauge("alerts", "cells under an alert", engine.alerts),
-        gauge("damaged_files", "segments set aside", sum(1 for _ in root.rglob("*.bad"))),
+        gauge("damaged_files", "files set aside, as last counted", counts.get("files_set_aside", 0)),
     ]  # fmt: skip
 
 

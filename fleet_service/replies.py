@@ -6,6 +6,7 @@ asking for history.
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -18,6 +19,7 @@ from schemas import keys, query
 from schemas.errors import InputError
 from schemas.query import MapQuery
 
+log = logging.getLogger(__name__)
 TEXT: Final = "text/plain"
 Answering = Callable[[MapQuery, Callable[[int], bool], int | None], Iterable[tuple[int, bytes]]]
 
@@ -28,7 +30,7 @@ class Replies:
     Args:
         answer: gives tile and payload of every reply to a query, for the tiles that a predicate wants, and the only
             one, where the query's key is a tile's.
-        counts: takes `queries`, and `bad_queries.FIELD`.
+        counts: takes `queries`, `bad_queries.FIELD` and `answer_failures`.
     """
 
     def __init__(self, answer: Answering, counts: Counter[str]) -> None:
@@ -54,8 +56,6 @@ class Replies:
     def _rebuild(self, asked: zenoh.Query, wanted: MapQuery) -> None:
         try:
             self._reply(asked, wanted)
-        except zenoh.ZError:  # the session closed meanwhile: nobody is there to hear it
-            pass
         finally:
             self._past.release()
 
@@ -65,6 +65,14 @@ class Replies:
                 self._send(asked, wanted)
             except InputError as error:
                 self._refuse(asked, error)
+            except zenoh.ZError:  # the session closed meanwhile: nobody is there to hear it
+                pass
+            except Exception as error:  # whatever it is: a query that ends without a reply says that there is no data
+                self._counts["answer_failures"] += 1
+                log.exception("a query could not be answered")
+                asked.reply_err(
+                    f"query: could not be answered ({type(error).__name__}); ask again later", encoding=TEXT
+                )
 
     def _send(self, asked: zenoh.Query, wanted: MapQuery) -> None:
         expression = asked.key_expr

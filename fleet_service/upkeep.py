@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from fleet_service.archive import checkpoints, segments, snapshots
+from fleet_service.archive import checkpoints, reading, segments, snapshots
 from fleet_service.archive.retention import retire
 from fleet_service.engine import Engine
 from schemas.config import ServiceConfig
@@ -24,6 +24,7 @@ from schemas.wire import Kind
 
 ROUND_ROWS: Final = 250_000  # of one round of compaction: a second of work, 150 MB
 LOOK_S: Final = 0.1  # between two looks whether a compaction has ended, or shall
+INVENTORY_S: Final = 300.0  # thousands of files are looked through in a tenth of a second
 DAY_S: Final = 86_400.0
 SOON_S: Final = 60.0  # after the start; the first turn of a job does not wait for its whole interval
 _NICE: Final = 10  # the worker goes first
@@ -64,11 +65,16 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path) -> list[Job]
         done = retire(root, config.raw_days, datetime.now(UTC).date())
         return f"retired: {done.days} days" if done.days else None
 
+    def inventory(_: threading.Event) -> str | None:
+        engine.counts["files_set_aside"] = reading.set_aside(root)
+        return None
+
     return [
         Job("compaction", config.compact_s, compaction),
         Job("checkpoint", config.checkpoint_s, checkpoint),
         Job("snapshot", config.snapshot_s, snapshot),
         Job("retention", DAY_S if config.raw_days else 0.0, retention),
+        Job("inventory", INVENTORY_S, inventory),
     ]
 
 

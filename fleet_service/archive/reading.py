@@ -155,8 +155,8 @@ def load(
 
 
 def set_aside(root: Path) -> int:
-    """How many damaged files lie in an archive."""
-    return sum(1 for _ in root.rglob(f"*.parquet{BAD}"))
+    """How many damaged files lie in an archive; walks through all of it."""
+    return sum(1 for _ in root.rglob(f"*{BAD}"))
 
 
 def _sound(table: pa.Table, columns: list[str] | None) -> pa.Table:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from prometheus_client.openmetrics.parser import text_string_to_metric_families
 from fleet_service import gauges
 from fleet_service.engine import Engine
 from fleet_service.gauges import Pulse
+from fleet_service.upkeep import archive_jobs
 from schemas import wire
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.wire import Kind
@@ -51,6 +53,24 @@ def test_a_service_shows_what_it_took_refused_and_keeps_waiting(
         assert 1.0 <= found["report_lag_seconds"] < 60.0
         status, _, text = fetch(f"{address}/healthz")
         assert (status, json.loads(text)["troubles"]) == (200, [])
+
+
+def test_damaged_files_are_counted_by_a_job_and_not_by_who_reads_the_metrics(tmp_path: Path) -> None:
+    config, pulse = ServiceConfig(), Pulse(turn_age_s=0.1, queued=0, routers=1, clock_lag_s=0.0)
+    engine = Engine(config, tmp_path)
+
+    def damaged() -> object:
+        found = {metric.name: metric.values for metric in gauges.metrics(engine, pulse, config, tmp_path)}
+        return found["damaged_files"][""]
+
+    (tmp_path / "weather").mkdir(exist_ok=True)
+    for name in ("inbox/a.parquet.bad", "weather/b.parquet.bad"):
+        (tmp_path / name).touch()
+    assert damaged() == 0, "a scrape walks through no archive"
+    (inventory,) = (job for job in archive_jobs(engine, config, tmp_path) if job.name == "inventory")
+    inventory.work(threading.Event())
+    assert damaged() == 2
+    engine.close()
 
 
 def test_each_trouble_is_told(tmp_path: Path) -> None:
