@@ -49,7 +49,7 @@ spark-test: setup  ## Spark beside DuckDB; installs it, wants a Java
 	$(BIN)/python -m pytest -q -m long tests/fleet_service/analytics/test_spark.py
 
 tune: setup  ## the ant colony over the memberships; writes the shipped file anew
-	$(BIN)/edge-agent tune --out edge_agent/tuning/tuned/aco-fckf.json
+	$(BIN)/edge-agent tune --out edge_agent/app/tuned/aco-fckf.json
 
 proto: setup  ## generate the message module from the .proto
 	$(BIN)/python -m grpc_tools.protoc -I schemas/proto --python_out=schemas/proto --pyi_out=schemas/proto gripmap.proto

@@ -17,12 +17,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from edge_agent.banks import bank_of
-from edge_agent.observer import Records
-from edge_agent.pipeline import Pipeline
-from edge_agent.simulation import SimulatedFleet
-from edge_agent.sources import Block, absolute
-from edge_agent.truth import TruthRecorder
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.inputs.block import Block, absolute
+from edge_agent.lab.simulation import SimulatedFleet
+from edge_agent.lab.truth_file import TruthRecorder
+from edge_agent.observe.observation_builder import Records
+from edge_agent.observe.pipeline import Pipeline
 from schemas.config import AgentConfig
 from schemas.wire import Columns
 

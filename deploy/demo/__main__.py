@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 from deploy.demo import compare, page, picture, processes
 from deploy.demo.listener import Listener
-from edge_agent.simulation.scenarios import scenario_named
+from edge_agent.lab.simulation.scenarios import scenario_named
 from fleet_service.archive.compaction import compact
 from schemas.config import ZenohSettings
 from schemas.runtime import figures

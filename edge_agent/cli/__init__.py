@@ -30,8 +30,8 @@ COMMANDS: Final = (
     Command("replay", "edge_agent.cli.replay", "estimate a recorded drive, and publish it on request"),
     Command("run", "edge_agent.cli.run", "one vehicle, live, in real time"),
     Command("fleet", "edge_agent.cli.fleet", "many simulated vehicles in real time, each with its own session"),
-    Command("tune", "edge_agent.tuning.cli", "tune the fuzzy memberships by ant colony"),
-    Command("evaluate", "edge_agent.evaluation.cli", "the papers' manoeuvres for every estimator, with figures"),
+    Command("tune", "edge_agent.cli.tune", "tune the fuzzy memberships by ant colony"),
+    Command("evaluate", "edge_agent.cli.evaluate", "the papers' manoeuvres for every estimator, with figures"),
 )
 
 

@@ -19,8 +19,8 @@ from schemas.runtime.process import Line, print_line
 if TYPE_CHECKING:
     from types import FrameType
 
-    from edge_agent.agent import Progress
-    from edge_agent.publisher import Publisher
+    from edge_agent.app.live_loop import Progress
+    from edge_agent.publish.publisher import Publisher
 
 
 def checked_name(name: str) -> str:
@@ -42,8 +42,8 @@ def publisher_of(names: Sequence[str], config: AgentConfig, estimator: str) -> P
     Raises:
         InputError: Zenoh refuses its settings, or the spool is in use or unusable.
     """
-    from edge_agent.publisher import Publisher
-    from edge_agent.spool import Spool
+    from edge_agent.publish.outbox import Spool
+    from edge_agent.publish.publisher import Publisher
     from schemas.runtime.zenoh_session import configuration
 
     for name in names:  # a bad setting, or a missing certificate, is to be an error here, not in a thread
@@ -79,7 +79,7 @@ def leave(publisher: Publisher, progress: Progress, drain_s: float) -> None:
     What is unsettled stays in the spool for the next start. A session that hangs on a frozen router would keep the
     interpreter from ending, so the process is then ended from here.
     """
-    from edge_agent.agent import summary
+    from edge_agent.app.live_loop import summary
 
     clean = publisher.close(drain_s)
     if not clean:
@@ -91,7 +91,7 @@ def leave(publisher: Publisher, progress: Progress, drain_s: float) -> None:
 
 def status(progress: Progress, publisher: Publisher, say: Callable[[str], None]) -> None:
     """One line on how it goes."""
-    from edge_agent.agent import summary
+    from edge_agent.app.live_loop import summary
 
     counts = publisher.counts
     late = f", behind real time by {progress.lag_s:.1f} s at the most" if progress.behind else ""

@@ -21,11 +21,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Drive until the duration has passed or a signal comes; write the truth before leaving."""
+    from edge_agent.app.estimates_file import writable
     from edge_agent.cli.live import drive_live
-    from edge_agent.estimates_file import writable
-    from edge_agent.simulation import SimulatedFleet
-    from edge_agent.sources.simulated import blocks
-    from edge_agent.truth import TruthRecorder
+    from edge_agent.lab.simulation import SimulatedFleet
+    from edge_agent.lab.simulation.blocks import blocks
+    from edge_agent.lab.truth_file import TruthRecorder
     from schemas.config import AgentConfig, load
 
     config = load(args.config, AgentConfig)

@@ -8,13 +8,13 @@ from functools import partial
 
 import numpy as np
 
-from edge_agent.agent import ENDED_DRAIN_S, STOPPED_DRAIN_S, Progress, drive
-from edge_agent.banks import bank_of
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.app.live_loop import ENDED_DRAIN_S, STOPPED_DRAIN_S, Progress, drive
+from edge_agent.app.metrics import metrics, troubles
 from edge_agent.cli.common import leave, publisher_of, status, stop_on_signal
-from edge_agent.gauges import metrics, troubles
-from edge_agent.pipeline import Pipeline
-from edge_agent.publisher import Publisher
-from edge_agent.sources import Block
+from edge_agent.inputs.block import Block
+from edge_agent.observe.pipeline import Pipeline
+from edge_agent.publish.publisher import Publisher
 from schemas.config import AgentConfig
 from schemas.runtime.metrics import serving
 from schemas.runtime.process import line_logger, log_as, print_line

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from edge_agent.backfill import Outcome
-    from edge_agent.estimates_file import EstimatesFile
+    from edge_agent.app.backfill import Outcome
+    from edge_agent.app.estimates_file import EstimatesFile
     from edge_agent.estimators import EstimatorBank
-    from edge_agent.sources.replay import Log
+    from edge_agent.inputs.signal_log import Log
     from schemas.config import AgentConfig
 
 DRAIN_S = 30.0  # for a busy service; what is not settled by then stays in the spool
@@ -39,10 +39,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Replay; 0 when everything was written, and acknowledged if it was to be published, else 1."""
-    from edge_agent.backfill import backfill, beside, tasks_of
-    from edge_agent.banks import bank_of
-    from edge_agent.estimates_file import EstimatesFile
-    from edge_agent.sources.replay import read_log
+    from edge_agent.app.backfill import backfill, beside, tasks_of
+    from edge_agent.app.estimates_file import EstimatesFile
+    from edge_agent.app.estimator_factory import bank_of
+    from edge_agent.inputs.signal_log import read_log
     from schemas.config import AgentConfig, load
     from schemas.errors import InputError
     from schemas.vehicle import load_vehicle
@@ -87,9 +87,9 @@ def _told(outcomes: Iterator[Outcome], count: int) -> int:
 def _published(
     name: str, log: Log, start_ns: int, bank: EstimatorBank, estimator: str, config: AgentConfig, file: EstimatesFile
 ) -> int:
-    from edge_agent.agent import Progress
+    from edge_agent.app.live_loop import Progress
     from edge_agent.cli.common import checked_name, leave, publisher_of
-    from edge_agent.pipeline import Pipeline
+    from edge_agent.observe.pipeline import Pipeline
 
     pipeline = Pipeline(bank, 1, config)
     publisher = publisher_of([checked_name(name)], config, estimator)

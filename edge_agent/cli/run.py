@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from edge_agent.sources import Block
+    from edge_agent.inputs.block import Block
     from schemas.vehicle import Vehicle
 
 SIMULATED = "simulated"
@@ -41,15 +41,15 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _simulated(args: argparse.Namespace) -> tuple[Vehicle, str, Iterator[Block]]:
-    from edge_agent.simulation import SimulatedFleet
-    from edge_agent.sources.simulated import blocks
+    from edge_agent.lab.simulation import SimulatedFleet
+    from edge_agent.lab.simulation.blocks import blocks
 
     fleet = SimulatedFleet(args.scenario, 1, args.seed, args.rate)
     return fleet.vehicles[0], args.name or fleet.names[0], blocks(fleet, args.rate)
 
 
 def _logged(args: argparse.Namespace) -> tuple[Vehicle, str, Iterator[Block]]:
-    from edge_agent.sources.replay import read_log
+    from edge_agent.inputs.signal_log import read_log
     from schemas.errors import InputError
     from schemas.vehicle import load_vehicle
 

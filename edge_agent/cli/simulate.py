@@ -24,8 +24,8 @@ def run(args: argparse.Namespace) -> int:
     """Simulate, or list the manoeuvres."""
     import pyarrow.parquet as pq
 
-    from edge_agent.estimates_file import writable
-    from edge_agent.simulation import MANOEUVRES, simulate_manoeuvre
+    from edge_agent.app.estimates_file import writable
+    from edge_agent.lab.simulation import MANOEUVRES, simulate_manoeuvre
     from schemas.errors import InputError
 
     if args.list:

@@ -90,7 +90,7 @@ def create(name: str, vehicles: Sequence[Vehicle], *, memberships: Memberships |
         return PLAIN[name](vehicles)
     if memberships is None:
         if name in TUNED:
-            raise InputError("memberships", f"{name} needs tuned ones", "make it with edge_agent.banks.bank_of")
+            raise InputError("memberships", f"{name} needs tuned ones", "make it with estimator_factory.bank_of")
         memberships = Memberships()
     if name == "paper-aco-fckf":
         return paper_aco_fckf.bank(vehicles, memberships)

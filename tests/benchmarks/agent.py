@@ -11,10 +11,10 @@ import tempfile
 import time
 from pathlib import Path
 
-from edge_agent.backfill import backfill, tasks_of
-from edge_agent.banks import bank_of
+from edge_agent.app.backfill import backfill, tasks_of
+from edge_agent.app.estimator_factory import bank_of
 from edge_agent.cli import main as edge
-from edge_agent.sources.replay import read_log
+from edge_agent.inputs.signal_log import read_log
 from schemas.runtime.figures import Figure
 from schemas.vehicle import load_vehicle
 from tests.benchmarks.measure import median_s
@@ -23,8 +23,8 @@ from tests.faults.processes import stage
 EDGE = (sys.executable, "-c", "import sys; from edge_agent.cli import main; sys.exit(main())")
 FIRST = """import sys
 from pathlib import Path
-from edge_agent.banks import bank_of
-from edge_agent.sources.replay import read_log
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.inputs.signal_log import read_log
 from schemas.vehicle import load_vehicle
 bank = bank_of("aco-fckf", [load_vehicle(Path(sys.argv[2]))])
 block = next(read_log(Path(sys.argv[1])).blocks(0))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge_agent.banks import bank_of
-from edge_agent.simulation import simulate_manoeuvre
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.lab.simulation import simulate_manoeuvre
 from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
 from schemas.signals import CHANNELS

@@ -8,11 +8,11 @@ from importlib.util import find_spec
 
 import numpy as np
 
-from edge_agent.banks import bank_of
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.app.tuned_memberships import shipped
 from edge_agent.dynamics.parameters import parameter_table
 from edge_agent.estimators import TUNED, Estimates, EstimatorBank
-from edge_agent.simulation import simulate_manoeuvre
-from edge_agent.tuning.tuned import shipped
+from edge_agent.lab.simulation import simulate_manoeuvre
 from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
 from schemas.signals import CHANNELS, S

@@ -12,9 +12,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from edge_agent.observer import Open, Records, observe
-from edge_agent.sources import Block, absolute
-from edge_agent.visits import Located, Track, locate
+from edge_agent.inputs.block import Block, absolute
+from edge_agent.observe.cell_tracker import Located, Track, locate
+from edge_agent.observe.observation_builder import Open, Records, observe
 from schemas import mugrid
 from schemas.config import AgentConfig
 from schemas.numeric import FloatArray

@@ -17,7 +17,7 @@ import pytest
 
 from edge_agent.cli import COMMANDS, main
 from edge_agent.estimators import ESTIMATORS
-from edge_agent.simulation import MANOEUVRES
+from edge_agent.lab.simulation import MANOEUVRES
 from schemas import tables
 from schemas.vehicle import load_vehicle
 from schemas.wire import Kind
@@ -255,7 +255,7 @@ def test_a_setting_that_zenoh_refuses_is_named(drive: Path, tmp_path: Path, caps
 
 
 def test_a_spool_in_use_is_refused(drive: Path, tmp_path: Path, router: Router, capsys: Output) -> None:
-    from edge_agent.spool import Spool
+    from edge_agent.publish.outbox import Spool
 
     options = ["--publish", *config(tmp_path, router), "--name", "car-one"]
     spool = Spool(tmp_path / "spool.sqlite")

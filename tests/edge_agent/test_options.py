@@ -15,13 +15,13 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from edge_agent.banks import bank_of
-from edge_agent.batching import Batcher
+from edge_agent.app.estimator_factory import bank_of
 from edge_agent.cli import COMMANDS, main
-from edge_agent.pipeline import Pipeline
-from edge_agent.simulation import SimulatedFleet
-from edge_agent.sources import Block
-from edge_agent.sources.simulated import blocks
+from edge_agent.inputs.block import Block
+from edge_agent.lab.simulation import SimulatedFleet
+from edge_agent.lab.simulation.blocks import blocks
+from edge_agent.observe.pipeline import Pipeline
+from edge_agent.publish.batching import Batcher
 from schemas.config import AgentConfig
 from schemas.numeric import FloatArray
 from schemas.vehicle import Vehicle

@@ -13,7 +13,7 @@ import tempfile
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from edge_agent.spool import Draft, Spool, Stream
+from edge_agent.publish.outbox import Draft, Spool, Stream
 from schemas.wire import Kind
 
 PAGE: Final = 4096

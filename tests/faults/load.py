@@ -20,10 +20,10 @@ from pathlib import Path
 
 import numpy as np
 
-from edge_agent.agent import STOPPED_DRAIN_S
-from edge_agent.observer import Records
-from edge_agent.publisher import Publisher
-from edge_agent.spool import Draft, Held, Spool, Stream
+from edge_agent.app.live_loop import STOPPED_DRAIN_S
+from edge_agent.observe.observation_builder import Records
+from edge_agent.publish.outbox import Draft, Held, Spool, Stream
+from edge_agent.publish.publisher import Publisher
 from schemas import grid, mugrid
 from schemas.config import AgentConfig, ZenohSettings
 from schemas.numeric import IntArray

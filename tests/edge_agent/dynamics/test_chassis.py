@@ -13,7 +13,7 @@ from edge_agent.dynamics.drive_wheel import ELECTRIC_S, blended, drive_wheel, sl
 from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import P, body, four, parameter_row
 from edge_agent.dynamics.tyres import brush
-from edge_agent.simulation.presets import PRESETS
+from edge_agent.lab.simulation.presets import PRESETS
 from schemas.numeric import FloatArray
 
 ROW = parameter_row(PRESETS["sedan"].vehicle)

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from edge_agent.simulation import simulate_manoeuvre
+from edge_agent.lab.simulation import simulate_manoeuvre
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS
 from schemas.vehicle import Vehicle

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.banks import bank_of
+from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates, create
 from edge_agent.estimators.estimates import COLUMNS
 from schemas.errors import InputError

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.banks import bank_of
+from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates, adaptive_federated_ckf, compensated_wckf, create, paper_aco_fckf
 from edge_agent.estimators.estimates import COLUMNS
 from edge_agent.estimators.paper_aco_fckf import Setting
-from edge_agent.observer import Open, observe
-from edge_agent.visits import Track, locate
+from edge_agent.observe.cell_tracker import Track, locate
+from edge_agent.observe.observation_builder import Open, observe
 from schemas.config import AgentConfig
 from schemas.errors import InputError
 from schemas.numeric import FloatArray

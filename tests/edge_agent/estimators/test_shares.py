@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edge_agent.banks import bank_of
+from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import ESTIMATORS
 from edge_agent.estimators.estimates import COLUMNS
 from edge_agent.estimators.shares import in_shares

@@ -97,13 +97,13 @@ def test_warnings_of_the_program_take_the_same_form() -> None:
     level = logging.root.level
     try:
         log_as("json", stream, service="shard-0")
-        logging.getLogger("edge_agent.publisher").warning("batch %d was rejected", 7)
+        logging.getLogger("edge_agent.publish.publisher").warning("batch %d was rejected", 7)
     finally:
         logging.root.handlers[:] = before
         logging.root.setLevel(level)
     record = json.loads(stream.getvalue())
     assert (record["level"], record["event"], record["message"]) == (
         "warning",
-        "edge_agent.publisher",
+        "edge_agent.publish.publisher",
         "batch 7 was rejected",
     )

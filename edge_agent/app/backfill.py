@@ -1,0 +1,79 @@
+"""Many recorded drives to estimates, several at a time.
+
+Threads and not processes: the kernels and Parquet release the interpreter's lock, and the compiled code is loaded once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+from typing import NamedTuple
+
+from edge_agent.app.estimates_file import EstimatesFile
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.inputs.signal_log import read_log
+from schemas.errors import InputError
+from schemas.vehicle import load_vehicle
+
+
+class Task(NamedTuple):
+    """A signal log, the vehicle that recorded it, and where its estimates go."""
+
+    log: Path
+    vehicle: Path
+    out: Path
+
+
+class Outcome(NamedTuple):
+    """What became of a task: samples estimated, and why it could not be done."""
+
+    task: Task
+    samples: int
+    error: InputError | None
+
+
+def tasks_of(logs: Sequence[Path], vehicle: Path | None, folder: Path) -> list[Task]:
+    """One task per log, its estimates under the log's name in `folder`; its vehicle file beside it unless one is given.
+
+    Raises:
+        InputError: two logs have one name, or estimates would replace a log.
+    """
+    tasks = [Task(log, vehicle or beside(log), folder / f"{log.stem}.parquet") for log in logs]
+    seen: dict[Path, Path] = {}
+    for task in tasks:
+        if (other := seen.setdefault(task.out, task.log)) is not task.log:
+            raise InputError("log", f"{other} and {task.log} would both write {task.out}", "rename one of them")
+        if task.out.resolve() == task.log.resolve():
+            raise InputError("out", f"estimates would replace the log {task.log}", "choose another folder")
+    return tasks
+
+
+def beside(log: Path) -> Path:
+    """The vehicle file of a log: the same name, ending in .json."""
+    return log.with_suffix(".json")
+
+
+def backfill(tasks: Sequence[Task], estimator: str, jobs: int) -> Iterator[Outcome]:
+    """Estimate all drives, `jobs` at a time; outcomes as they come. A bad drive stops no other.
+
+    Raises:
+        InputError: jobs is below 1.
+    """
+    if jobs < 1:
+        raise InputError("jobs", f"{jobs} is below 1", "give at least one job")
+    with ThreadPoolExecutor(jobs) as pool:
+        for future in as_completed([pool.submit(estimate, task, estimator) for task in tasks]):
+            yield future.result()
+
+
+def estimate(task: Task, estimator: str) -> Outcome:
+    """Estimate one drive."""
+    try:
+        bank, log = bank_of(estimator, [load_vehicle(task.vehicle)]), read_log(task.log)
+        with EstimatesFile(task.out) as file:
+            for block in log.blocks(0):
+                file.write(block.t, bank.advance(block.t, block.signals))
+    except InputError as error:
+        return Outcome(task, 0, error)
+    return Outcome(task, len(log.t), None)

@@ -1,0 +1,91 @@
+"""The live loop: blocks of samples in real time through the pipeline to the publisher, until told to stop.
+
+The clock paces the loop. A block that is worked off more than its own length too late counts as behind; nothing is
+skipped: a loop that fell behind catches up as fast as it can, and says so.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from edge_agent.inputs.block import Block
+from edge_agent.observe.pipeline import Pipeline
+from edge_agent.publish.publisher import Publisher
+from schemas.wire import Kind
+
+STATUS_EVERY_S = 5.0
+STOPPED_DRAIN_S = 1.7  # a signalled agent is gone within 3 s, with a second for sessions that hang
+ENDED_DRAIN_S = 10.0  # at its own end it may wait for a busy service
+
+
+@dataclass
+class Progress:
+    """How far the loop is: seconds of signals, blocks, blocks that were behind, the longest and the last lag [s]."""
+
+    signals_s: float = 0.0
+    blocks: int = 0
+    behind: int = 0
+    lag_s: float = 0.0
+    now_s: float = 0.0
+
+
+def drive(
+    blocks: Iterator[Block],
+    pipeline: Pipeline,
+    publisher: Publisher,
+    stop: threading.Event,
+    on_status: Callable[[Progress], None],
+    *,
+    duration_s: float = float("inf"),
+    clock: Callable[[], float] = time.monotonic,
+    progress: Progress | None = None,
+) -> Progress:
+    """Run until the blocks end, `duration_s` has passed or `stop` is set; then close the open visits.
+
+    `progress` is kept up to date while it runs, for others to look at, and returned.
+    """
+    progress, status_at = progress or Progress(), STATUS_EVERY_S
+    started = first = float("nan")
+    for block in blocks:
+        _, observations, states = pipeline.step(block)
+        publisher.offer(observations, states)
+        if not progress.blocks:
+            started, first = clock(), float(block.t.min())  # the first block may have had to load kernels
+        length = float(block.t.max()) - first - progress.signals_s
+        progress.signals_s += length
+        progress.blocks += 1
+        lag = clock() - started - progress.signals_s
+        progress.behind += lag > length
+        progress.lag_s, progress.now_s = max(progress.lag_s, lag), max(lag, 0.0)
+        if stop.wait(max(0.0, -lag)) or clock() - started >= duration_s:
+            break
+        if clock() - started >= status_at:
+            status_at += STATUS_EVERY_S
+            on_status(progress)
+    if (last := pipeline.finish()) is not None:
+        publisher.offer(last)
+    return progress
+
+
+def summary(progress: Progress, publisher: Publisher) -> dict[str, float]:
+    """Counts of records at the end, all kinds together and observations alone; lags and blocks of the loop."""
+    counts, seen = publisher.counts, Kind.OBSERVATION
+    return {
+        "published": sum(counts.published.values()),
+        "acknowledged": sum(counts.acknowledged.values()),
+        "unsettled": publisher.unsettled(),
+        "rejected": sum(counts.rejected.values()),
+        "dropped": publisher.dropped,
+        "behind": progress.behind,
+        "blocks": progress.blocks,
+        "lag_s": round(progress.lag_s, 3),
+        "signals_s": round(progress.signals_s, 3),
+        "resent_batches": counts.resent_batches,
+        "observations_published": counts.published[seen],
+        "observations_acknowledged": counts.acknowledged[seen],
+        "observations_unsettled": publisher.unsettled(seen),
+        "observations_rejected": counts.rejected[seen],
+    }

@@ -1,0 +1,44 @@
+"""What an operator sees of an agent in numbers, and what counts as trouble."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+from edge_agent.app.live_loop import Progress
+from edge_agent.publish.publisher import Publisher
+from schemas.runtime.metrics import Metric, gauge
+from schemas.wire import Kind
+
+BEHIND_S: Final = 1.0  # of real time, from which on the agent is too slow for its vehicles
+_NAMES: Final = {Kind.OBSERVATION: "observation", Kind.STATE: "state"}
+
+
+def metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
+    """All values, now; records are counted by kind."""
+    counts = publisher.counts
+    return [
+        Metric("published_records", "counter", "put on disk and sent", _named(counts.published), "kind"),
+        Metric("acknowledged_records", "counter", "held by a service", _named(counts.acknowledged), "kind"),
+        Metric("rejected_records", "counter", "refused by a service for good", _named(counts.rejected), "kind"),
+        Metric("dropped_records", "counter", "given up for want of room", {"": publisher.dropped}),
+        Metric("resent_batches", "counter", "sent again", {"": counts.resent_batches}),
+        Metric("bad_acks", "counter", "acknowledgements that could not be read", {"": counts.bad_acks}),
+        gauge("unsettled_records", "neither acknowledged nor rejected yet", publisher.unsettled()),
+        gauge("sessions", "sessions that are open", publisher.links),
+        gauge("blocks_behind", "blocks that were worked off too late", progress.behind),
+        gauge("lag_seconds", "behind real time, at the last block", progress.now_s),
+        gauge("longest_lag_seconds", "behind real time, at the most", progress.lag_s),
+    ]  # fmt: skip
+
+
+def troubles(publisher: Publisher, progress: Progress) -> list[str]:
+    """What is not as it should be."""
+    found = [] if publisher.links else ["no session is open"]
+    if progress.now_s > BEHIND_S:
+        found.append(f"{progress.now_s:.1f} s behind real time")
+    return found
+
+
+def _named(counts: Mapping[Kind, int]) -> dict[str, float]:
+    return {_NAMES[kind]: number for kind, number in counts.items()}

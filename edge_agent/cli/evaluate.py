@@ -1,0 +1,61 @@
+"""`edge-agent evaluate`: the campaign, its figures.json, its Markdown table and its plots."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import sys
+import time
+from pathlib import Path
+from typing import Final
+
+from schemas.errors import InputError
+
+LEAST_SEEDS: Final = 20  # of a campaign whose bars count
+QUICK_SEEDS: Final = 2
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--out", type=Path, required=True, help="folder for figures.json, report.md and the plots")
+    parser.add_argument("--quick", action="store_true", help="three scenarios, two estimators, two seeds: does it run?")
+    parser.add_argument("--seeds", type=int, help=f"how many drives per scenario (default {LEAST_SEEDS})")
+    parser.add_argument("--no-plots", action="store_true", help="figures and table only; needs no matplotlib")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Evaluate; 0 when all bars hold that were measured, else 1.
+
+    Raises:
+        InputError: too few seeds, the folder cannot be made, or matplotlib is not installed.
+    """
+    from edge_agent.lab.evaluation.bars import figures as figures_of
+    from edge_agent.lab.evaluation.campaign import run as campaign
+    from edge_agent.lab.evaluation.report import report
+    from schemas.runtime.figures import write
+
+    count = args.seeds if args.seeds is not None else QUICK_SEEDS if args.quick else LEAST_SEEDS
+    if count < 2:
+        raise InputError("seeds", f"{count} drives have no spread", "give at least 2")
+    if not args.no_plots and importlib.util.find_spec("matplotlib") is None:
+        raise InputError("plots", "matplotlib is not installed", "install gripmap[demo], or give --no-plots")
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError("out", f"cannot make {args.out} ({error.strerror})", "name another folder") from error
+    began, seeds = time.monotonic(), range(count)
+    results = campaign(
+        seeds, quick=args.quick,
+        tell=lambda line: print(f"{time.monotonic() - began:6.1f} s  {line}", file=sys.stderr, flush=True),
+    )  # fmt: skip
+    figures = figures_of(results, quick=args.quick)
+    name = "edge-agent evaluate" + (" --quick" if args.quick else "")
+    write(args.out / "figures.json", name, list(seeds), figures)
+    text = report(figures, seeds=count)
+    (args.out / "report.md").write_text(text, encoding="utf-8")
+    if not args.no_plots:
+        from edge_agent.lab.evaluation.plots import draw
+
+        draw(results, figures, args.out)
+    print(text.partition("## The papers' figures")[0].rstrip())
+    return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1

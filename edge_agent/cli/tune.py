@@ -1,0 +1,184 @@
+"""`edge-agent tune`: search the memberships, beside a random search of equal budget, and write what was found.
+
+With --study: paper 004's own filter under right and wrong R, several searches each way, as figures, table and plot.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from edge_agent.adaptation.memberships import Memberships
+from edge_agent.app.tuned_memberships import WAYS, Budget, Comparison, Document, Provenance, Score, save
+from edge_agent.lab.tuning import colony, random_search
+from edge_agent.lab.tuning.objectives import HELD_OUT, OBJECTIVES, TRAIN, Recorded, choices, objective_on, record, worth
+from edge_agent.lab.tuning.search import Iteration, Objective, Progress, Result
+from schemas.errors import InputError
+from schemas.runtime import figures
+
+ESTIMATOR: Final = "aco-fckf"
+ANTS, ITERATIONS, DURATION_S = 12, 10, 6.0
+QUICK_ANTS, QUICK_ITERATIONS, QUICK_DURATION_S = 3, 2, 2.0
+REPEATS, QUICK_REPEATS = 8, 2  # searches each way of the study
+POSITIONS: Final = 7  # per vertex: the default and three to each side
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `edge-agent tune`."""
+    parser.add_argument("--seed", type=int, default=0, help="of the ants and of the random search (default 0)")
+    parser.add_argument("--ants", type=int, help=f"paths per iteration (default {ANTS})")
+    parser.add_argument("--iterations", type=int, help=f"default {ITERATIONS}")
+    parser.add_argument(
+        "--objective",
+        choices=tuple(OBJECTIVES),
+        default="interval",
+        help="interval score of friction, or log-likelihood of the innovations (default %(default)s)",
+    )
+    parser.add_argument("--out", type=Path, default=Path(f"{ESTIMATOR}.json"), help="default %(default)s")
+    parser.add_argument(
+        "--study", type=Path, metavar="DIR",
+        help="the study of paper 004's filter instead: figures.json, study.md, convergence.png, paper-aco-fckf.json",
+    )  # fmt: skip
+    parser.add_argument("--quick", action="store_true", help="a few ants on short drives: tries the way, tunes nothing")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Search, compare, print, write; InputError for options out of range."""
+    ants = args.ants if args.ants is not None else QUICK_ANTS if args.quick else ANTS
+    iterations = args.iterations if args.iterations is not None else QUICK_ITERATIONS if args.quick else ITERATIONS
+    for name, value, least in (("--ants", ants, 1), ("--iterations", iterations, 1), ("--seed", args.seed, 0)):
+        if value < least:
+            raise InputError(name, f"{value} is too small", f"use {least} or more")
+    duration = QUICK_DURATION_S if args.quick else DURATION_S
+    if args.study is not None:
+        return _study(args, ants, iterations)
+
+    print_line(f"simulating {len(TRAIN)} drives to search on, {len(HELD_OUT)} to judge by, {duration:g} s each")
+    train, held_out = record(TRAIN, duration), record(HELD_OUT, duration)
+    results = _search(objective_on(train, ESTIMATOR, args.objective), ants, iterations, args.seed)
+    found = {"default": Memberships()} | {way: Memberships.from_vector(r.best) for way, r in results.items()}
+    scores = {way: Comparison(train=_score(found[way], train), held_out=_score(found[way], held_out)) for way in WAYS}
+    print(table(scores))
+    budget = Budget(
+        ants=ants, iterations=iterations, evaluations={way: result.evaluations for way, result in results.items()}
+    )
+    command = (
+        f"edge-agent tune --seed {args.seed} --ants {ants} --iterations {iterations}"
+        f" --objective {args.objective}{' --quick' * args.quick}"
+    )
+    save(args.out, _document(found["colony"], args.objective, scores, budget, command, args.seed))
+    print(f"wrote {args.out}")
+    return 0
+
+
+def _study(args: argparse.Namespace, ants: int, iterations: int) -> int:
+    """The study, written into a folder."""
+    from edge_agent.lab.tuning import study_report
+
+    if importlib.util.find_spec("matplotlib") is None:
+        raise InputError("study", "its plot needs matplotlib", "install gripmap[demo]")
+    try:
+        args.study.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError("study", f"cannot make {args.study} ({error.strerror})", "name another folder") from error
+    seeds = range(args.seed, args.seed + (QUICK_REPEATS if args.quick else REPEATS))
+    done = study_report.run(
+        ants=ants, iterations=iterations, positions=POSITIONS, seeds=seeds,
+        duration_s=QUICK_DURATION_S if args.quick else DURATION_S,
+        reporter=lambda way: reporter(way, iterations, time.monotonic, print_line),
+    )  # fmt: skip
+    listed = study_report.figures(done)
+    figures.write(args.study / "figures.json", "edge-agent tune --study", list(seeds), listed)
+    text = study_report.markdown(listed)
+    (args.study / "study.md").write_text(text, encoding="utf-8")
+    study_report.draw(listed, ants, args.study / "convergence.png")
+    names = dict(zip(WAYS, ("untuned", "random", "colony"), strict=True))
+    scores = {way: Comparison(**study_report.scores(done, name)) for way, name in names.items()}
+    evaluations = {way: sum(result.evaluations for result in results) for way, results in done.found.items()}
+    command = f"edge-agent tune --seed {args.seed} --ants {ants} --iterations {iterations} --study DIR"
+    document = _document(
+        done.best("colony"), "innovation", scores, Budget(ants=ants, iterations=iterations, evaluations=evaluations),
+        command + " --quick" * args.quick, args.seed, "paper-aco-fckf",
+    )  # fmt: skip
+    save(args.study / "paper-aco-fckf.json", document)
+    print_line(text)
+    return 0
+
+
+def _search(objective: Objective, ants: int, iterations: int, seed: int) -> dict[str, Result]:
+    """Random search and ant colony from the same start, with the same positions and budget."""
+    start = Memberships().to_vector()
+    objective(start)  # loads the compiled filter, so that the first iteration's time tells the others'
+    results = {}
+    for stream, (way, search) in enumerate((("random", random_search.optimise), ("colony", colony.optimise))):
+        results[way] = search(
+            objective,
+            choices(POSITIONS),
+            ants=ants,
+            iterations=iterations,
+            rng=np.random.default_rng([seed, stream]),
+            progress=reporter(way, iterations, time.monotonic, print_line),
+            start=start,
+        )
+    return results
+
+
+def print_line(line: str) -> None:
+    """Print at once, also into a pipe."""
+    print(line, flush=True)
+
+
+def reporter(way: str, iterations: int, clock: Callable[[], float], write: Callable[[str], None]) -> Progress:
+    """Progress as one line per iteration: best, mean, elapsed and expected remaining time by `clock` [s]."""
+    began = clock()
+
+    def tell(line: Iteration) -> None:
+        elapsed = clock() - began
+        left = elapsed / line.iteration * (iterations - line.iteration)
+        write(
+            f"{way:<7} {line.iteration:>3}/{iterations}   best {line.best:.4f}   mean {line.mean:.4f}   "
+            f"evaluations {line.evaluations:>4}   elapsed {elapsed:4.0f} s   left {left:4.0f} s"
+        )
+
+    return tell
+
+
+def _score(memberships: Memberships, drives: Recorded) -> Score:
+    return Score(**asdict(worth(memberships, drives, ESTIMATOR)))
+
+
+def _document(
+    memberships: Memberships, objective: str, scores: dict[str, Comparison], budget: Budget, command: str, seed: int,
+    estimator: str = ESTIMATOR,
+) -> Document:  # fmt: skip
+    header = figures.header("tune", [seed])
+    provenance = Provenance.model_validate(
+        {name: header[name] for name in ("date", "commit", "machine", "versions")}
+        | {"command": command, "seed": seed, "budget": budget}
+    )
+    return Document(
+        estimator=estimator,
+        memberships=memberships.to_json(),
+        objective=objective,
+        scores=scores,
+        provenance=provenance,
+    )
+
+
+def table(scores: dict[str, Comparison]) -> str:
+    """The comparison as plain text, a row per way and set of drives."""
+    lines = [f"{'':<8} {'drives':<9} {'interval score':>15} {'coverage':>9} {'innovations [nat/s]':>20} {'NIS':>6}"]
+    for way, row in scores.items():
+        for drives, score in (("train", row.train), ("held out", row.held_out)):
+            lines.append(
+                f"{way:<8} {drives:<9} {score.interval_score:>15.4f} {score.coverage:>9.3f}"
+                f" {score.log_likelihood:>20.2f} {score.nis_ratio:>6.2f}"
+            )
+    return "\n".join(lines)

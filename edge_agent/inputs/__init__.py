@@ -1,0 +1,1 @@
+"""Signals in: a recorded log; each source gives blocks of samples."""

@@ -1,0 +1,147 @@
+"""A recorded drive: a Parquet signal log as blocks of one vehicle.
+
+Needed columns: `t` [s] or `timestamp`; ax, ay, yaw_rate; the four omega; delta_fl or delta_fr. Each of them must hold
+at least one reading. The other channels may be missing, and NaN or null is a missing reading anywhere.
+A front wheel whose steering angle has no column takes that of the other; rear wheels without a column do not steer.
+`timestamp` is an Arrow timestamp, or a number: integer ns since 1970 UTC, float s since 1970 UTC.
+Time may stand still (the estimator says so in `health`) but not go back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from edge_agent.inputs.block import NS, Block, absolute
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+from schemas.signals import CHANNELS, S, per_wheel
+
+NEEDED: Final = ("ax", "ay", "yaw_rate", *per_wheel("omega"))
+FRONT_STEERING: Final = per_wheel("delta")[:2]
+REAR_STEERING: Final = per_wheel("delta")[2:]
+BLOCK_ROWS: Final = 16_384  # 2.4 MB of signals: bounds memory, and is long enough for the per-block cost to vanish
+
+
+@dataclass(frozen=True)
+class Log:
+    """A read log: t (T,) [s] as recorded, signals (T, channels), and the ns UTC of t = 0 where the log knows it."""
+
+    t: FloatArray
+    signals: FloatArray
+    start_ns: int | None
+
+    def blocks(self, start_ns: int, rows: int = BLOCK_ROWS) -> Iterator[Block]:
+        """The log in order, in blocks of at most `rows` samples; t = 0 is at `start_ns`."""
+        for first in range(0, len(self.t), rows):
+            t = self.t[first : first + rows, None]
+            yield Block(t, absolute(t, start_ns), self.signals[first : first + rows, None])
+
+
+def read_log(path: Path) -> Log:
+    """Read and check a signal log.
+
+    Raises:
+        InputError: not a readable Parquet file, a needed column missing or without a reading, a column that is not
+            numeric, no row, or time that is missing or goes back; names the column (and row) and the fix.
+    """
+    table = _table(path)
+    if not table.num_rows:
+        raise InputError("log", f"{path} has no rows", "give a log with at least one sample")
+    t, start_ns = _time(table)
+    signals = np.full((table.num_rows, len(CHANNELS)), np.nan)
+    for index, name in enumerate(CHANNELS):
+        if name in table.column_names:
+            signals[:, index] = _numbers(table, name)
+    signals[np.isinf(signals)] = np.nan
+    _check(table, signals)
+    _steering(table, signals)
+    return Log(t, signals, start_ns)
+
+
+def _table(path: Path) -> pa.Table:
+    try:
+        with pq.ParquetFile(path) as file:
+            present = set(file.schema_arrow.names)
+            return file.read(columns=[name for name in ("t", "timestamp", *CHANNELS) if name in present])
+    except FileNotFoundError as error:
+        raise InputError("log", f"{path} does not exist", "give the path of a signal log") from error
+    except (OSError, pa.ArrowException) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError("log", f"{path} is not a Parquet file ({reason})", "write the log as Parquet") from error
+
+
+def _numbers(table: pa.Table, name: str) -> FloatArray:
+    """A column as float64, null as NaN; a copy, since Arrow's own is read-only and numba would compile again for it."""
+    try:
+        values: Any = pc.cast(table[name], pa.float64())
+    except pa.ArrowException as error:
+        raise InputError(name, f"is {table[name].type}, not a number", "write the column as float64") from error
+    return np.array(values.to_numpy(zero_copy_only=False), dtype=np.float64)
+
+
+def _time(table: pa.Table) -> tuple[FloatArray, int | None]:
+    """t [s] and the ns UTC of t = 0, None for a log that has only `t`."""
+    name = next((name for name in ("t", "timestamp") if name in table.column_names), None)
+    if name is None:
+        raise InputError("t", "the log has neither t nor timestamp", "add the time of each sample, t in seconds")
+    if name == "t":
+        t, start_ns = _numbers(table, name), None
+    else:
+        t, start_ns = _timestamps(table[name])
+    bad = np.flatnonzero(~np.isfinite(t))
+    if len(bad):
+        raise InputError(name, f"row {bad[0]} has no time", "give every sample its time")
+    back = np.flatnonzero(np.diff(t) < 0)
+    if len(back):
+        raise InputError(name, f"goes back at row {back[0] + 1}", "sort the log by time")
+    return t, start_ns
+
+
+def _timestamps(column: Any) -> tuple[FloatArray, int | None]:  # noqa: ANN401 pyarrow's column types are not generic
+    """Seconds since the first sample, and the ns UTC of that sample."""
+    if column.null_count:
+        row = int(np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0])
+        raise InputError("timestamp", f"row {row} has no time", "give every sample its time")
+    kind = column.type
+    if pa.types.is_timestamp(kind):
+        column = pc.cast(pc.cast(column, pa.timestamp("ns", tz=kind.tz)), pa.int64())
+    elif not pa.types.is_integer(kind) and not pa.types.is_floating(kind):
+        raise InputError("timestamp", f"is {kind}, not a time", "write an Arrow timestamp, or ns as int64")
+    values = np.asarray(column.to_numpy(zero_copy_only=False))
+    if pa.types.is_floating(kind):
+        first = float(values[0])
+        return np.asarray(values - first, dtype=np.float64), round(first * NS) if np.isfinite(first) else None
+    return (values - values[0]) / NS, int(values[0])
+
+
+def _check(table: pa.Table, signals: FloatArray) -> None:
+    for name in NEEDED:
+        if name not in table.column_names:
+            raise InputError(name, "the log has no such column", "add it in SI units (README, signal log)")
+        if np.isnan(signals[:, CHANNELS.index(name)]).all():
+            raise InputError(name, "has no reading in any row", "record the channel, or mend its conversion")
+    front = [name for name in FRONT_STEERING if name in table.column_names]
+    if not front:
+        raise InputError(FRONT_STEERING[0], "the log has no such column", f"add it or {FRONT_STEERING[1]} [rad]")
+    if all(np.isnan(signals[:, CHANNELS.index(name)]).all() for name in front):
+        raise InputError(front[0], "has no reading in any row", "record the channel, or mend its conversion")
+
+
+def _steering(table: pa.Table, signals: FloatArray) -> None:
+    """Fill the steering angles that have no column (not those that have one without readings)."""
+    missing = [name not in table.column_names for name in (*FRONT_STEERING, *REAR_STEERING)]
+    if missing[0]:
+        signals[:, S.DELTA] = signals[:, S.DELTA + 1]
+    if missing[1]:
+        signals[:, S.DELTA + 1] = signals[:, S.DELTA]
+    for wheel in (2, 3):
+        if missing[wheel]:
+            signals[:, S.DELTA + wheel] = 0.0

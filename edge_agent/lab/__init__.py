@@ -1,0 +1,1 @@
+"""What judges and tunes: simulation, evaluation, tuning. Nothing that is judged imports it."""

@@ -1,0 +1,147 @@
+"""The figures of a campaign: those with a bar as one table, and every measure beside them for context."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+
+from edge_agent.lab.evaluation.campaign import DEFAULT, Results
+from edge_agent.lab.evaluation.measures import COMPONENTS, bounds
+from edge_agent.lab.evaluation.reliability import LEVELS, shares
+from schemas.numeric import FloatArray
+from schemas.runtime.figures import Figure
+
+PRIOR_WIDTH: Final = 0.9 * 1.15  # of the 90 % interval of the uniform prior
+
+
+class Bar(NamedTuple):
+    """A figure by name, how it is read from the results (NaN where not measured), its unit and its bar."""
+
+    name: str
+    read: Callable[[Results], float]
+    unit: str
+    bar: float
+    better: Literal["less", "more"]
+
+
+def of(scenario: str, measure: str, estimator: str = DEFAULT) -> Callable[[Results], float]:
+    """Mean over seeds of a measure with ordinary sensors."""
+
+    def read(results: Results) -> float:
+        return mean(results.real.get((scenario, estimator), {}).get(measure))
+
+    return read
+
+
+def noise(experiment: str, measure: str) -> Callable[[Results], float]:
+    """Mean over seeds of a measure of paper 004's own experiments."""
+    return lambda results: mean(results.noise.get((experiment, "paper-aco-fckf"), {}).get(measure))
+
+
+def mean(values: FloatArray | None) -> float:
+    """Mean; NaN of nothing."""
+    return math.nan if values is None or not len(values) else float(np.mean(values))
+
+
+def false_per_hour(results: Results) -> float:
+    """False changes of the default over all hours of scenarios whose friction is one and does not change."""
+    counted = [m for (_, name), m in results.real.items() if name == DEFAULT and "hours" in m]
+    hours = sum(float(m["hours"].sum()) for m in counted)
+    return sum(float(m["false_changes"].sum()) for m in counted) / hours if hours else math.nan
+
+
+def both_stops(results: Results) -> float:
+    """Coverage over the anti-lock stops on dry road and on snow."""
+    return 0.5 * (of("default.abs.dry", "coverage90")(results) + of("default.abs.snow", "coverage90")(results))
+
+
+def on_foreign_tyres(results: Results) -> float:
+    """Coverage of the default over all scenarios and kinds of tyre."""
+    return mean(np.concatenate(list(results.foreign.values()))) if results.foreign else math.nan
+
+
+def width_ratio(results: Results) -> float:
+    """Width of the interval over the prior's, straight on at constant speed."""
+    return of("default.straight", "width")(results) / PRIOR_WIDTH
+
+
+M_S, RAD_S, SHARE = "m/s", "rad/s", "1"
+BARS: Final = (
+    *(
+        Bar(f"papers.004.{kind}.mae_{name}", noise(kind, f"mae_{name}"), unit, bar, "less")
+        for kind in ("constant", "variable")
+        for name, unit, bar in (("vx", M_S, 0.002), ("vy", M_S, 0.007), ("yaw_rate", RAD_S, 0.002))
+    ),
+    Bar("default.dlc.mu_error", of("default.dlc", "mu_error"), SHARE, 0.05, "less"),
+    Bar("default.dlc.coverage90", of("default.dlc", "end_coverage90"), SHARE, 0.85, "more"),
+    Bar("papers.001.rmse_vx", of("001.dlc", "rmse_vx"), M_S, 0.02, "less"),
+    Bar("papers.001.rmse_vy", of("001.dlc", "rmse_vy"), M_S, 0.01, "less"),
+    Bar("papers.001.rmse_beta", of("001.dlc", "rmse_beta"), "rad", 0.001, "less"),
+    Bar("papers.002.sine.rmse_vx", of("002.sine", "rmse_vx"), M_S, 0.03, "less"),
+    Bar("papers.002.sine.rmse_vy", of("002.sine", "rmse_vy"), M_S, 0.03, "less"),
+    Bar("papers.002.jturn.rmse_vx", of("002.jturn", "rmse_vx"), M_S, 0.03, "less"),
+    Bar("papers.002.jturn.rmse_vy", of("002.jturn", "rmse_vy"), M_S, 0.03, "less"),
+    Bar("papers.003.accel.mu_error", of("003.accel", "mu_error"), SHARE, 0.08, "less"),
+    Bar("papers.003.turn.mu_error", of("003.turn", "mu_error"), SHARE, 0.05, "less"),
+    Bar("papers.003.split.low_error", of("003.split", "low_error"), SHARE, 0.07, "less"),
+    Bar("papers.003.split.high_coverage90", of("003.split", "high_coverage90"), SHARE, 0.85, "more"),
+    Bar("papers.000.coverage90", of("000.jump", "coverage90"), SHARE, 0.87, "more"),
+    Bar("default.jump.accel_s", of("default.jump.accel", "arrival_s"), "s", 0.1, "less"),
+    Bar("default.jump.brake_s", of("default.jump.brake", "arrival_s"), "s", 0.25, "less"),
+    Bar("default.jump.false_per_hour", false_per_hour, "1/h", 1.0, "less"),
+    Bar("default.straight.width_ratio", width_ratio, SHARE, 0.8, "more"),
+    Bar("default.straight.coverage90", of("default.straight", "coverage90"), SHARE, 0.9, "more"),
+    Bar("default.foreign_tyres.coverage90", on_foreign_tyres, SHARE, 0.85, "more"),
+    Bar("default.abs.coverage90", both_stops, SHARE, 0.80, "more"),
+    Bar("default.spin.coverage90", of("default.spin", "coverage90"), SHARE, 0.80, "more"),
+)
+
+UNITS: Final = {
+    "vx": M_S, "vy": M_S, "yaw_rate": RAD_S, "beta": "rad", "s": "s", "hours": "h", "changes": "per drive",
+}  # fmt: skip
+
+
+def unit_of(measure: str) -> str:
+    """Unit of a measure, by the end of its name."""
+    return next((unit for end, unit in UNITS.items() if measure.endswith(f"_{end}") or measure == end), SHARE)
+
+
+def figures(results: Results, *, quick: bool) -> list[Figure]:
+    """Bars first (when quick, those that were measured), then `KIND.SCENARIO.ESTIMATOR.MEASURE` with its spread."""
+    barred = [Figure(bar.name, bar.read(results), bar.unit, bar.bar, bar.better) for bar in BARS]
+    listed = [figure for figure in barred if not (quick and math.isnan(figure.value))]
+    for kind, table in (("ideal", results.ideal), ("real", results.real)):
+        for (scenario, estimator), found in table.items():
+            listed += _context(f"{kind}.{scenario}.{estimator}", found)
+    for (experiment, estimator), found in results.noise.items():
+        listed += _context(f"noise.004.{experiment}.{estimator}", found)
+    for (case, estimator), found in results.faults.items():
+        listed += _context(f"faults.{case}.{estimator}", found)
+    listed += _consistency(results)
+    return listed + [
+        Figure(f"foreign.{kind}.coverage90", mean(value), SHARE) for kind, value in results.foreign.items()
+    ]
+
+
+def _consistency(results: Results) -> list[Figure]:
+    """Bounds of NEES and NIS, and the reliability of every estimator over all scenarios."""
+    listed = []
+    for measure in COMPONENTS if results.seeds else ():
+        for end, value in zip(("lower", "upper"), bounds(measure, results.seeds), strict=True):
+            listed.append(Figure(f"bounds.{measure}.{end}", value, SHARE))
+    for estimator, parts in results.ranks.items():
+        for level, share in zip(LEVELS, shares(np.concatenate(parts)), strict=True):
+            listed.append(Figure(f"reliability.{estimator}.below_{100 * level:02.0f}", float(share), SHARE))
+    return listed
+
+
+def _context(prefix: str, found: dict[str, FloatArray]) -> list[Figure]:
+    listed = []
+    for measure, values in found.items():
+        listed.append(Figure(f"{prefix}.{measure}", mean(values), unit_of(measure)))
+        if len(values) > 1:
+            listed.append(Figure(f"{prefix}.{measure}.sd", float(np.std(values, ddof=1)), unit_of(measure)))
+    return listed

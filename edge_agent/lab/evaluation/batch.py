@@ -1,0 +1,99 @@
+"""Drives of one scenario side by side, and what an estimator makes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pyarrow as pa
+
+from edge_agent.estimators import Estimates, EstimatorBank
+from edge_agent.lab.simulation import simulate_manoeuvre
+from edge_agent.lab.simulation.manoeuvres import Friction
+from edge_agent.lab.simulation.presets import TrueVehicle
+from schemas.numeric import FloatArray
+from schemas.signals import CHANNELS, per_wheel
+from schemas.vehicle import Vehicle
+
+FINE_HZ = 500.0  # steering is held over a sample of the simulator; a slow sensor must not see it as steps
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A manoeuvre of a paper, or of the default estimator's bars: vehicle, speed [m/s], friction, rate, length."""
+
+    manoeuvre: str
+    vehicle: TrueVehicle
+    mu: Friction | None = None
+    speed: float | None = None
+    rate_hz: float = 100.0
+    duration_s: float | None = None
+    about: str = ""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """N drives: t (T, N) [s], signals (T, N, 18), truth by name (T, N), nominal vehicles."""
+
+    t: FloatArray
+    signals: FloatArray
+    truth: dict[str, FloatArray]
+    vehicles: list[Vehicle]
+
+    @property
+    def mu_wheel(self) -> FloatArray:
+        """True friction of the wheels, (T, N, 4)."""
+        return np.stack([self.truth[name] for name in per_wheel("true_mu")], axis=-1)
+
+    @property
+    def mu(self) -> FloatArray:
+        """Its mean, (T, N)."""
+        return np.asarray(self.mu_wheel.mean(axis=-1))
+
+    def last(self, seconds: float) -> slice:
+        """The samples of the last so many seconds."""
+        return slice(int(np.searchsorted(self.t[:, 0], self.t[-1, 0] - seconds)), None)
+
+
+def realistic(scenario: Scenario, seeds: Sequence[int], sensors: str = "mems") -> Batch:
+    """One drive per seed with ordinary sensors, of a vehicle known to a few per cent."""
+    return joined([_drive(scenario, seed, sensors, 1) for seed in seeds])
+
+
+def ideal(scenario: Scenario) -> Batch:
+    """One drive with sensors without error, of a vehicle known exactly; simulated finely, sampled at the rate."""
+    step = max(1, round(FINE_HZ / scenario.rate_hz))
+    return joined([_drive(replace(scenario, rate_hz=scenario.rate_hz * step), 0, "ideal", step)])
+
+
+def _drive(scenario: Scenario, seed: int, sensors: str, step: int) -> tuple[pa.Table, Vehicle]:
+    log, vehicle = simulate_manoeuvre(
+        scenario.manoeuvre, mu=scenario.mu, speed=scenario.speed, seed=seed, rate_hz=scenario.rate_hz,
+        duration_s=scenario.duration_s, vehicle=scenario.vehicle, sensors=sensors,
+    )  # fmt: skip
+    return log.take(np.arange(0, len(log), step)), vehicle
+
+
+def joined(drives: Sequence[tuple[pa.Table, Vehicle]]) -> Batch:
+    """Drives of one length side by side."""
+
+    def column(name: str) -> FloatArray:
+        return np.stack([log[name].to_numpy(zero_copy_only=False) for log, _ in drives], axis=1).astype(float)
+
+    names = [name for name in drives[0][0].column_names if name.startswith("true_")]
+    signals = np.stack([column(name) for name in CHANNELS], axis=-1)
+    return Batch(column("t"), signals, {name: column(name) for name in names}, [vehicle for _, vehicle in drives])
+
+
+def repeated(batch: Batch, count: int) -> Batch:
+    """The one drive of a batch `count` times, for noise to be laid on it."""
+    truth = {name: np.repeat(value, count, axis=1) for name, value in batch.truth.items()}
+    return Batch(
+        np.repeat(batch.t, count, axis=1), np.repeat(batch.signals, count, axis=1), truth, batch.vehicles * count
+    )
+
+
+def estimates(bank: EstimatorBank, batch: Batch) -> Estimates:
+    """What the bank says of the drives."""
+    return bank.advance(batch.t, batch.signals)

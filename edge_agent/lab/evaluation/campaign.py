@@ -1,0 +1,110 @@
+"""The campaign: every scenario for every estimator that can take part; figures and plots are made of its numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.estimators import ESTIMATORS, Estimates, EstimatorBank, adaptive_federated_ckf, compensated_wckf
+from edge_agent.lab.evaluation import faults
+from edge_agent.lab.evaluation.batch import Batch, estimates, ideal, realistic, repeated
+from edge_agent.lab.evaluation.measures import arrival, consistency, false_changes, measures, sides
+from edge_agent.lab.evaluation.paper_004 import experiments
+from edge_agent.lab.evaluation.reliability import watched
+from edge_agent.lab.evaluation.scenarios import FOREIGN, OTHERS, PAPERS, VEHICLES, foreign
+from schemas.numeric import FloatArray
+
+DEFAULT = "aco-fckf"
+QUICK_ESTIMATORS = (DEFAULT, "paper-aco-fckf")
+HARD = ("split", "abs", "spin")  # unlike roads and wheels past the peak have bars of their own
+QUICK_SCENARIOS = ("004.dlc", "003.split", "default.jump.accel")
+FAULTY_SEEDS = 4  # drives per manoeuvre under each sensor fault: three manoeuvres, thirteen faults, all estimators
+
+
+@dataclass(frozen=True)
+class Drive:
+    """The first drive of a scenario and what was said of it, kept for plots."""
+
+    batch: Batch
+    said: Estimates
+
+
+@dataclass
+class Results:
+    """Measures per drive, by (scenario, estimator): `real` with ordinary sensors, `ideal` without errors."""
+
+    real: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)
+    ideal: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)
+    noise: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)  # paper 004's experiments
+    foreign: dict[str, FloatArray] = field(default_factory=dict)  # coverage of the default, by kind of tyre
+    faults: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)  # by (fault, estimator)
+    ranks: dict[str, list[FloatArray]] = field(default_factory=dict)  # of the truth in the posterior, by estimator
+    seeds: int = 0
+    drives: dict[tuple[str, str], Drive] = field(default_factory=dict)
+
+
+def run(seeds: Sequence[int], *, quick: bool, tell: Callable[[str], None]) -> Results:
+    """All measurements; `tell` is given one line of progress at a time."""
+    results = Results(seeds=len(seeds))
+    names = QUICK_ESTIMATORS if quick else tuple(ESTIMATORS)
+    results.noise, plotted = experiments(seeds)
+    for key, (batch, said) in plotted.items():
+        results.drives[key, "paper-aco-fckf"] = Drive(batch, said)
+    tell("paper 004, its two noise experiments")
+    for name, scenario in (PAPERS | OTHERS | VEHICLES).items():
+        if quick and name not in QUICK_SCENARIOS:
+            continue
+        batch = realistic(scenario, seeds)
+        exact = repeated(ideal(scenario), 1) if name in PAPERS and not quick else None
+        for estimator in names if name in PAPERS else (DEFAULT,):
+            said, ranks = watched(bank_of(estimator, batch.vehicles), batch)
+            results.real[name, estimator] = _all(name, batch, said) | consistency(batch, said)
+            results.ranks.setdefault(estimator, []).append(ranks.ravel())
+            results.drives[name, estimator] = Drive(batch, said)
+            if exact is not None:
+                results.ideal[name, estimator] = _all(name, exact, estimates(_as_in_paper(estimator, exact), exact))
+        tell(f"{name}: {scenario.about or scenario.manoeuvre}, {len(seeds)} drives")
+    manoeuvres = tuple(faults.DRIVES)[: 1 if quick else None]
+    results.faults = faults.campaign(seeds[:FAULTY_SEEDS], names, manoeuvres)
+    tell(f"{len(faults.CASES) - 1} sensor faults")
+    if not quick:
+        results.foreign = _foreign_tyres(seeds, tell)
+    return results
+
+
+def _as_in_paper(estimator: str, batch: Batch) -> EstimatorBank:
+    """The bank for a paper's own conditions: where friction is set by hand, it is set to the truth of the start."""
+    friction = float(batch.mu[0, 0])
+    if estimator == "adaptive-federated-ckf":
+        return adaptive_federated_ckf.bank(batch.vehicles, friction)
+    if estimator == "compensated-wckf":
+        return compensated_wckf.bank(batch.vehicles, friction)
+    return bank_of(estimator, batch.vehicles)
+
+
+def _all(name: str, batch: Batch, said: Estimates) -> dict[str, FloatArray]:
+    found = measures(batch, said)
+    if "split" in name:
+        found |= sides(batch, said)
+    if "jump" in name:
+        found["arrival_s"] = arrival(batch, said)
+    elif not any(word in name for word in HARD):
+        found["false_changes"] = false_changes(batch, said)
+        found["hours"] = (batch.t[-1] - batch.t[0]) / 3600.0
+    return found
+
+
+def _foreign_tyres(seeds: Sequence[int], tell: Callable[[str], None]) -> dict[str, FloatArray]:
+    """Coverage of the default in all scenarios, each seed with the next kind of tyre."""
+    found: dict[str, list[float]] = {kind: [] for kind in FOREIGN}
+    kinds = list(FOREIGN)
+    for scenario in (PAPERS | OTHERS).values():
+        for place, kind in enumerate(kinds):
+            batch = realistic(foreign(scenario, kind), seeds[place :: len(kinds)] or seeds[:1])
+            said = estimates(bank_of(DEFAULT, batch.vehicles), batch)
+            found[kind].extend(measures(batch, said)["coverage90"])
+    tell("all scenarios on foreign tyres")
+    return {kind: np.array(values) for kind, values in found.items()}

@@ -1,0 +1,141 @@
+"""Sensor faults: what goes wrong, what is expected then, and what every estimator makes of it.
+
+The drives are ordinary ones; a fault begins at BEGINS. `told` is whether the health of every drive carries the flag.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.estimators import Estimates
+from edge_agent.lab.evaluation.batch import Batch, Scenario, estimates, realistic
+from edge_agent.lab.evaluation.measures import covered, errors
+from edge_agent.lab.evaluation.scenarios import SEDAN
+from edge_agent.lab.simulation import Fault
+from edge_agent.lab.simulation.faults import apply_faults
+from edge_agent.lab.simulation.manoeuvres import jump, kmh
+from schemas.numeric import FloatArray
+from schemas.signals import Health
+
+BEGINS, ENDS = 2.0, 5.0  # [s]
+DRIVES: Final = {
+    "slalom": Scenario("slalom", SEDAN, 0.30, kmh(30), duration_s=8.0),
+    "lane change": Scenario("double-lane-change", SEDAN, 0.85, kmh(80), duration_s=8.0),
+    "braking": Scenario("moderate-braking", SEDAN, jump(0.85, 0.50, 60.0), kmh(80), duration_s=6.0),
+}
+
+
+def in_order(t: FloatArray) -> FloatArray:
+    """The clock as it is."""
+    return t
+
+
+def gap(t: FloatArray) -> FloatArray:
+    """Three seconds without a sample; what is left is a drive with a hole in it."""
+    return np.where(t < BEGINS, t, t + 3.0)
+
+
+def late_samples(t: FloatArray) -> FloatArray:
+    """From BEGINS to ENDS every tenth sample carries the time of fifty milliseconds before."""
+    number = np.arange(len(t))[:, None]
+    return np.where((t >= BEGINS) & (t < ENDS) & (number % 10 == 0), t - 0.05, t)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One row of the table of faults: `says` is the flag that health must carry, OK where no sensor can tell."""
+
+    faults: tuple[Fault, ...]
+    says: Health
+    expected: str
+    clock: Callable[[FloatArray], FloatArray] = in_order
+
+
+def during(kind: str, *channels: str, size: float = 0.0) -> tuple[Fault, ...]:
+    """The fault on some channels from BEGINS to ENDS."""
+    return tuple(Fault(kind, channel, BEGINS, ENDS, size) for channel in channels)
+
+
+CASES: Final = {
+    "none": Case((), Health.OK, "the drives as they are, for comparison"),
+    "inertial-dropout": Case(
+        during("dropout", "ax", "ay", "yaw_rate"), Health.NO_INERTIAL,
+        "motion is carried by the wheels with wider spread; nothing is concluded on friction",
+    ),
+    "steering-dropout": Case(
+        during("dropout", "delta"), Health.NO_STEERING, "the last angle is held; axles say nothing of friction"
+    ),
+    "wheel-speed-stuck": Case(
+        during("stuck", "omega_fl"), Health.OK, "not told; a wheel that seems to slide is outvoted"
+    ),
+    "spikes-beyond-belief": Case(
+        during("spike", "omega_fl", size=900.0) + during("spike", "ay", size=60.0), Health.OUTLIER,
+        "refused reading by reading",
+    ),
+    "believable-spikes": Case(
+        during("spike", "omega_fl", size=8.0) + during("spike", "ax", size=5.0), Health.OK,
+        "not told by all; an acceleration that jumps is refused once, a wheel that does is trusted less",
+    ),
+    "bias-step": Case(
+        (Fault("bias", "ay", BEGINS, size=0.3),), Health.OK, "not told; the offset is a state and is learned in seconds"
+    ),
+    "wrong-steering-zero": Case(
+        (Fault("bias", "delta_fl", size=0.003), Fault("bias", "delta_fr", size=0.003)), Health.OK,
+        "3 degrees at the steering wheel: not told; the offset of the steering is a state",
+    ),
+    "one-wheel-speed-lost": Case(
+        (Fault("dropout", "omega_rl", BEGINS),), Health.NO_WHEEL_SPEED, "the others do; the interval is a little wider"
+    ),
+    "no-torque-at-all": Case(
+        (Fault("missing", "torque"),), Health.NO_TORQUE, "force from the accelerometer, shared out by guess"
+    ),
+    "position-gone": Case(
+        tuple(Fault("dropout", channel, BEGINS) for channel in ("latitude", "longitude", "yaw")), Health.NO_POSITION,
+        "estimates as before; no visit, so no observation",
+    ),
+    "time-gap": Case((), Health.TIME_GAP, "motion begins anew, friction fades over the metres missed", gap),
+    "sample-out-of-order": Case((), Health.TIME_GAP, "left out, the estimate before is repeated", late_samples),
+}  # fmt: skip
+
+
+def harmed(batch: Batch, case: Case) -> Batch:
+    """The drives with the fault in their signals and on their clock."""
+    each = [apply_faults(batch.t[:, n], batch.signals[:, n], case.faults) for n in range(batch.t.shape[1])]
+    return replace(batch, t=case.clock(batch.t), signals=np.stack(each, axis=1))
+
+
+def outcome(batch: Batch, said: Estimates, case: Case) -> dict[str, FloatArray]:
+    """What is measured of a case, per drive: `finite`, `told` (1 or 0), coverage and width from BEGINS on, RMSE."""
+    after = batch.t[:, 0] >= BEGINS
+    whole = np.isfinite(said.told).all(axis=-1)
+    ordered = (said.mu_lower <= said.mu) & (said.mu <= said.mu_upper)
+    found = {
+        "finite": (whole & ordered).all(axis=0).astype(float),
+        "told": ((said.health & int(case.says)) != 0).any(axis=0).astype(float),
+        "coverage90": covered(batch, said)[after].mean(axis=0),
+        "width": (said.mu_upper - said.mu_lower)[after].mean(axis=0),
+    }
+    for name in ("vx", "vy"):
+        found[f"rmse_{name}"] = np.sqrt((errors(batch, said)[name][after] ** 2).mean(axis=0))
+    return found
+
+
+def campaign(
+    seeds: Sequence[int], estimators: Sequence[str], drives: Sequence[str] = tuple(DRIVES)
+) -> dict[tuple[str, str], dict[str, FloatArray]]:
+    """Every case for every estimator over all drives and seeds: measures by (case, estimator)."""
+    batches = [realistic(DRIVES[name], seeds) for name in drives]
+    found = {}
+    for name, case in CASES.items():
+        for estimator in estimators:
+            parts = []
+            for batch in batches:
+                broken = harmed(batch, case)
+                parts.append(outcome(broken, estimates(bank_of(estimator, broken.vehicles), broken), case))
+            found[name, estimator] = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    return found

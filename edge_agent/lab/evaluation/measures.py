@@ -1,0 +1,119 @@
+"""What is measured of estimates against truth; every measure gives one number per drive, (N,).
+
+Legend: NEES squared error of (v_x, v_y) over its stated variance, per component [1], 1 where the stated spread is
+right; NIS squared innovation over its stated variance, per row [1]. Their mean over N drives at one instant has
+95 % of its values within chi-squared bounds if the filter is right (Bar-Shalom, Li, Kirubarajan 2001, 5.4).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edge_agent.estimators import Estimates
+from edge_agent.lab.evaluation.batch import Batch
+from schemas.numeric import BoolArray, FloatArray
+
+LAST_S = 1.0  # "the last second"
+NEAR = 0.1  # of friction: arrived, or wrong
+HOLD_S = 0.2  # a wrong interval that lasts so long is a false change
+SLOWEST_M_S = 1.0
+COMPONENTS = {"nees": 2, "nis": 3}  # independent squares in each; no estimator measures fewer than three rows
+
+
+def errors(batch: Batch, said: Estimates) -> dict[str, FloatArray]:
+    """Errors (T, N) of the motion: vx, vy [m/s], yaw_rate [rad/s], beta [rad]."""
+    truth = batch.truth
+    beta = np.arctan2(truth["true_vy"], np.maximum(truth["true_vx"], SLOWEST_M_S))
+    return {
+        "vx": said.vx - truth["true_vx"],
+        "vy": said.vy - truth["true_vy"],
+        "yaw_rate": said.yaw_rate - truth["true_yaw_rate"],
+        "beta": said.sideslip - beta,
+    }
+
+
+def covered(batch: Batch, said: Estimates) -> BoolArray:
+    """Whether the 90 % interval holds the mean friction, (T, N)."""
+    return np.asarray((said.mu_lower <= batch.mu) & (batch.mu <= said.mu_upper))
+
+
+def measures(batch: Batch, said: Estimates) -> dict[str, FloatArray]:
+    """All measures that every drive has."""
+    end = batch.last(LAST_S)
+    found: dict[str, FloatArray] = {}
+    for name, error in errors(batch, said).items():
+        found[f"mae_{name}"] = np.abs(error).mean(axis=0)
+        found[f"rmse_{name}"] = np.sqrt((error**2).mean(axis=0))
+    found["rmse_mu"] = np.sqrt(((said.mu - batch.mu) ** 2).mean(axis=0))
+    found["mae_mu"] = np.abs(said.mu - batch.mu).mean(axis=0)
+    found["mu_error"] = np.abs(said.mu - batch.mu)[end].mean(axis=0)
+    found["coverage90"] = covered(batch, said).mean(axis=0)
+    found["end_coverage90"] = covered(batch, said)[end].mean(axis=0)
+    found["width"] = (said.mu_upper - said.mu_lower).mean(axis=0)
+    found["nis"] = said.innovation_nis.mean(axis=0)
+    found["nees"] = nees(batch, said).mean(axis=0)
+    return found
+
+
+def nees(batch: Batch, said: Estimates) -> FloatArray:
+    """Squared error of (v_x, v_y) over its stated variance, per component, (T, N)."""
+    off = errors(batch, said)
+    return np.asarray(0.5 * ((off["vx"] / said.vx_std) ** 2 + (off["vy"] / said.vy_std) ** 2))
+
+
+def bounds(measure: str, drives: int) -> tuple[float, float]:
+    """Where the mean of "nees" or "nis" over so many drives lies 95 times in 100 if the filter is right."""
+    from scipy.stats import chi2
+
+    count = COMPONENTS[measure] * drives
+    return float(chi2.ppf(0.025, count)) / count, float(chi2.ppf(0.975, count)) / count
+
+
+def consistency(batch: Batch, said: Estimates) -> dict[str, FloatArray]:
+    """Share of instants whose mean NEES, and NIS, over the drives lies within its bounds, (1,) each."""
+    found = {}
+    for name, value in (("nees", nees(batch, said)), ("nis", said.innovation_nis)):
+        low, high = bounds(name, value.shape[1])
+        mean = value.mean(axis=1)
+        found[f"{name}_within"] = np.array([((low <= mean) & (mean <= high)).mean()])
+    return found
+
+
+def sides(batch: Batch, said: Estimates) -> dict[str, FloatArray]:
+    """Of split friction, in the last second: error of the lower side, coverage of the higher."""
+    end, truth = batch.last(LAST_S), batch.mu_wheel
+    told = said.mu_wheel
+    if told is None:
+        whole = np.stack([said.mu, said.mu_lower, said.mu_upper], axis=-1)
+        told = np.repeat(whole[:, :, None, :], 4, axis=2)
+    low = truth <= truth.min(axis=-1, keepdims=True)
+    middle = np.abs(told[..., 0] - truth)
+    inside = (told[..., 1] <= truth) & (truth <= told[..., 2])
+    return {
+        "low_error": np.asarray(np.nanmean(np.where(low, middle, np.nan)[end], axis=(0, 2))),
+        "high_coverage90": np.asarray(np.nanmean(np.where(low, np.nan, inside)[end], axis=(0, 2))),
+    }
+
+
+def arrival(batch: Batch, said: Estimates) -> FloatArray:
+    """Seconds from the change of friction until mu is within NEAR of it; what never arrives counts to the end."""
+    changed = batch.mu == batch.mu[-1]
+    seconds = np.empty(batch.t.shape[1])
+    for n in range(len(seconds)):
+        first = int(np.argmax(changed[:, n]))
+        near = np.abs(said.mu[first:, n] - batch.mu[first:, n]) <= NEAR
+        last = int(np.argmax(near)) if near.any() else len(near) - 1
+        seconds[n] = batch.t[first + last, n] - batch.t[first, n]
+    return seconds
+
+
+def false_changes(batch: Batch, said: Estimates) -> FloatArray:
+    """How often the interval lies more than NEAR beside an unchanged friction for HOLD_S or longer, per drive."""
+    wrong = (said.mu_upper < batch.mu - NEAR) | (said.mu_lower > batch.mu + NEAR)
+    hold = max(1, round(HOLD_S / float(batch.t[1, 0] - batch.t[0, 0])))
+    count = np.zeros(wrong.shape[1])
+    run = np.zeros(wrong.shape[1], dtype=np.int64)
+    for row in wrong:
+        run = np.where(row, run + 1, 0)
+        count += run == hold
+    return count

@@ -1,0 +1,59 @@
+"""The two experiments of paper 004, as it did them: noise on a_x, a_y, r only, exact inputs, start at the truth.
+
+They show that the filter is implemented as meant. They show nothing about estimating friction, which is known at the
+start: the bars and the printed tables are for v_x, v_y and the yaw rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from edge_agent.adaptation.memberships import Memberships
+from edge_agent.app.tuned_memberships import shipped
+from edge_agent.estimators import TUNED, Estimates
+from edge_agent.estimators.paper_aco_fckf import AT_THE_TRUTH, bank
+from edge_agent.lab.evaluation.batch import Batch, estimates, ideal, repeated
+from edge_agent.lab.evaluation.measures import measures
+from edge_agent.lab.evaluation.scenarios import MATCHED, PAPERS, SEDAN
+from edge_agent.lab.simulation.white import add_white, scheduled
+from schemas.numeric import FloatArray
+
+CONSTANT = 0.05  # variance of all three noises [SI]
+STILL = Memberships(outputs=(0.0,) * 5)  # fuzzy sets that leave R as it is
+
+
+def noisy(batch: Batch, variance: FloatArray, seeds: Sequence[int]) -> Batch:
+    """One copy of the drive per seed, with white noise of variance (T,) on a_x, a_y and r."""
+    copies = repeated(batch, len(seeds))
+    for n, seed in enumerate(seeds):
+        add_white(copies.signals[:, n], variance, np.random.default_rng([seed, 4]))
+    return copies
+
+
+def variances(t: FloatArray, experiment: str) -> FloatArray:
+    """Noise variance at the times t (T,) [s] of the experiment "constant" or "variable"."""
+    return np.full(len(t), CONSTANT) if experiment == "constant" else scheduled(t)
+
+
+def experiments(
+    seeds: Sequence[int],
+) -> tuple[dict[tuple[str, str], dict[str, FloatArray]], dict[str, tuple[Batch, Estimates]]]:
+    """(measures per drive by experiment and filter, drives for plots by experiment).
+
+    "sedan" is "constant" with the simulator's own plant. The filters are the paper's, and its controls: untuned
+    (paper-fckf), without adaptation (paper-ckf). Only a_x, a_y and r are noisy; the names of S are in that order.
+    """
+    found, drives = {}, {}
+    for name, vehicle in (("constant", MATCHED), ("variable", MATCHED), ("sedan", SEDAN)):
+        exact = ideal(replace(PAPERS["004.dlc"], vehicle=vehicle))
+        batch = noisy(exact, variances(exact.t[:, 0], "variable" if name == "variable" else "constant"), seeds)
+        for estimator, sets in (
+            ("paper-ckf", STILL), ("paper-fckf", Memberships()), ("paper-aco-fckf", shipped(TUNED["paper-aco-fckf"]))
+        ):  # fmt: skip
+            said = estimates(bank(batch.vehicles, sets, AT_THE_TRUTH), batch)
+            found[name, estimator] = measures(batch, said)
+        drives[f"004.{name}"] = (batch, said)
+    return found, drives

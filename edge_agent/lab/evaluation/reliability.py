@@ -1,0 +1,73 @@
+"""Reliability: how often the truth lies below each stated quantile of friction, at LEVELS.
+
+An estimates file tells three quantiles. An estimator that tells the evidence of a visit tells more: a visit that has
+lasted since the start begins at the uniform prior, so its likelihood on the friction grid is the whole posterior. It
+is asked of a copy of the bank, so that the drive itself goes on as if nobody had asked. Other estimators are Gaussian
+between their quantiles, or tell the prior.
+"""
+
+from __future__ import annotations
+
+import copy
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from edge_agent.estimators import Estimates, EstimatorBank
+from edge_agent.lab.evaluation.batch import Batch
+from schemas.mugrid import BINS, LOWER, UPPER
+from schemas.numeric import FloatArray
+
+LEVELS: Final = tuple(round(0.05 * k, 2) for k in range(1, 20))
+EVERY_S: Final = 1.0
+PRIOR_WIDTH: Final = 0.9 * (UPPER - LOWER)  # of its 90 % interval
+EDGES: Final = np.linspace(LOWER, UPPER, BINS + 1)
+
+
+def watched(bank: EstimatorBank, batch: Batch) -> tuple[Estimates, FloatArray]:
+    """What the bank says of the drives, and the rank of the truth in its posterior once every EVERY_S, (K, N)."""
+    samples = len(batch.t)
+    step = max(1, round(EVERY_S / float(batch.t[1, 0] - batch.t[0, 0])))
+    parts, ranks = [], []
+    for first, end in pairwise([*range(0, samples, step), samples]):
+        parts.append(bank.advance(batch.t[first:end], batch.signals[first:end]))
+        if end < samples:
+            ranks.append(_rank(bank, batch, end, parts[-1]))
+    return joined(parts), np.array(ranks).reshape(-1, batch.t.shape[1])
+
+
+def joined(parts: list[Estimates]) -> Estimates:
+    """Estimates of one drive, one stretch after the other; evidence is left out."""
+    return Estimates(np.concatenate([part.told for part in parts]))
+
+
+def _rank(bank: EstimatorBank, batch: Batch, now: int, said: Estimates) -> FloatArray:
+    """Share of the posterior below the true friction of the sample before `now`, (N,)."""
+    truth = batch.mu[now - 1]
+    closes = np.ones((1, len(truth)), np.bool_)
+    told = copy.deepcopy(bank).advance(batch.t[now : now + 1], batch.signals[now : now + 1], closes).evidence
+    if told is None:
+        return between_quantiles(truth, said.mu_lower[-1], said.mu[-1], said.mu_upper[-1])
+    return on_the_grid(truth, told[0])
+
+
+def on_the_grid(truth: FloatArray, log_likelihood: FloatArray) -> FloatArray:
+    """Share below the truth (N,) of posteriors with log-likelihoods (N, 32) upon the uniform prior, (N,)."""
+    weight = np.exp(log_likelihood)
+    below = np.cumsum(weight / weight.sum(axis=1, keepdims=True), axis=1)
+    return np.array([np.interp(mu, EDGES, [0.0, *row]) for mu, row in zip(truth, below, strict=True)])
+
+
+def between_quantiles(truth: FloatArray, lower: FloatArray, mu: FloatArray, upper: FloatArray) -> FloatArray:
+    """The same of Gaussians with these 5, 50 and 95 % quantiles, one of which may be cut off; of the prior, uniform."""
+    from scipy.stats import norm
+
+    std = np.maximum(np.maximum(mu - lower, upper - mu), 1e-9) / norm.ppf(0.95)
+    uniform = (truth - LOWER) / (UPPER - LOWER)
+    return np.where(upper - lower > PRIOR_WIDTH - 1e-6, uniform, norm.cdf((truth - mu) / std))
+
+
+def shares(ranks: FloatArray) -> FloatArray:
+    """Share of ranks at or below each of LEVELS."""
+    return np.asarray((ranks.ravel()[:, None] <= np.array(LEVELS)).mean(axis=0))

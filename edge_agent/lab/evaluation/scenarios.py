@@ -1,0 +1,115 @@
+"""The scenarios: the papers' manoeuvres with the papers' vehicles, those of the default's bars, and other vehicles.
+
+What a paper does not give (tyres, wheel inertia, the vehicle of 003) is that of the simulator's sedan or of an ordinary
+car; all four wheels drive, as in the papers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Final
+
+from edge_agent.lab.evaluation.batch import Scenario
+from edge_agent.lab.simulation.manoeuvres import jump, kmh, split
+from edge_agent.lab.simulation.presets import PRESETS, TrueVehicle, car, matched
+
+SLOPES: Final = ("longitudinal_stiffness", "cornering_stiffness")
+SEDAN: Final = PRESETS["sedan"]  # paper 004, table 1
+# papers 000 and 001, table 2
+LIGHT: Final = TrueVehicle(car("light", 830.0, 1110.0, (1.17, 1.17), (1.416, 1.416), 0.54, 0.278, 0.5), power=60e3)
+# paper 002, table 1; the height of the centre of gravity is not given
+SMALL: Final = TrueVehicle(car("in-wheel", 710.0, 1000.0, (0.795, 0.975), (1.55, 1.55), 0.50, 0.245, 0.5), power=60e3)
+STRONG: Final = replace(SEDAN, power=400e3)  # .6 g at 25 m/s
+LOOSE: Final = replace(STRONG, slip_limit=math.inf)  # no slip control: wheels spin
+
+MATCHED: Final = matched(SEDAN)  # the vehicle of 004, whose tyres are not given, as its model has it
+
+
+def steered_behind(speed: float) -> TrueVehicle:
+    """The vehicle of 000 and 001 with the rear wheels steered for no sideslip in a steady turn at `speed` [m/s].
+
+    Paper 001, equation 53: (K*m*a*v^2 - b) / (K*m*b*v^2 + a), K = 1/(axle stiffness*wheelbase), alike at both axles.
+    """
+    told = LIGHT.vehicle
+    a, b = told.cg_to_front_axle, told.cg_to_rear_axle
+    pull = told.mass * speed * speed / (2.0 * told.cornering_stiffness * (a + b))
+    return replace(LIGHT, rear_steer=(pull * a - b) / (pull * b + a))
+
+
+# as other cars are: another drive, softer tyres, another load
+HATCHBACK: Final = PRESETS["small"]
+VAN: Final = replace(
+    PRESETS["van"],
+    vehicle=PRESETS["van"].vehicle.model_copy(
+        update={name: 0.7 * getattr(PRESETS["van"].vehicle, name) for name in SLOPES}
+    ),
+)
+LOADED: Final = replace(
+    SEDAN,
+    vehicle=SEDAN.vehicle.model_copy(
+        update={"mass": 2050.0, "yaw_inertia": 2500.0, "cg_height": 0.60, "cg_to_front_axle": 1.45,
+                "cg_to_rear_axle": 1.24}
+    ),
+)  # fmt: skip
+
+PAPERS: Final = {
+    "004.dlc": Scenario("double-lane-change", SEDAN, 0.85, kmh(80), 50.0, about="double lane change, 80 km/h"),
+    "000.jump": Scenario("two-lane-changes", steered_behind(kmh(30)), about="lane changes at 30 km/h, .5 to .3"),
+    "001.dlc": Scenario(
+        "double-lane-change", steered_behind(kmh(40)), 0.85, kmh(40), 50.0, 14.0, "double lane change, 40 km/h"
+    ),
+    "001.sine": Scenario("sine", steered_behind(kmh(70)), 0.50, kmh(70), 50.0, about="sine steering, 70 km/h"),
+    "001.slalom": Scenario("slalom", steered_behind(kmh(30)), 0.30, kmh(30), 50.0, about="slalom, 30 km/h"),
+    "001.gaining.dlc": Scenario("gaining-lane-changes", LIGHT, 0.90, rate_hz=50.0, about="lane changes, 4 to 40 km/h"),
+    "001.gaining.slalom": Scenario("gaining-slalom", LIGHT, 0.90, rate_hz=50.0, about="slalom, 5 to 30 km/h"),
+    "002.sine": Scenario("accelerating-sine", SMALL, 0.70, 20.0, about="sine steering, 20 to 25 m/s"),
+    "002.jturn": Scenario("j-turn", SMALL, 1.00, 15.0, about="J-turn, 15 m/s"),
+    "002.serpentine": Scenario("slalom", SMALL, 0.85, about="serpentine of the road test, speed not given"),
+    "003.accel": Scenario("firm-acceleration", STRONG, 0.85, about="acceleration of .6 g"),
+    "003.turn": Scenario("low-turn", SEDAN, 0.35, about="turn on snow, 40 km/h"),
+    "003.split": Scenario("firm-acceleration", STRONG, split(0.30, 0.85), about="acceleration on split friction"),
+    "003.straight.split": Scenario(
+        "straight", SEDAN, split(0.30, 0.85), kmh(40), duration_s=10.0, about="split friction, constant speed"
+    ),
+    "003.straight.low": Scenario("straight", SEDAN, 0.30, kmh(40), duration_s=10.0, about="snow, constant speed"),
+    "003.jump": Scenario("brisk-acceleration", STRONG, jump(0.85, 0.50, 30.0), about="acceleration, .85 to .5"),
+}
+
+OTHERS: Final = {
+    "default.dlc": Scenario("double-lane-change", SEDAN, 0.85, kmh(80), about="as 004, realistic"),
+    "default.jump.accel": Scenario("brisk-acceleration", STRONG, jump(0.85, 0.50, 30.0), about=".85 to .5 at .45 g"),
+    "default.jump.brake": Scenario("moderate-braking", SEDAN, jump(0.85, 0.30, 60.0), about=".85 to .3 at .28 g"),
+    "default.steady": Scenario("pulses", SEDAN, 0.60, duration_s=90.0, about="town traffic, one road"),
+    "default.straight": Scenario("straight", SEDAN, 0.85, kmh(60), duration_s=20.0, about="19 s at constant speed"),
+    "default.abs.dry": Scenario("braking", SEDAN, 0.85, about="anti-lock stop, dry"),
+    "default.abs.snow": Scenario("braking", SEDAN, 0.30, about="anti-lock stop, snow"),
+    "default.spin": Scenario("firm-acceleration", LOOSE, 0.35, about="spinning wheels on snow"),
+}
+
+# the default on other vehicles: shown, without bars
+VEHICLES: Final = {
+    f"default.{name}.{drive}": Scenario(manoeuvre, vehicle, friction, about=f"{about}, {name}")
+    for name, vehicle in (("hatchback", HATCHBACK), ("van", VAN), ("loaded", LOADED))
+    for drive, manoeuvre, friction, about in (
+        ("abs", "braking", 0.80, "anti-lock stop"),
+        ("abs.jump", "jump-braking", None, "anti-lock stop from dry onto snow"),
+        ("abs.split", "split-braking", None, "anti-lock stop with one side on snow"),
+        ("jump", "brisk-acceleration", jump(0.80, 0.40, 30.0), ".8 to .4 accelerating"),
+        ("jturn", "j-turn", 0.60, "J-turn"),
+        ("ice", "acceleration", 0.15, "acceleration on ice"),
+    )
+}
+
+# tyres that are not of the estimators' family or shape; "all scenarios" are driven with each in turn
+FOREIGN: Final = {
+    "brush": {"brush": True},
+    "sharp": {"shape": 1.65, "curvature": -0.6},
+    "round": {"shape": 1.30, "curvature": 0.1},
+    "softening": {"softening": 0.3},
+}
+
+
+def foreign(scenario: Scenario, kind: str) -> Scenario:
+    """The scenario with tyres of a kind of FOREIGN."""
+    return replace(scenario, vehicle=replace(scenario.vehicle, **FOREIGN[kind]))  # type: ignore[arg-type]

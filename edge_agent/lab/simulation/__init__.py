@@ -1,0 +1,24 @@
+"""Simulated vehicles: manoeuvres on a test track and fleets on a road network, with truth beside the signals."""
+
+from edge_agent.lab.simulation.faults import FAULTS, Fault
+from edge_agent.lab.simulation.fleet import SimulatedFleet, Truth
+from edge_agent.lab.simulation.manoeuvres import MANOEUVRES, jump, split
+from edge_agent.lab.simulation.presets import PRESETS
+from edge_agent.lab.simulation.scenarios import SCENARIOS, Scenario
+from edge_agent.lab.simulation.sensors import SENSORS
+from edge_agent.lab.simulation.simulate import simulate_manoeuvre
+
+__all__ = [
+    "FAULTS",
+    "MANOEUVRES",
+    "PRESETS",
+    "SCENARIOS",
+    "SENSORS",
+    "Fault",
+    "Scenario",
+    "SimulatedFleet",
+    "Truth",
+    "jump",
+    "simulate_manoeuvre",
+    "split",
+]

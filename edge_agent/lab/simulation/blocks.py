@@ -1,0 +1,26 @@
+"""A simulated fleet as an endless source of blocks, with its truth handed to a recorder."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+from edge_agent.inputs.block import Block, absolute
+from edge_agent.lab.simulation import SimulatedFleet
+from edge_agent.lab.truth_file import TruthRecorder
+
+BLOCK_S = 0.1  # of a live loop: short beside the second that a batch waits
+
+
+def blocks(fleet: SimulatedFleet, rate_hz: float, recorder: TruthRecorder | None = None) -> Iterator[Block]:
+    """Blocks of BLOCK_S without end; simulated time begins at the moment the first block is asked for."""
+    steps, start_ns = max(1, round(BLOCK_S * rate_hz)), 0
+    while True:
+        t, signals = fleet.step(steps)
+        start_ns = start_ns or time.time_ns()  # after the first step, which may have to compile
+        block = Block(t, absolute(t, start_ns), signals)
+        if recorder is not None:
+            truth = fleet.truth
+            position = fleet.scenario.origin.to_latlon(truth.x, truth.y)
+            recorder.add(block.time, position, truth.yaw, truth.mu_wheel, truth.utilisation)
+        yield block

@@ -1,0 +1,220 @@
+"""The driver of a simulated vehicle: follows a route for ever, brakes before junctions, is caught out by black ice.
+
+He aims at a point ahead on his lane (pure pursuit), and at a speed from the lane's profile and his budget q: the share
+of the grip he *believes* in that he likes to use, at most what is comfortable. His belief follows the looks of the road
+ahead, falls fast when he feels a wheel slide, and comes back slowly. Now and then somebody ahead makes him brake.
+Other vehicles are not seen: each drives as if alone, so that a drive does not depend on how many there are.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_agent.dynamics.parameters import GRAVITY, P
+from edge_agent.lab.simulation.chance import uniform
+from edge_agent.lab.simulation.friction import F, look_up
+from edge_agent.lab.simulation.plant import W, X, strongest_pull
+from edge_agent.lab.simulation.roads import L
+from schemas.numeric import FloatArray, IntArray
+from schemas.runtime.jit import compiled
+
+Lanes: TypeAlias = tuple[FloatArray, IntArray, IntArray, FloatArray, IntArray]
+"""The arrays of a `Network`: points, first, size, spacing, ways."""
+Key: TypeAlias = np.uint64
+KeyArray: TypeAlias = NDArray[np.uint64]
+
+
+class D(IntEnum):
+    """State of one driver (float64)."""
+
+    STEER = 0  # [rad] mean road-wheel angle, as the arms have followed so far
+    FORCE = 1  # [N] longitudinal, as the foot has followed so far
+    BELIEF = 2  # grip he believes in
+    STYLE = 3  # share of it that he uses
+    COMFORT = 4  # [m/s^2] most that he cares for
+    CRUISE = 5  # [m/s] on a dry open road
+    WOBBLE = 6  # [m] amplitude of his wandering in the lane
+    SHORT = 7  # [m] left to the next point of the lane
+
+
+class G(IntEnum):
+    """Where one driver is on his route (int64)."""
+
+    LANE = 0
+    POINT = 1  # the next point of the lane
+    WAY = 2  # which way he will go at its end
+    TURNS = 3  # how many lanes he has finished
+
+
+ARMS_S: Final = 0.12  # lag of the steering
+FOOT_S: Final = 0.2  # lag of the pedals
+LOOKING_S: Final = 0.6  # how far ahead he judges the look of the road
+WORSE_S: Final = 0.5  # how fast he takes in that the road ahead looks worse, and better
+BETTER_S: Final = 2.5
+ALARM_S: Final = 0.7  # e-folding of his belief while wheels slide
+SLIDING: Final = 3.5  # normalised slip that he feels as sliding: well past the peak
+LEAST_BELIEF: Final = 0.12
+SLOWEST: Final = 3.0  # [m/s] nobody stops: standing vehicles tell nothing of the road
+LARGEST_STEER: Final = 0.55  # [rad]
+LARGEST_SLIP_ANGLE: Final = 0.09  # [rad] of the front wheels; more steering than that only scrubs
+ALERT_S: Final = 7.0  # once in this time somebody ahead may make him brake,
+ALERT_SHARE: Final = 0.45  # with this probability,
+ALERT_LENGTH_S: Final = 1.5  # for this long
+LEAST_BRAKING: Final = 0.35  # share of the budget that is left for the brakes in the tightest bend
+FRIGHT: Final = 2.5  # [m/s^2] asked of the brakes at least, whatever the road, by who is much too fast:
+TOO_FAST: Final = 1.4  # this many times the square of the speed he aims at
+PULL: Final = 0.85  # share of the grip of the driven wheels that he dares to use for driving
+WOBBLE_HZ: Final = 0.11
+ROUTE_STREAM: Final = 10
+ALERT_STREAM: Final = 11
+
+
+@compiled
+def ways_of(ways: IntArray, lane: int) -> int:
+    """How many ways there are to go on from a lane."""
+    count = 0
+    while count < ways.shape[1] and ways[lane, count] >= 0:
+        count += 1
+    return count
+
+
+@compiled
+def follow(x: FloatArray, g: IntArray, lanes: Lanes, key: Key) -> float:
+    """Move the route state `g` on to where the vehicle is; at the end of a lane choose the next turn by chance.
+
+    Returns how far it still is to the next point [m], at most the distance between points.
+    """
+    points, first, size, spacing, ways = lanes
+    while True:
+        lane, point = g[G.LANE], g[G.POINT]
+        row = points[first[lane] + point]
+        along = (x[X.X] - row[L.X]) * row[L.COS] + (x[X.Y] - row[L.Y]) * row[L.SIN]
+        if not along > 0.0:
+            return float(min(-along, spacing[lane]))
+        if point + 1 < size[lane]:
+            g[G.POINT] = point + 1
+            continue
+        g[G.LANE], g[G.POINT] = ways[lane, g[G.WAY]], 0
+        g[G.TURNS] += 1
+        g[G.WAY] = int(uniform(key, g[G.TURNS]) * ways_of(ways, g[G.LANE]))
+
+
+@compiled
+def ahead(d: FloatArray, g: IntArray, lanes: Lanes, distance: float) -> tuple[int, float]:
+    """Where the route is `distance` [m] further on: the row of a point, and metres beyond it.
+
+    Beyond the next lane he takes the first way.
+    """
+    _, first, size, spacing, ways = lanes
+    lane, way = g[G.LANE], g[G.WAY]
+    left = max(distance - d[D.SHORT] + g[G.POINT] * spacing[lane], 0.0)
+    while True:
+        length = (size[lane] - 1) * spacing[lane]
+        if left <= length:
+            point = int(left / spacing[lane])
+            return int(first[lane] + point), float(left - point * spacing[lane])
+        left -= length
+        lane, way = ways[lane, way], 0
+
+
+@compiled
+def budget(d: FloatArray) -> float:
+    """q [m/s^2]: what the driver is ready to ask of the tyres."""
+    return float(min(d[D.STYLE] * d[D.BELIEF] * GRAVITY, d[D.COMFORT]))
+
+
+@compiled
+def cruise(d: FloatArray) -> float:
+    """Speed he keeps on an open road [m/s]: slower where he believes it slippery."""
+    return float(d[D.CRUISE] * math.sqrt(min(1.0, 0.25 + 1.1 * d[D.BELIEF])))
+
+
+@compiled
+def believe(d: FloatArray, looks: float, w: FloatArray, dt: float) -> None:
+    """Take in how the road ahead looks, and whether wheels slide."""
+    lag = WORSE_S if looks < d[D.BELIEF] else BETTER_S
+    d[D.BELIEF] += (looks - d[D.BELIEF]) * -math.expm1(-dt / lag)
+    for i in range(4):
+        if w[W.THETA, i] > SLIDING:
+            d[D.BELIEF] *= math.exp(-dt / ALARM_S)
+            break
+    d[D.BELIEF] = max(d[D.BELIEF], LEAST_BELIEF)
+
+
+@compiled
+def alerted(t: float, key: Key) -> float:
+    """How hard somebody ahead makes him brake now, as a share of his budget; 0 for most of the time."""
+    window = int(t / ALERT_S)
+    if t - window * ALERT_S > ALERT_LENGTH_S or uniform(key, 2 * window) > ALERT_SHARE:
+        return 0.0
+    return 0.6 + 0.4 * uniform(key, 2 * window + 1)
+
+
+@compiled
+def wished_acceleration(
+    x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float, key: Key
+) -> float:
+    """Longitudinal acceleration [m/s^2] that he asks for."""
+    vx, q = x[X.VX], budget(d)
+    reach = max(2.0, 0.5 * vx)
+    lane = g[G.LANE]
+    row, beyond = ahead(d, g, lanes, reach)
+    last = lanes[1][lane] + lanes[2][lane] - 1
+    stays = lanes[1][lane] <= row <= last
+    here = lanes[0][lanes[1][lane] + g[G.POINT], L.PROFILE + g[G.WAY]]
+    there = lanes[0][row, L.PROFILE + g[G.WAY]] if stays else min(here, lanes[0][row, L.PROFILE])
+    if stays and row < last:
+        there += (lanes[0][row + 1, L.PROFILE + g[G.WAY]] - there) * beyond / lanes[3][lane]
+    aim = min(q * there, cruise(d) ** 2)
+    wish = (max(aim, SLOWEST**2) - vx * vx) / (2.0 * reach)
+    across = min(abs(vx * x[X.YAW_RATE]) / q, 1.0)
+    room = math.sqrt(1.0 - across * across)  # what cornering leaves of the budget
+    driven = max(p[P.DRIVE_FRONT], 1.0 - p[P.DRIVE_FRONT])  # share of the pull on an axle that carries half the vehicle
+    gas = min(PULL * d[D.BELIEF] * GRAVITY * min(1.0, 0.5 / driven), 0.8 * q, strongest_pull(p, vx) / p[P.MASS])
+    alarm = alerted(t, key)
+    if alarm > 0.0 and vx > SLOWEST + 1.0:
+        wish = min(wish, -alarm * q)
+    hardest = max(q, FRIGHT) if vx * vx > TOO_FAST * aim else q
+    return float(min(max(wish, -max(room, LEAST_BRAKING) * hardest), room * gas))
+
+
+@compiled
+def wished_steer(x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float) -> float:
+    """Mean road-wheel angle [rad] of the circle through a point ahead, as far as the front tyres follow."""
+    vx, base = max(x[X.VX], SLOWEST), p[P.TO_FRONT] + p[P.TO_REAR]
+    number, beyond = ahead(d, g, lanes, 2.5 + 0.45 * vx)
+    row = lanes[0][number]
+    offset = d[D.WOBBLE] * math.sin(2.0 * math.pi * WOBBLE_HZ * t + 1e3 * d[D.WOBBLE])
+    dx = row[L.X] + row[L.COS] * beyond - row[L.SIN] * offset - x[X.X]
+    dy = row[L.Y] + row[L.SIN] * beyond + row[L.COS] * offset - x[X.Y]
+    c, s = math.cos(x[X.YAW]), math.sin(x[X.YAW])
+    forward, left = c * dx + s * dy + p[P.TO_REAR], c * dy - s * dx
+    if forward < 0.0:  # spun round: turn about, or the point stays straight behind for ever
+        return math.copysign(LARGEST_STEER, left)
+    steer = math.atan(2.0 * base * left / max(forward * forward + left * left, 1.0))
+    drift = math.atan2(x[X.VY] + p[P.TO_FRONT] * x[X.YAW_RATE], vx)
+    steer = min(max(steer, drift - LARGEST_SLIP_ANGLE), drift + LARGEST_SLIP_ANGLE)
+    return min(max(steer, -LARGEST_STEER), LARGEST_STEER)
+
+
+@compiled
+def drive(
+    x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, w: FloatArray, friction: FloatArray,
+    t: float, dt: float, keys: tuple[Key, Key],
+) -> None:  # fmt: skip
+    """Move driver `d` and route `g` on by one sample: afterwards d[STEER], d[FORCE] are what arms and foot do.
+
+    `w` is what the wheels did at the last sample; keys are those of his route and of his alerts.
+    """
+    d[D.SHORT] = follow(x, g, lanes, keys[0])
+    number, _ = ahead(d, g, lanes, max(LOOKING_S * x[X.VX], 0.0))
+    point = lanes[0][number]
+    believe(d, look_up(friction, F.LOOKS, t, point[L.X], point[L.Y]), w, dt)
+    force = p[P.MASS] * wished_acceleration(x, d, g, lanes, p, t, keys[1])
+    d[D.FORCE] += (force - d[D.FORCE]) * -math.expm1(-dt / FOOT_S)
+    d[D.STEER] += (wished_steer(x, d, g, lanes, p, t) - d[D.STEER]) * -math.expm1(-dt / ARMS_S)

@@ -1,0 +1,162 @@
+"""Many vehicles that drive on a road network for ever, in one compiled kernel."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from edge_agent.lab.simulation.chance import checked_seed, key_of
+from edge_agent.lab.simulation.driver import ALERT_STREAM, ROUTE_STREAM, D, G, KeyArray, Lanes, drive
+from edge_agent.lab.simulation.friction import F, look_up
+from edge_agent.lab.simulation.plant import (
+    RECORD,
+    STATES,
+    R,
+    U,
+    W,
+    advance,
+    command,
+    observe,
+    start_at,
+    substeps_of,
+    wheel_place,
+)
+from edge_agent.lab.simulation.presets import nominal, one_of_a_fleet
+from edge_agent.lab.simulation.roads import L, Network
+from edge_agent.lab.simulation.scenarios import Scenario, scenario_named
+from edge_agent.lab.simulation.sensors import Sensors, error_row, noise_keys, sense, sensors_named
+from schemas.errors import InputError
+from schemas.numeric import FloatArray, IntArray
+from schemas.runtime.jit import compiled
+
+VEHICLE_STREAM = 0
+GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0  # multiples of it, modulo 1, are spread evenly however many there are
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What was true in a block, (T, N) or (T, N, 4): pose [m, m, rad], speed [m/s], friction, |F|/(μ F_z)."""
+
+    x: FloatArray
+    y: FloatArray
+    yaw: FloatArray
+    vx: FloatArray
+    vy: FloatArray
+    mu_wheel: FloatArray
+    utilisation: FloatArray
+
+
+@compiled
+def run(
+    states: tuple[FloatArray, FloatArray, IntArray, FloatArray], parameters: FloatArray, lanes: Lanes,
+    friction: FloatArray, keys: tuple[KeyArray, KeyArray], first: int, steps: int, timing: tuple[float, int],
+) -> FloatArray:  # fmt: skip
+    """Records (T, N, 30) of the next `steps` samples; the states are carried on in place.
+
+    states: vehicles (N, 12), drivers (N, 7), routes (N, 4), wheels (N, 8, 4); keys: of routes and of alerts (N,);
+    timing: sample period [s] and plant steps in it; `first` is the number of the first sample.
+    """
+    vehicles, drivers, routes, wheels = states
+    period, substeps = timing
+    records = np.empty((steps, vehicles.shape[0], RECORD))
+    u = np.empty((4, 4))
+    for n in range(vehicles.shape[0]):
+        x, d, g, w, p = vehicles[n], drivers[n], routes[n], wheels[n], parameters[n]
+        for k in range(steps):
+            t = (first + k) * period
+            drive(x, d, g, lanes, p, w, friction, t, period, (keys[0][n], keys[1][n]))
+            command(p, u, d[D.STEER], d[D.FORCE])
+            for i in range(4):
+                px, py = wheel_place(x, p, i)
+                u[U.MU, i] = look_up(friction, F.MU, t, px, py)
+            observe(x, p, u, w, records[k, n])
+            advance(x, p, u, w, period / substeps, substeps)
+    return records
+
+
+class SimulatedFleet:
+    """N vehicles on the roads of a scenario, deterministic in (scenario, seed, rate) and in a vehicle's number alone.
+
+    Args:
+        scenario: a key of SCENARIOS, or a Scenario.
+        vehicles: how many; vehicle k drives the same whatever their number.
+        seed: non-negative.
+        rate_hz: of the samples.
+        sensors: a key of SENSORS.
+
+    Raises:
+        InputError: an argument is out of range or unknown.
+    """
+
+    def __init__(
+        self, scenario: str | Scenario, vehicles: int, seed: int, rate_hz: float, sensors: str | Sensors = "mems-patchy"
+    ) -> None:
+        if vehicles < 1:
+            raise InputError("vehicles", f"{vehicles} vehicles cannot drive", "give a positive number")
+        if not (math.isfinite(rate_hz) and rate_hz > 0.0):
+            raise InputError("rate_hz", f"{rate_hz} is not possible", "give a positive number")
+        seed = checked_seed(seed)
+        self.scenario = scenario_named(scenario)
+        self.rate_hz = rate_hz
+        self.names = [f"sim-{k + 1:03d}" for k in range(vehicles)]
+        rngs = [np.random.default_rng([seed, k, VEHICLE_STREAM]) for k in range(vehicles)]
+        truths = [one_of_a_fleet(k, name, rng) for k, (name, rng) in enumerate(zip(self.names, rngs, strict=True))]
+        self.vehicles = [nominal(truth, rng) for truth, rng in zip(truths, rngs, strict=True)]
+        self._parameters = np.stack([truth.row() for truth in truths])
+        self._errors = np.stack(
+            [error_row(sensors_named(sensors), self.scenario.origin, seed, k) for k in range(vehicles)]
+        )
+        noise = [noise_keys(seed, k) for k in range(vehicles)]
+        self._noise = (np.array([white for white, _ in noise]), np.array([silence for _, silence in noise]))
+        self._keys = (
+            np.array([key_of(seed, k, ROUTE_STREAM) for k in range(vehicles)]),
+            np.array([key_of(seed, k, ALERT_STREAM) for k in range(vehicles)]),
+        )
+        self._states = _start(self.scenario.network, self._parameters, rngs)
+        self._wander = np.zeros((vehicles, 3))
+        self._next = 0
+        self.truth = _truth(np.empty((0, vehicles, RECORD)))
+
+    def step(self, steps: int) -> tuple[FloatArray, FloatArray]:
+        """The next `steps` samples: t (T, N) [s] from 0 and signals (T, N, 18); `truth` is then that of this block."""
+        if steps < 1:
+            raise InputError("steps", f"{steps} samples cannot be had", "give a positive number")
+        network, origin = self.scenario.network, self.scenario.origin
+        lanes = (network.points, network.first, network.size, network.spacing, network.ways)
+        timing = (1.0 / self.rate_hz, substeps_of(self.rate_hz))
+        records = run(self._states, self._parameters, lanes, self.scenario.table, self._keys, self._next, steps, timing)
+        place = np.array([origin.latitude, origin.longitude, *origin.per_metre])
+        signals = sense(records, self._errors, self._wander, place, self._noise, self._next, self.rate_hz)
+        t = np.repeat((np.arange(self._next, self._next + steps) / self.rate_hz)[:, None], len(self.names), axis=1)
+        self._next += steps
+        self.truth = _truth(records)
+        return t, signals
+
+
+def _truth(records: FloatArray) -> Truth:
+    x, y, yaw, vx, vy = (records[..., column] for column in (R.X, R.Y, R.YAW, R.VX, R.VY))
+    return Truth(x, y, yaw, vx, vy, records[..., R.MU : R.MU + 4], records[..., R.UTILISATION : R.UTILISATION + 4])
+
+
+def _start(
+    network: Network, parameters: FloatArray, rngs: list[np.random.Generator]
+) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
+    """Vehicles spread over the roads, rolling at walking pace, each with a driver of his own."""
+    count = len(rngs)
+    vehicles, wheels = np.zeros((count, STATES)), np.zeros((count, len(W), 4))
+    drivers, routes = np.zeros((count, len(D))), np.zeros((count, len(G)), dtype=np.int64)
+    end = np.cumsum(network.size[: network.roads])
+    for k, rng in enumerate(rngs):
+        place = int((k + 0.5) * GOLDEN % 1.0 * end[-1])
+        lane = int(np.searchsorted(end, place, side="right"))
+        point = network.points[place]
+        routes[k] = (lane, place - network.first[lane], 0, 0)
+        start_at(vehicles[k], parameters[k], (point[L.X], point[L.Y], math.atan2(point[L.SIN], point[L.COS])), 5.0)
+        drivers[k, D.BELIEF] = 0.3
+        drivers[k, D.STYLE] = rng.uniform(0.65, 0.88)
+        drivers[k, D.COMFORT] = rng.uniform(4.0, 6.5)
+        drivers[k, D.CRUISE] = rng.uniform(12.0, 15.5)
+        drivers[k, D.WOBBLE] = rng.uniform(0.1, 0.3)
+    return vehicles, drivers, routes, wheels

@@ -1,0 +1,120 @@
+"""Scenarios: a road network, the friction on it over time, and where on earth it lies, as one table."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+
+from edge_agent.lab.simulation.friction import DRY, ICE, SNOW, WET, F, Patch, friction_table, look_up_many
+from edge_agent.lab.simulation.place import GOTHENBURG, Origin
+from edge_agent.lab.simulation.roads import Network, Road, build_network
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A place to drive. `junctions` name -> (x, y) [m]; `patches` lie upon `background` friction, later ones on top."""
+
+    name: str
+    about: str
+    junctions: dict[str, tuple[float, float]]
+    roads: tuple[Road, ...]
+    background: float
+    patches: tuple[Patch, ...]
+    origin: Origin = field(default=GOTHENBURG)
+
+    @cached_property
+    def network(self) -> Network:
+        """The lanes of the roads."""
+        return build_network(self.junctions, self.roads)
+
+    @cached_property
+    def table(self) -> FloatArray:
+        """The patches for `friction.look_up`."""
+        return friction_table(self.background, self.patches)
+
+    @property
+    def events(self) -> tuple[Patch, ...]:
+        """What appears while one drives, in the order of time."""
+        return tuple(sorted((p for p in self.patches if math.isfinite(p.start)), key=lambda p: p.start))
+
+    def friction(self, t: FloatArray | float, x: FloatArray, y: FloatArray) -> FloatArray:
+        """μ at the times t [s] and points (x, y) [m], in the arrays' common shape."""
+        t, x, y = (np.asarray(a, dtype=np.float64) for a in np.broadcast_arrays(t, x, y))
+        return look_up_many(self.table, int(F.MU), t.ravel(), x.ravel(), y.ravel()).reshape(x.shape)
+
+    def to_latlon(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(latitude, longitude) [deg]."""
+        return self.origin.to_latlon(x, y)
+
+    def from_latlon(self, latitude: FloatArray, longitude: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(x, y) [m]."""
+        return self.origin.from_latlon(latitude, longitude)
+
+
+def demo() -> Scenario:
+    """Four streets from a crossing to a winding ring: dry in the north-east, wet, snow, ice, slush along one street.
+
+    At 70 s black ice appears on the eastern street where drivers brake before the crossing and accelerate out of it.
+    """
+    return Scenario(
+        name="demo",
+        about="a crossing and a ring of 2 km; black ice appears at 70 s",
+        junctions={"centre": (0.0, 0.0), "north": (14.0, 140.0), "east": (190.0, 16.0), "south": (0.0, -140.0),
+                   "west": (-190.0, -20.0)},
+        roads=(
+            Road("centre", "north", ((0.0, 45.0), (14.0, 95.0)), 45.0),
+            Road("centre", "east", ((70.0, 0.0), (130.0, 16.0)), 60.0),
+            Road("centre", "south"),
+            Road("centre", "west", ((-60.0, 0.0), (-115.0, -20.0)), 45.0),
+            Road("north", "east", ((150.0, 150.0), (190.0, 105.0)), 28.0),
+            Road("east", "south", ((190.0, -90.0), (140.0, -140.0)), 32.0),
+            Road("south", "west", ((-60.0, -160.0), (-120.0, -115.0), (-190.0, -130.0)), 26.0),
+            Road("west", "north", ((-190.0, 95.0), (-130.0, 150.0), (-60.0, 122.0)), 30.0),
+        ),
+        background=DRY,
+        patches=(
+            Patch("wet north-west", -110.0, 90.0, 220.0, 160.0, WET, looks=WET),
+            Patch("snow south-west", -110.0, -80.0, 220.0, 180.0, SNOW, looks=SNOW),
+            Patch("slush west of the southern street", -4.0, -75.0, 70.0, 4.0, SNOW, math.pi / 2, looks=WET),
+            Patch("slush east of the southern street", 4.0, -75.0, 70.0, 4.0, SNOW, math.pi / 2, looks=WET),
+            Patch("ice on the southern street", -33.0, -151.0, 36.0, 14.0, ICE, 0.32, looks=0.25),
+            Patch("black ice", 40.0, 0.0, 44.0, 12.0, ICE, start=70.0),
+        ),
+    )  # fmt: skip
+
+
+def tiny() -> Scenario:
+    """A triangle of three streets, half of it snow, an ice patch at 5 s: for tests."""
+    return Scenario(
+        name="test",
+        about="a triangle of 300 m, half of it snow; ice appears at 5 s",
+        junctions={"a": (0.0, 0.0), "b": (110.0, 0.0), "c": (50.0, 90.0)},
+        roads=(Road("a", "b"), Road("b", "c"), Road("c", "a")),
+        background=DRY,
+        patches=(
+            Patch("snow in the west", -20.0, 50.0, 140.0, 160.0, SNOW, looks=SNOW),
+            Patch("ice", 80.0, 0.0, 20.0, 10.0, ICE, start=5.0),
+        ),
+    )
+
+
+SCENARIOS: Final = {scenario.name: scenario for scenario in (demo(), tiny())}
+
+
+def scenario_named(name: str | Scenario) -> Scenario:
+    """The scenario of that name.
+
+    Raises:
+        InputError: there is none.
+    """
+    if isinstance(name, Scenario):
+        return name
+    if name not in SCENARIOS:
+        raise InputError("scenario", f"there is no scenario {name!r}", f"choose one of {', '.join(SCENARIOS)}")
+    return SCENARIOS[name]

@@ -1,0 +1,189 @@
+"""What the sensors say of a true record: white noise, constant offsets, gains, a wandering position, missing readings.
+
+Every random number is a hash of (vehicle key, sample number, channel), so a reading depends neither on how a drive is
+cut into blocks nor on the other vehicles. Only the satellite receiver's wander is carried from block to block.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_agent.lab.simulation.chance import key_of, normal, uniform
+from edge_agent.lab.simulation.place import Origin
+from edge_agent.lab.simulation.plant import R
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+from schemas.signals import CHANNELS, S
+
+KeyArray: TypeAlias = NDArray[np.uint64]
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """Errors of a set of sensors: standard deviations of white noise, and of offsets drawn once per drive."""
+
+    acceleration: tuple[float, float] = (0.0, 0.0)  # [m/s^2] white, offset
+    yaw_rate: tuple[float, float] = (0.0, 0.0)  # [rad/s]
+    steering: tuple[float, float] = (0.0, 0.0)  # [rad]
+    wheel_speed: float = 0.0  # [rad/s] white
+    torque: tuple[float, float] = (0.0, 0.0)  # [N·m] white; relative error of the gain, one for all wheels
+    position: tuple[float, float] = (0.0, 0.0)  # [m] white, wandering, north and east each
+    yaw: tuple[float, float] = (0.0, 0.0)  # [rad] white, wandering
+    leak: bool = False  # accelerometers fixed to the rolling body
+    dropouts: float = 0.0  # share of the half seconds in which one group of channels is silent
+
+
+SENSORS: Final = {
+    "ideal": Sensors(),
+    "mems": Sensors(
+        acceleration=(0.05, 0.03), yaw_rate=(0.002, 0.001), steering=(0.001, 0.0005), wheel_speed=0.03,
+        torque=(2.0, 0.03), position=(0.3, 1.5), yaw=(0.01, 0.01),
+    ),
+    "mems-leak": Sensors(
+        acceleration=(0.05, 0.03), yaw_rate=(0.002, 0.001), steering=(0.001, 0.0005), wheel_speed=0.03,
+        torque=(2.0, 0.03), position=(0.3, 1.5), yaw=(0.01, 0.01), leak=True,
+    ),
+    "mems-patchy": Sensors(
+        acceleration=(0.05, 0.03), yaw_rate=(0.002, 0.001), steering=(0.001, 0.0005), wheel_speed=0.03,
+        torque=(2.0, 0.03), position=(0.3, 1.5), yaw=(0.01, 0.01), leak=True, dropouts=0.002,
+    ),
+}  # fmt: skip
+
+FIX_S: Final = 0.1  # a receiver gives ten positions a second; the samples between have none
+WANDER_S: Final = 60.0  # correlation time of its slow error
+SILENCE_S: Final = 0.5  # length of one dropout
+
+# counters of the random streams within one sample; below len(CHANNELS): white noise of the channel
+DRAWS: Final = 32
+WANDER_DRAW: Final = 24  # three of them
+OFFSET_STREAM: Final = 1
+WHITE_STREAM: Final = 2
+SILENCE_STREAM: Final = 3
+
+# channels that fall silent together: inertial unit, steering, each wheel's speed, torques, receiver
+GROUPS: Final = ("inertial", "steering", "wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr", "torque", "receiver")
+GROUP_OF: Final = np.array([0, 0, 0, 1, 1, 1, 1, 2, 3, 4, 5, 6, 6, 6, 6, 7, 7, 7])
+
+
+class E(IntEnum):
+    """Columns of a vehicle's sensor errors: white std, then offset and gain, of every channel; then the rest."""
+
+    WHITE = 0
+    OFFSET = len(CHANNELS)
+    GAIN = 2 * len(CHANNELS)
+    WANDER = 3 * len(CHANNELS)  # std of the three wandering errors: latitude, longitude, yaw
+    LEAK = 3 * len(CHANNELS) + 3
+    DROPOUTS = 3 * len(CHANNELS) + 4
+
+
+ERRORS: Final = 3 * len(CHANNELS) + 5
+
+
+def sensors_named(name: str | Sensors) -> Sensors:
+    """The set of that name.
+
+    Raises:
+        InputError: there is none.
+    """
+    if isinstance(name, Sensors):
+        return name
+    if name not in SENSORS:
+        raise InputError("sensors", f"there is no sensor set {name!r}", f"choose one of {', '.join(SENSORS)}")
+    return SENSORS[name]
+
+
+def error_row(sensors: Sensors, origin: Origin, seed: int, index: int) -> FloatArray:
+    """Errors of the sensors of vehicle `index`, shape (ERRORS,), columns E; offsets and gain are drawn here."""
+    north, east = origin.per_metre
+    white, offset = np.zeros(len(CHANNELS)), np.zeros(len(CHANNELS))
+    for first, count, (std, bias) in (
+        (S.AX, 2, sensors.acceleration), (S.YAW_RATE, 1, sensors.yaw_rate), (S.DELTA, 4, sensors.steering),
+        (S.OMEGA, 4, (sensors.wheel_speed, 0.0)), (S.TORQUE, 4, (sensors.torque[0], 0.0)),
+        (S.LATITUDE, 1, (sensors.position[0] * north, 0.0)), (S.LONGITUDE, 1, (sensors.position[0] * east, 0.0)),
+        (S.YAW, 1, (sensors.yaw[0], 0.0)),
+    ):  # fmt: skip
+        white[first : first + count], offset[first : first + count] = std, bias
+    rng = np.random.default_rng([seed, index, OFFSET_STREAM])
+    gain = np.ones(len(CHANNELS))
+    gain[S.TORQUE : S.TORQUE + 4] += rng.normal(0.0, sensors.torque[1])
+    offset *= rng.standard_normal(len(CHANNELS))
+    offset[S.DELTA : S.DELTA + 4] = offset[S.DELTA]  # one steering sensor feeds the four angles
+    wander = (sensors.position[1] * north, sensors.position[1] * east, sensors.yaw[1])
+    return np.array([*white, *offset, *gain, *wander, float(sensors.leak), sensors.dropouts])
+
+
+def noise_keys(seed: int, index: int) -> tuple[np.uint64, np.uint64]:
+    """Keys of the white noise and of the dropouts of vehicle `index`."""
+    return key_of(seed, index, WHITE_STREAM), key_of(seed, index, SILENCE_STREAM)
+
+
+@compiled
+def read_out(record: FloatArray, error: FloatArray, place: FloatArray, signals: FloatArray) -> None:
+    """Fill `signals` (18,) with the truth of `record`; place = (lat0, lon0, deg per m north, deg per m east)."""
+    felt = error[E.LEAK] > 0.0
+    signals[S.AX] = record[R.AX_FELT] if felt else record[R.AX]
+    signals[S.AY] = record[R.AY_FELT] if felt else record[R.AY]
+    signals[S.YAW_RATE] = record[R.YAW_RATE]
+    for i in range(4):
+        signals[S.DELTA + i] = record[R.DELTA + i]
+        signals[S.OMEGA + i] = record[R.OMEGA + i]
+        signals[S.TORQUE + i] = record[R.TORQUE + i]
+    signals[S.LATITUDE] = place[0] + place[2] * record[R.Y]
+    signals[S.LONGITUDE] = place[1] + place[3] * record[R.X]
+    signals[S.YAW] = record[R.YAW]
+
+
+@compiled
+def wander_on(error: FloatArray, wander: FloatArray, key: np.uint64, sample: int) -> None:
+    """Move the receiver's slow errors `wander` (3,) on to the next fix; the first has their long-run spread."""
+    keep = 0.0 if sample == 0 else math.exp(-FIX_S / WANDER_S)
+    for i in range(3):
+        kick = error[E.WANDER + i] * math.sqrt(1.0 - keep * keep)
+        wander[i] = keep * wander[i] + kick * normal(key, sample * DRAWS + WANDER_DRAW + i)
+
+
+@compiled
+def sense(
+    records: FloatArray, errors: FloatArray, wander: FloatArray, place: FloatArray, keys: tuple[KeyArray, KeyArray],
+    first: int, rate_hz: float,
+) -> FloatArray:  # fmt: skip
+    """Signals (T, N, 18) of the records (T, N, 30); `wander` (N, 3) is carried on; `first` numbers the first sample.
+
+    keys: two uint64 arrays (N,), of the noise and of the dropouts.
+    """
+    white, silence = keys
+    steps, vehicles = records.shape[0], records.shape[1]
+    signals = np.empty((steps, vehicles, len(CHANNELS)))
+    per_fix = max(1, round(rate_hz * FIX_S))
+    per_silence = max(1, round(rate_hz * SILENCE_S))
+    for n in range(vehicles):
+        error = errors[n]
+        for k in range(steps):
+            sample = first + k
+            row = signals[k, n]
+            read_out(records[k, n], error, place, row)
+            fix = sample % per_fix == 0
+            if fix:
+                wander_on(error, wander[n], white[n], sample)
+            for c in range(len(CHANNELS)):
+                if c >= S.LATITUDE and not fix:
+                    row[c] = math.nan
+                    continue
+                if error[E.WHITE + c] > 0.0:
+                    row[c] = row[c] * error[E.GAIN + c] + error[E.OFFSET + c]
+                    row[c] += error[E.WHITE + c] * normal(white[n], sample * DRAWS + c)
+                if c >= S.LATITUDE:
+                    row[c] += wander[n, c - S.LATITUDE]
+            if error[E.DROPOUTS] > 0.0:
+                window = sample // per_silence
+                for c in range(len(CHANNELS)):
+                    if uniform(silence[n], window * len(GROUPS) + GROUP_OF[c]) < error[E.DROPOUTS]:
+                        row[c] = math.nan
+    return signals

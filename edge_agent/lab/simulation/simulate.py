@@ -1,0 +1,145 @@
+"""One manoeuvre of one vehicle: a signal log with truth beside it, and the vehicle file that belongs to it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+import pyarrow as pa
+
+from edge_agent.dynamics.parameters import P
+from edge_agent.lab.simulation.chance import checked_seed
+from edge_agent.lab.simulation.faults import Fault, apply_faults
+from edge_agent.lab.simulation.manoeuvres import MANOEUVRES, Friction, Manoeuvre, Moment
+from edge_agent.lab.simulation.place import GOTHENBURG, Origin
+from edge_agent.lab.simulation.plant import (
+    RECORD,
+    STATES,
+    R,
+    U,
+    W,
+    X,
+    advance,
+    command,
+    observe,
+    start_at,
+    strongest_pull,
+    substeps_of,
+    wheel_place,
+)
+from edge_agent.lab.simulation.presets import TrueVehicle, nominal, true_vehicle
+from edge_agent.lab.simulation.sensors import SENSORS, Sensors, error_row, noise_keys, sense, sensors_named
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+from schemas.signals import CHANNELS, per_wheel
+from schemas.vehicle import Vehicle
+
+TRUTH: Final = (
+    ("true_vx", R.VX), ("true_vy", R.VY), ("true_yaw_rate", R.YAW_RATE), ("true_x", R.X), ("true_y", R.Y),
+    ("true_yaw", R.YAW), ("true_ax", R.AX), ("true_ay", R.AY),
+    *((name, R.MU + i) for i, name in enumerate(per_wheel("true_mu"))),
+    *((name, R.UTILISATION + i) for i, name in enumerate(per_wheel("true_utilisation"))),
+)  # fmt: skip
+STEERING_LAG_S: Final = 0.1  # from the wish to the road wheel
+PEDAL_LAG_S: Final = 0.15
+
+
+def simulate_manoeuvre(
+    name: str, *, mu: Friction | None = None, speed: float | None = None, seed: int = 0, rate_hz: float = 100.0,
+    duration_s: float | None = None, vehicle: str | Vehicle | TrueVehicle = "sedan", sensors: str | Sensors = "mems",
+    faults: tuple[Fault, ...] = (), origin: Origin = GOTHENBURG,
+) -> tuple[pa.Table, Vehicle]:  # fmt: skip
+    """Drive a manoeuvre and return (log, vehicle file).
+
+    The log has a row per sample: `t` [s], the CHANNELS of `schemas.signals` (null where missing), and the truth
+    (`true_vx`, `true_mu_fl`, `true_utilisation_fl`, … in the units of the signals). The vehicle file is nominal: the
+    true vehicle differs from it by the errors in `presets.KNOWN`, except with sensors "ideal", where it is exact.
+
+    Args:
+        name: a key of MANOEUVRES.
+        mu: friction; the manoeuvre's usual one if not given.
+        speed: [m/s], likewise.
+        duration_s: [s], likewise.
+        vehicle: a key of PRESETS, or the true vehicle itself.
+
+    Raises:
+        InputError: an argument is out of range or unknown.
+    """
+    manoeuvre = _named(name)
+    told = sensors_named(sensors)
+    truth = true_vehicle(vehicle)
+    speed = manoeuvre.speed if speed is None else speed
+    duration = manoeuvre.duration if duration_s is None else duration_s
+    seed = checked_seed(seed)
+    _check(speed=speed, rate_hz=rate_hz, duration_s=duration)
+    friction = _friction(manoeuvre.friction if mu is None else mu)
+    records = _drive(manoeuvre, truth, friction, speed, rate_hz, max(1, round(duration * rate_hz)))
+    signals = _sensed(records, told, origin, seed, rate_hz)
+    t = np.arange(len(records)) / rate_hz
+    signals = apply_faults(t, signals, faults)
+    file = truth.vehicle if told == SENSORS["ideal"] else nominal(truth, np.random.default_rng([seed, 0]))
+    return _table(t, signals, records), file
+
+
+def _named(name: str) -> Manoeuvre:
+    if name not in MANOEUVRES:
+        raise InputError("manoeuvre", f"there is no manoeuvre {name!r}", f"choose one of {', '.join(MANOEUVRES)}")
+    return MANOEUVRES[name]
+
+
+def _check(**positive: float) -> None:
+    for name, value in positive.items():
+        if not (math.isfinite(value) and value > 0.0):
+            raise InputError(name, f"{value} is not possible", "give a positive number")
+
+
+def _friction(mu: Friction) -> Callable[[float, float], float]:
+    if callable(mu):
+        return mu
+    if not 0.0 < mu <= 2.0:
+        raise InputError("mu", f"{mu} is not a friction", "give a number in (0, 2]")
+    return lambda _x, _y: mu
+
+
+def _drive(
+    manoeuvre: Manoeuvre, truth: TrueVehicle, friction: Callable[[float, float], float], speed: float,
+    rate_hz: float, samples: int,
+) -> FloatArray:  # fmt: skip
+    """True records (T, 30) of the drive."""
+    p, x, u, w = truth.row(), np.zeros(STATES), np.zeros((len(U), 4)), np.zeros((len(W), 4))
+    records = np.empty((samples, RECORD))
+    substeps, dt = substeps_of(rate_hz), 1.0 / rate_hz
+    start_at(x, p, (0.0, 0.0, 0.0), speed)
+    steer = force = 0.0
+    for k in range(samples):
+        wish, acceleration = manoeuvre.control(_moment(k * dt, x, speed))
+        steer += (wish - steer) * -math.expm1(-dt / STEERING_LAG_S)
+        force += (float(p[P.MASS]) * acceleration - force) * -math.expm1(-dt / PEDAL_LAG_S)
+        force = min(force, strongest_pull(p, float(x[X.VX])))
+        command(p, u, steer, force)
+        for i in range(4):
+            u[U.MU, i] = friction(*wheel_place(x, p, i))
+        observe(x, p, u, w, records[k])
+        advance(x, p, u, w, dt / substeps, substeps)
+    return records
+
+
+def _moment(t: float, x: FloatArray, speed: float) -> Moment:
+    return Moment(t, float(x[X.X]), float(x[X.Y]), float(x[X.YAW]), float(x[X.VX]), speed)
+
+
+def _sensed(records: FloatArray, sensors: Sensors, origin: Origin, seed: int, rate_hz: float) -> FloatArray:
+    """Signals (T, 18) of the records of one vehicle."""
+    errors = error_row(sensors, origin, seed, 0)[None]
+    place = np.array([origin.latitude, origin.longitude, *origin.per_metre])
+    keys = tuple(np.array([key]) for key in noise_keys(seed, 0))
+    return sense(records[:, None], errors, np.zeros((1, 3)), place, (keys[0], keys[1]), 0, rate_hz)[:, 0]
+
+
+def _table(t: FloatArray, signals: FloatArray, records: FloatArray) -> pa.Table:
+    """The log: NaN readings become nulls, truth has none."""
+    columns = {"t": pa.array(t)}
+    columns |= {name: pa.array(signals[:, i], from_pandas=True) for i, name in enumerate(CHANNELS)}
+    return pa.table(columns | {name: pa.array(records[:, column]) for name, column in TRUTH})

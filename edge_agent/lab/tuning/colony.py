@@ -1,0 +1,163 @@
+"""Ant colony over a graph of positions (paper 004, III.C), pure: randomness and objective come in.
+
+An ant walks from vertex to vertex and takes one position at each; its path is one vector of values.
+
+    M_vj = τ_vj^α · η_vj^θ₀ / Σ_{r ∈ A} τ_vr^α · η_vr^θ₀        (31)
+    τ_vj ← (1 − ρ)·τ_vj + Δτ_vj,   Δτ = Σ over depositing ants   (32)
+
+    symbol  name                                        shape    unit
+    v, j    vertex; position at it                               -
+    τ       pheromone                                   (V, K)   -
+    η       visibility: prior preference of a position  (V, K)   -
+    A       positions that exist at the vertex          (V, K)   -
+    ρ       evaporation per iteration                            -
+
+Departures from the print. The paper calls ρ the residual and uses it as evaporation in (32); here (32) stands, and
+its .284 is read as what remains, so that ρ = .716: with few iterations the colony must learn fast.
+Pheromone lies on (vertex, position), not on edges: the objective depends on positions, not on their succession.
+Deposits go by rank and to the best path so far, and pheromone stays inside bounds, so that the scale of the
+objective does not matter and the colony cannot stagnate (rank-based, elitist and max-min ant systems).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from edge_agent.lab.tuning.search import Admissible, Graph, Ledger, Objective, Progress, Result, everything, nearest
+from schemas.errors import InputError
+from schemas.numeric import BoolArray, FloatArray, IntArray
+
+HIGHEST = 1.0  # deposits of one iteration sum to ρ per vertex, so that pheromone tends to this at most
+
+
+@dataclass(frozen=True)
+class Habits:
+    """How the ants behave; InputError where a habit leaves its range."""
+
+    alpha: float = 1.0  # weight of pheromone, α
+    theta: float = 1.0  # weight of visibility, θ₀
+    evaporation: float = 0.716  # ρ = 1 − the paper's residual .284
+    elite: float = 0.25  # share of the ants of an iteration that deposit
+    memory: float = 0.4  # share of the deposit that the best path so far receives
+    retrace: float = 0.3  # chance that an ant of a converged colony walks the best path again
+
+    def __post_init__(self) -> None:
+        """Refuse habits for which (31) or (32) lose their meaning."""
+        for name in ("evaporation", "elite", "memory", "retrace"):
+            value = getattr(self, name)
+            if not 0.0 < value < 1.0:
+                raise InputError(name, f"{value} is no share", "use a number between 0 and 1")
+        for name in ("alpha", "theta"):
+            if getattr(self, name) < 0.0:
+                raise InputError(name, "negative: the ants would shun what is good", "use 0 or more")
+
+
+def transition_probabilities(
+    pheromone: FloatArray, visibility: FloatArray, reachable: BoolArray, *, alpha: float, theta: float
+) -> FloatArray:
+    """Equation (31) for every vertex at once: (V, K), zero outside A, each row sums to one."""
+    attraction = np.where(reachable, pheromone**alpha * visibility**theta, 0.0)
+    probabilities: FloatArray = attraction / attraction.sum(axis=1, keepdims=True)
+    return probabilities
+
+
+def lowest_pheromone(reachable: BoolArray, retrace: float) -> FloatArray:
+    """Lower bound (V, 1) for which a converged colony repeats its best path with probability `retrace`.
+
+    Per vertex the best position then has p = retrace^(1/V) = τ_max / (τ_max + (K − 1)·τ_min), solved for τ_min.
+    """
+    vertices = len(reachable)
+    p = retrace ** (1.0 / vertices)
+    others = np.maximum(reachable.sum(axis=1, keepdims=True) - 1, 1)
+    lowest: FloatArray = np.minimum(HIGHEST * (1.0 - p) / (others * p), HIGHEST)
+    return lowest
+
+
+def deposit(paths: IntArray, weights: FloatArray, reachable: BoolArray) -> FloatArray:
+    """Δτ (V, K) of paths (P, V) with weights (P,); every vertex receives Σ weights."""
+    laid = np.zeros(reachable.shape)
+    vertices = np.arange(reachable.shape[0])
+    for path, weight in zip(paths, weights, strict=True):
+        laid[vertices, path] += weight
+    return laid
+
+
+def renew(
+    pheromone: FloatArray, laid: FloatArray, reachable: BoolArray, *, evaporation: float, retrace: float
+) -> FloatArray:
+    """Equation (32) within the bounds [τ_min, 1]; zero where there is no position."""
+    renewed = (1.0 - evaporation) * pheromone + laid
+    return np.where(reachable, np.clip(renewed, lowest_pheromone(reachable, retrace), HIGHEST), 0.0)
+
+
+def _walk(probabilities: FloatArray, rng: np.random.Generator) -> IntArray:
+    """One ant's path (V,): a draw from each row of (31)."""
+    reached = np.cumsum(probabilities, axis=1)
+    drawn = rng.random((len(probabilities), 1)) * reached[:, -1:]
+    path: IntArray = np.argmax(reached > drawn, axis=1)
+    return path
+
+
+def _weights(ants: int, habits: Habits) -> FloatArray:
+    """Deposits (P,) of the best ants of an iteration by rank; with the best path so far they sum to ρ."""
+    count = max(1, round(habits.elite * ants))
+    ranks = np.arange(count, 0, -1, dtype=np.float64)
+    weights: FloatArray = (1.0 - habits.memory) * habits.evaporation * ranks / ranks.sum()
+    return weights
+
+
+def optimise(
+    objective: Objective,
+    choices: Sequence[FloatArray],
+    *,
+    ants: int,
+    iterations: int,
+    rng: np.random.Generator,
+    progress: Progress | None = None,
+    start: FloatArray | None = None,
+    admissible: Admissible = everything,
+    visibility: Sequence[FloatArray] | None = None,
+    habits: Habits | None = None,
+) -> Result:
+    """Search the vector with the largest objective.
+
+    choices: per vertex its positions, ascending. start (V,): walked by the first ant, so that the result is never
+    worse than it. admissible: vectors that may be asked for; others are drawn again. visibility: per vertex the
+    preference η > 0 of each position, all alike if absent. The objective is called at most ants·iterations times,
+    once per vector. Raises InputError for empty choices, no ants or no iterations.
+    """
+    habits = habits or Habits()
+    graph = Graph.of(choices)
+    reachable = graph.reachable
+    ledger = Ledger(objective, graph, admissible)
+    eta = np.ones(reachable.shape) if visibility is None else np.nan_to_num(Graph.of(visibility).positions, nan=1.0)
+    pheromone = np.where(reachable, HIGHEST, 0.0)
+    weights = _weights(ants, habits)
+
+    for iteration in range(iterations):
+        odds = transition_probabilities(pheromone, eta, reachable, alpha=habits.alpha, theta=habits.theta)
+        paths = [ledger.draw(lambda odds=odds: _walk(odds, rng)) for _ in range(ants)]  # type: ignore[misc]
+        if iteration == 0 and start is not None:
+            paths[0] = nearest(graph, start)
+        values = [ledger.evaluate(path) for path in paths]
+        ledger.record(values, progress)
+        pheromone = renew(
+            pheromone,
+            _laid(paths, values, weights, ledger, habits),
+            reachable,
+            evaporation=habits.evaporation,
+            retrace=habits.retrace,
+        )
+    return ledger.result()
+
+
+def _laid(
+    paths: list[IntArray], values: list[float], weights: FloatArray, ledger: Ledger, habits: Habits
+) -> FloatArray:
+    """Δτ of one iteration: its best ants by rank, and the best path so far."""
+    order = np.argsort(-np.asarray(values), kind="stable")[: len(weights)]
+    best = ledger.best_path if ledger.best_path is not None else paths[0]
+    depositing = np.array([paths[ant] for ant in order] + [best])
+    amounts = np.append(weights, habits.memory * habits.evaporation)
+    return deposit(depositing, amounts, ledger.graph.reachable)

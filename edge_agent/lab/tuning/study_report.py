@@ -1,0 +1,160 @@
+"""The study as figures, a table, a plot and a tuned file: several searches each way, all judged on held-out drives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from edge_agent.adaptation.memberships import SETS, Memberships
+from edge_agent.app.tuned_memberships import Score
+from edge_agent.lab.tuning import study
+from edge_agent.lab.tuning.search import Progress, Result
+from edge_agent.lab.tuning.study import CONDITIONS, WAYS, Recorded, Worth, memberships_of, overall, worth
+from schemas.runtime.figures import Figure
+
+UNITS: Final = {"log_likelihood": "nat/s", "nis": "1", "rmse_vx": "m/s", "rmse_vy": "m/s", "rmse_yaw_rate": "rad/s"}
+TITLES: Final = {"right": "R right", "too-small": "ten times too small", "too-large": "ten times too large",
+                 "schedule": "noise by schedule"}  # fmt: skip
+
+
+GIVEN: Final = {"fixed": Memberships(outputs=(0.0,) * SETS), "untuned": Memberships()}  # R as it is; not tuned
+SHOWN: Final = (*GIVEN, *WAYS)
+
+
+@dataclass
+class Study:
+    """Results of every repeat of every way, and what the found memberships are worth on held-out drives."""
+
+    train: Recorded
+    held_out: Recorded
+    found: dict[str, list[Result]] = field(default_factory=dict)
+
+    def memberships(self, way: str) -> list[Memberships]:
+        """What each repeat found, or what is given."""
+        if way in GIVEN:
+            return [GIVEN[way]]
+        return [memberships_of(result.best) for result in self.found[way]]
+
+    def best(self, way: str) -> Memberships:
+        """The memberships of the repeat that did best on the drives it was searched on."""
+        if way in GIVEN:
+            return GIVEN[way]
+        return memberships_of(max(self.found[way], key=lambda result: result.value).best)
+
+
+def run(
+    *, ants: int, iterations: int, positions: int, seeds: Sequence[int], duration_s: float,
+    reporter: Callable[[str], Progress],
+) -> Study:  # fmt: skip
+    """Search with every seed in every way; `reporter` makes the progress of a search from its name."""
+    done = Study(study.record(study.TRAIN, duration_s), study.record(study.HELD_OUT, duration_s))
+    for seed in seeds:
+        for way in WAYS:
+            result = study.search(
+                way, done.train, ants=ants, iterations=iterations, positions=positions, seed=seed,
+                progress=reporter(f"{way} {seed}"),
+            )  # fmt: skip
+            done.found.setdefault(way, []).append(result)
+    return done
+
+
+def figures(done: Study) -> list[Figure]:
+    """Per way: each condition on held-out drives, the objective on both sets, and how the searches came there."""
+    listed = []
+    overalls: dict[str, list[float]] = {}
+    for way in SHOWN:
+        sets = done.memberships(way)
+        for name in CONDITIONS:
+            listed += _spread(f"tuning.{name}.{way}", [worth(one, done.held_out, name) for one in sets])
+        for drives, recorded in (("train", done.train), ("held_out", done.held_out)):
+            values = [overall(one, recorded) for one in sets]
+            listed += _mean_sd(f"tuning.overall.{way}.{drives}", values, "nat/s")
+            overalls[f"{way}.{drives}"] = values
+    for drives in ("train", "held_out"):
+        gain = np.array(overalls[f"colony.{drives}"]) - np.array(overalls[f"random.{drives}"])
+        listed += _mean_sd(f"tuning.colony_over_random.{drives}", list(gain), "nat/s")
+        listed.append(Figure(f"tuning.colony_over_random.{drives}.wins", float((gain > 0.0).mean()), "1"))
+    for way, results in done.found.items():
+        for lines in zip(*(result.history for result in results), strict=True):
+            best = [line.best for line in lines]
+            listed += _mean_sd(f"tuning.convergence.{way}.{lines[0].iteration:03d}", best, "nat/s")
+    return listed
+
+
+def _spread(prefix: str, worths: Sequence[Worth]) -> list[Figure]:
+    return [
+        figure
+        for name, unit in UNITS.items()
+        for figure in _mean_sd(f"{prefix}.{name}", [getattr(one, name) for one in worths], unit)
+    ]
+
+
+def _mean_sd(name: str, values: Sequence[float], unit: str) -> list[Figure]:
+    listed = [Figure(name, float(np.mean(values)), unit)]
+    return [*listed, Figure(f"{name}.sd", float(np.std(values, ddof=1)), unit)] if len(values) > 1 else listed
+
+
+def markdown(listed: Sequence[Figure]) -> str:
+    """The table: a row per condition and measure, a column per way; made from the figures and nothing else."""
+    values = {figure.name: figure.value for figure in listed}
+
+    def cell(name: str) -> str:
+        sd = values.get(f"{name}.sd")
+        return f"{values[name]:.3g}" + ("" if sd is None else f" ± {sd:.2g}")
+
+    rows = ["| held out | | " + " | ".join(SHOWN) + " |", "|---" * (len(SHOWN) + 2) + "|"]
+    for name, title in TITLES.items():
+        for measure, unit in UNITS.items():
+            cells = " | ".join(cell(f"tuning.{name}.{way}.{measure}") for way in SHOWN)
+            rows.append(f"| {title} | {measure.replace('_', ' ')} [{unit}] | {cells} |")
+    for drives, title in (("held_out", "all conditions"), ("train", "all, drives searched on")):
+        cells = " | ".join(cell(f"tuning.overall.{way}.{drives}") for way in SHOWN)
+        rows.append(f"| {title} | log likelihood [nat/s] | {cells} |")
+    gain = "tuning.colony_over_random.held_out"
+    told = (
+        f"Colony over random search of the same seed and budget, held out: {cell(gain)} nat/s,"
+        f" better in {100 * values[f'{gain}.wins']:.0f} % of the searches."
+    )
+    return "\n".join(rows) + f"\n\n{told}\n"
+
+
+def scores(done: Study, way: str) -> dict[str, Score]:
+    """What the file of tuned memberships says of a way: over all conditions, on both sets of drives."""
+    found = {}
+    for drives, recorded in (("train", done.train), ("held_out", done.held_out)):
+        intervals = [study.interval(done.best(way), recorded, name) for name in CONDITIONS]
+        worths = [worth(done.best(way), recorded, name) for name in CONDITIONS]
+        found[drives] = Score(
+            interval_score=float(np.mean([score for score, _ in intervals])),
+            coverage=float(np.mean([coverage for _, coverage in intervals])),
+            log_likelihood=float(np.mean([one.log_likelihood for one in worths])),
+            nis_ratio=float(np.mean([one.nis for one in worths])),
+        )
+    return found
+
+
+def draw(listed: Sequence[Figure], per_iteration: int, path: Path) -> None:
+    """Plot the best value so far over evaluations, mean and one standard deviation over the searches."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    values = {figure.name: figure.value for figure in listed}
+    drawn, axis = plt.subplots(figsize=(7, 4), layout="constrained")
+    for way in WAYS:
+        prefix = f"tuning.convergence.{way}."
+        names = [name for name in values if name.startswith(prefix) and not name.endswith(".sd")]
+        evaluations = per_iteration * np.arange(1, len(names) + 1)
+        best, sd = (np.array([values.get(name + end, 0.0) for name in names]) for end in ("", ".sd"))
+        line = axis.plot(evaluations, best, "o-", ms=3, label=way)[0]
+        axis.fill_between(evaluations, best - sd, best + sd, color=line.get_color(), alpha=0.2, lw=0)
+    axis.axhline(values["tuning.overall.untuned.train"], color="k", ls=":", label="untuned")
+    axis.set(xlabel="evaluations", ylabel="log likelihood of the innovations [nat/s]", title="drives searched on")
+    axis.legend()
+    drawn.savefig(path, dpi=80)
+    plt.close(drawn)

@@ -1,0 +1,1 @@
+"""Estimates along a drive → observations per cell and visit; pure."""

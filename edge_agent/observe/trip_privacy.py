@@ -1,0 +1,95 @@
+"""Trip ends stay at home: what a vehicle learns near the beginning and the end of a trip is not told.
+
+Where somebody parks says who they are. A record passes when the trip's beginning lies `metres` and `seconds` behind it,
+and its end at least as far ahead; so it waits until the vehicle has driven on. A trip is the life of a pipeline: what
+waits when it ends is never told. Pure; with both at zero every record passes at once.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edge_agent.observe.observation_builder import Records
+from schemas.numeric import FloatArray, IntArray
+from schemas.wire import Kind
+
+NS = 1_000_000_000
+_TIME = {Kind.OBSERVATION: "leave_time", Kind.STATE: "time"}
+
+
+class TripEnds:
+    """The cut for N vehicles. Call `drive` with each block, then `cut` with its records.
+
+    Args:
+        vehicles: N.
+        metres, seconds: at each end; both must have passed.
+    """
+
+    def __init__(self, vehicles: int, metres: float, seconds: float) -> None:
+        self._metres, self._ns = metres, round(seconds * NS)
+        self._driven: FloatArray = np.zeros(vehicles)  # [m] until the last sample
+        self._times: list[IntArray] = []
+        self._odometers: list[FloatArray] = []
+        self._began: IntArray | None = None
+        self._held: dict[Kind, Records] = {}
+
+    @property
+    def _off(self) -> bool:
+        return self._metres == 0.0 and self._ns == 0
+
+    def drive(self, time: IntArray, speed: FloatArray) -> None:
+        """Move on by a block: time (T, N) [ns], speed (T, N) [m/s]."""
+        if self._off:
+            return
+        if self._began is None:
+            self._began = time[0].copy()
+            self._times.append(time[:1])
+            self._odometers.append(self._driven[None].copy())
+        before = np.vstack([self._times[-1][-1:], time])
+        odometer = self._driven + np.cumsum(np.abs(speed) * np.diff(before, axis=0) / NS, axis=0)
+        self._driven = odometer[-1]
+        self._times.append(time[-1:])
+        self._odometers.append(odometer[-1:])
+        self._forget()
+
+    def cut(self, records: Records) -> Records:
+        """Those of the records, and of the earlier ones that waited, that may be told now."""
+        if self._off or self._began is None:
+            return records
+        held = self._held.get(records.kind)
+        both = records if held is None else _joined(held, records)
+        time: IntArray = both.columns[_TIME[records.kind]]
+        there = self._odometer(time, both.vehicle)
+        now = self._times[-1][-1][both.vehicle]
+        begun = (there >= self._metres) & (time - self._began[both.vehicle] >= self._ns)
+        gone = (self._driven[both.vehicle] - there >= self._metres) & (now - time >= self._ns)
+        self._held[records.kind] = _taken(both, begun & ~gone)
+        return _taken(both, begun & gone)
+
+    def _forget(self) -> None:
+        """Drop the way before the oldest record that waits."""
+        waiting = [r.columns[_TIME[kind]].min() for kind, r in self._held.items() if len(r.vehicle)]
+        oldest = min(waiting, default=self._times[-1].min())
+        while len(self._times) > 2 and self._times[1].max() <= oldest:
+            del self._times[0], self._odometers[0]
+
+    def _odometer(self, time: IntArray, vehicle: IntArray) -> FloatArray:
+        """How far each vehicle had driven at a time, (n,), between the ends of blocks."""
+        times, odometers = np.vstack(self._times), np.vstack(self._odometers)
+        out = np.empty(len(time))
+        for n in np.unique(vehicle).tolist():
+            rows = vehicle == n
+            since = times[0, n]
+            out[rows] = np.interp((time[rows] - since) / NS, (times[:, n] - since) / NS, odometers[:, n])
+        return out
+
+
+def _taken(records: Records, rows: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Records:
+    columns = {name: column[rows] for name, column in records.columns.items()}
+    return Records(records.kind, columns, records.vehicle[rows], records.urgent[rows])
+
+
+def _joined(first: Records, second: Records) -> Records:
+    columns = {name: np.concatenate([first.columns[name], second.columns[name]]) for name in first.columns}
+    vehicle, urgent = (np.concatenate([getattr(r, n) for r in (first, second)]) for n in ("vehicle", "urgent"))
+    return Records(first.kind, columns, vehicle, urgent)

@@ -1,0 +1,1 @@
+"""Observations → batches → outbox on disk → Zenoh; acknowledgements."""

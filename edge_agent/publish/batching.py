@@ -1,0 +1,96 @@
+"""Records -> batches: columns gathered per (vehicle, kind, region) until a batch is due. Pure; time comes in.
+
+A batch is due when it is full, when its oldest record has waited long enough, or at once when a record is urgent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from edge_agent.observe.observation_builder import Records
+from edge_agent.publish.outbox import Draft
+from schemas import grid
+from schemas.wire import Batch, Columns, Kind, encode
+
+
+class _Place(NamedTuple):
+    vehicle: int
+    kind: Kind
+    region: int
+
+
+@dataclass
+class _Group:
+    since: float
+    urgent: bool = False
+    rows: int = 0
+    parts: list[Columns] = field(default_factory=list)
+
+
+class Batcher:
+    """Gathers records of the named vehicles; `rows` at the most in a batch, `flush_s` the longest wait."""
+
+    def __init__(self, names: Sequence[str], boot: int, estimator: str, *, flush_s: float, rows: int) -> None:
+        self._names, self._boot, self._estimator = tuple(names), boot, estimator
+        self._flush_s, self._rows = flush_s, rows
+        self._groups: dict[_Place, _Group] = {}
+
+    @property
+    def records(self) -> int:
+        """Records that wait for their batch."""
+        return sum(group.rows for group in self._groups.values())
+
+    def add(self, records: Records, now: float) -> None:
+        """Take records in; rows of one vehicle and region keep their order."""
+        if not len(records.vehicle):
+            return
+        columns = records.columns
+        if records.kind is Kind.OBSERVATION:
+            cells = columns["cell"]
+        else:
+            cells = grid.cell_of(columns["latitude"], columns["longitude"])
+        owners = np.stack([records.vehicle, grid.region_of(cells)], axis=1)
+        unique, which = np.unique(owners, axis=0, return_inverse=True)
+        for index, (vehicle, region) in enumerate(unique.tolist()):
+            chosen = np.flatnonzero(which.ravel() == index)
+            group = self._groups.setdefault(_Place(vehicle, records.kind, region), _Group(now))
+            group.parts.append({name: column[chosen] for name, column in columns.items()})
+            group.rows += len(chosen)
+            group.urgent |= bool(records.urgent[chosen].any())
+
+    def due(self, now: float, *, everything: bool = False) -> list[Draft]:
+        """Take out the batches that are due."""
+        drafts: list[Draft] = []
+        for place, group in list(self._groups.items()):
+            whole = everything or group.urgent or now - group.since >= self._flush_s
+            ready = group.rows if whole else group.rows - group.rows % self._rows
+            if not ready:
+                continue
+            del self._groups[place]
+            joined = {name: np.concatenate([part[name] for part in group.parts]) for name in group.parts[0]}
+            starts = range(0, ready, self._rows)
+            drafts += [self._draft(place, _slice(joined, at, min(at + self._rows, ready))) for at in starts]
+            if ready < group.rows:
+                rest = _slice(joined, ready, group.rows)
+                self._groups[place] = _Group(now, rows=group.rows - ready, parts=[rest])
+        return drafts
+
+    def _draft(self, place: _Place, columns: Columns) -> Draft:
+        name = self._names[place.vehicle]
+        fixed = partial(_encoded, place.kind, name, self._boot, place.region, columns, self._estimator)
+        return Draft(name, place.kind, place.region, len(columns["latitude"]), fixed)
+
+
+def _slice(columns: Columns, first: int, last: int) -> Columns:
+    return {name: column[first:last] for name, column in columns.items()}
+
+
+def _encoded(
+    kind: Kind, vehicle: str, boot: int, region: int, columns: Columns, estimator: str, seq: int, first_held: int
+) -> bytes:
+    return encode(Batch(kind, vehicle, boot, region, seq, first_held, columns, estimator))

@@ -1,0 +1,223 @@
+"""The thread between the estimation loop and the network: batch, spool, put, settle, resend.
+
+The loop only ever does `offer`, which cannot block: disk and network are touched by the sender thread alone.
+Every batch is on disk before it is put, and stays there until the service has settled it.
+Sessions are opened by a second thread, which waits for the routers as long as it takes.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import sqlite3
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from edge_agent.observe.observation_builder import Records
+from edge_agent.publish.batching import Batcher
+from edge_agent.publish.outbox import Draft, Spool, Stream
+from edge_agent.publish.zenoh_link import Link
+from schemas.config import AgentConfig
+from schemas.errors import WireError
+from schemas.wire import Kind, decode_ack
+
+TICK_S: Final = 0.05  # how often the sender looks for due batches when nothing is offered
+QUEUE_LIMIT: Final = 20_000  # blocks of records; many minutes of a disk that does not answer
+WAITING_LIMIT: Final = 10_000  # batches kept in memory while the disk refuses
+RESEND_LIMIT: Final = 64  # batches offered again per round, so that fresh ones are not held up
+LOOK_S: Final = 0.5  # between two looks whether a lost router is back
+CLOSE_GRACE_S: Final = 0.5  # beyond the deadline, for a put or a close that hangs on a frozen router
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class Counts:
+    """Records by kind and by what became of them."""
+
+    offered: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
+    published: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
+    acknowledged: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
+    rejected: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
+    dropped: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
+    resent_batches: int = 0
+    bad_acks: int = 0
+
+
+class Publisher:
+    """Publishes records of the named vehicles; row `vehicle` of the records is an index into `names`."""
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        spool: Spool,
+        config: AgentConfig,
+        estimator: str,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._names = dict.fromkeys(names)
+        self._spool, self._config, self._clock = spool, config, clock
+        self._batcher = Batcher(names, spool.boot, estimator, flush_s=config.flush_s, rows=config.batch_rows)
+        self._offered: queue.Queue[Records] = queue.Queue(QUEUE_LIMIT)
+        self._acks: queue.SimpleQueue[tuple[str, bytes]] = queue.SimpleQueue()
+        self._links: dict[str, Link] = {}
+        self._connected: dict[str, bool] = {}
+        self._looked = -float("inf")
+        self._waiting: list[Draft] = []
+        self._closing, self._gone = threading.Event(), threading.Event()
+        self._deadline = float("inf")
+        self._sender = threading.Thread(target=self._send, name="sender", daemon=True)
+        self._connector = threading.Thread(target=self._connect, name="connector", daemon=True)
+        self.counts = Counts()
+
+    def start(self) -> None:
+        """Begin to open sessions and to send."""
+        self._connector.start()
+        self._sender.start()
+
+    @property
+    def links(self) -> int:
+        """Sessions that are open."""
+        return len(self._links)
+
+    def unsettled(self, kind: Kind | None = None) -> int:
+        """Records that are not settled yet: in the spool, those of an earlier start included, or on their way to it."""
+        counts, kinds = self.counts, Kind if kind is None else (kind,)
+        coming = sum(counts.offered[k] - counts.dropped[k] - counts.published[k] for k in kinds)
+        return coming + self._spool.records(self._names, kind)
+
+    @property
+    def dropped(self) -> int:
+        """Records given up for want of room, in the queue or in the spool."""
+        return sum(self.counts.dropped.values()) + sum(self._spool.counts.evicted.values())
+
+    def offer(self, *blocks: Records) -> None:
+        """Hand records over; never blocks. What does not fit is dropped and counted."""
+        for records in blocks:
+            if not len(records.vehicle):
+                continue
+            self.counts.offered[records.kind] += len(records.vehicle)
+            try:
+                self._offered.put_nowait(records)
+            except queue.Full:
+                self.counts.dropped[records.kind] += len(records.vehicle)
+
+    def close(self, within_s: float) -> bool:
+        """Flush, wait for acknowledgements at most `within_s`, leave; False when something hung and was left behind."""
+        self._deadline = self._clock() + within_s
+        self._closing.set()
+        self._sender.join(within_s + CLOSE_GRACE_S)
+        self._gone.set()
+        closer = threading.Thread(target=self._disconnect, name="closer", daemon=True)
+        closer.start()
+        closer.join(CLOSE_GRACE_S)
+        if self._sender.is_alive() or closer.is_alive():
+            return False
+        try:
+            self._spool.close()
+        except sqlite3.Error as error:
+            log.warning("the spool cannot be tidied (%s); settled batches will be sent again", error)
+        return True
+
+    def _connect(self) -> None:
+        for name in self._names:
+            link = Link.open(self._config.zenoh, name, self._hear, self._gone)
+            if link is None:
+                return
+            self._links[name] = link
+
+    def _disconnect(self) -> None:
+        self._connector.join()
+        for link in self._links.values():
+            link.close()
+
+    def _hear(self, vehicle: str, payload: bytes) -> None:
+        self._acks.put((vehicle, payload))
+
+    def _send(self) -> None:
+        while not self._finished():
+            self._take()
+            self._settle()
+            self._waiting += self._batcher.due(self._clock(), everything=self._closing.is_set())
+            self._store()
+            try:
+                self._spool.tidy()
+                self._resend()
+            except sqlite3.Error as error:
+                log.warning("the spool cannot be read or tidied (%s); trying again", error)
+
+    def _finished(self) -> bool:
+        if not self._closing.is_set():
+            return False
+        return not self.unsettled() or self._clock() >= self._deadline
+
+    def _take(self) -> None:
+        try:
+            self._batcher.add(self._offered.get(timeout=TICK_S), self._clock())
+            while True:
+                self._batcher.add(self._offered.get_nowait(), self._clock())
+        except queue.Empty:
+            return
+
+    def _store(self) -> None:
+        """Commit what waits, then put it. A disk that refuses is tried again with the next round."""
+        if not self._waiting:
+            return
+        try:
+            batches = self._spool.store(self._waiting, self._clock())
+        except sqlite3.Error as error:
+            log.warning("the spool refuses %d batches (%s); trying again", len(self._waiting), error)
+            for draft in self._waiting[:-WAITING_LIMIT]:
+                self.counts.dropped[draft.kind] += draft.records
+            self._waiting = self._waiting[-WAITING_LIMIT:]
+            return
+        for draft in self._waiting:
+            self.counts.published[draft.kind] += draft.records
+        self._waiting = []
+        for batch in batches:
+            if link := self._links.get(batch.stream.vehicle):
+                link.put(batch)
+
+    def _resend(self) -> None:
+        if not self._links:
+            return
+        if self._clock() - self._looked >= LOOK_S:
+            self._looked = self._clock()
+            self._hurry()
+        for batch in self._spool.due(self._clock(), RESEND_LIMIT):
+            link = self._links.get(batch.stream.vehicle)
+            self.counts.resent_batches += link is not None and link.put(batch)
+
+    def _hurry(self) -> None:
+        """What was put while there was no router is lost: offer it anew as soon as there is one."""
+        for name, link in list(self._links.items()):
+            connected = link.connected
+            if connected and not self._connected.get(name, True):
+                self._spool.hurry(name, self._clock())
+            self._connected[name] = connected
+
+    def _settle(self) -> None:
+        while not self._acks.empty():
+            vehicle, payload = self._acks.get()
+            try:
+                named, streams = decode_ack(payload)
+            except WireError as error:
+                self.counts.bad_acks += 1
+                log.warning("an acknowledgement for %s cannot be read: %s", vehicle, error)
+                continue
+            if named != vehicle:
+                self.counts.bad_acks += 1
+                continue
+            for told in streams:
+                stream = Stream(vehicle, told.boot, told.kind, told.region)
+                self.counts.acknowledged[told.kind] += self._spool.settle(stream, told.durable)
+                for seq, row, reason in told.rejected:
+                    records = self._spool.settle(stream, [(seq, seq)])
+                    self.counts.rejected[told.kind] += records
+                    if records:
+                        log.warning(
+                            "%s batch %d of %s was rejected at row %d: %s", told.kind, seq, vehicle, row, reason
+                        )

@@ -1,0 +1,70 @@
+"""Many recorded drives: each to its own file, several at a time, a bad one beside good ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from edge_agent.app.backfill import Task, backfill, tasks_of
+from edge_agent.cli import main
+from schemas.errors import InputError
+
+DRIVES = 3
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of drives, each with its vehicle file beside it."""
+    folder = tmp_path_factory.mktemp("drives")
+    for seed in range(DRIVES):
+        files = ["--out", str(folder / f"d{seed}.parquet"), "--vehicle-out", str(folder / f"d{seed}.json")]
+        assert main(["simulate", "slalom", "--duration", "1", "--seed", str(seed), *files]) == 0
+    return folder
+
+
+def logs(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*.parquet"))
+
+
+def test_two_jobs_write_what_one_writes_and_what_a_single_replay_writes(drives: Path, tmp_path: Path) -> None:
+    paths = [str(path) for path in logs(drives)]
+    for jobs in ("1", "2"):
+        out = ["--out", str(tmp_path / jobs), "--jobs", jobs]
+        assert main(["replay", *paths, "--estimator", "ckf", *out]) == 0
+    one = tmp_path / "one.parquet"
+    assert main(["replay", paths[0], "--estimator", "ckf", "--out", str(one)]) == 0
+    assert pq.read_table(tmp_path / "1" / "d0.parquet").equals(pq.read_table(one))
+    for path in logs(tmp_path / "1"):
+        assert pq.read_table(path).equals(pq.read_table(tmp_path / "2" / path.name))
+    assert len(logs(tmp_path / "2")) == DRIVES
+
+
+def test_a_bad_log_is_told_and_the_others_are_estimated(
+    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bad = tmp_path / "bad.parquet"
+    bad.write_bytes(b"not a log")
+    vehicle = ["--vehicle", str(drives / "d0.json"), "--estimator", "ckf"]
+    assert main(["replay", str(bad), str(drives / "d0.parquet"), *vehicle, "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert f"error: {bad}: log:" in said
+    assert "2 of 2 logs, 100 samples" in said
+    assert [path.name for path in logs(tmp_path / "out")] == ["d0.parquet"]
+
+
+def test_logs_of_one_name_and_estimates_over_their_log_are_refused(drives: Path, tmp_path: Path) -> None:
+    log = drives / "d0.parquet"
+    with pytest.raises(InputError, match="would both write"):
+        tasks_of([log, tmp_path / "d0.parquet"], None, tmp_path)
+    with pytest.raises(InputError, match="would replace the log"):
+        tasks_of([log], None, drives)
+    assert tasks_of([log], None, tmp_path) == [Task(log, drives / "d0.json", tmp_path / "d0.parquet")]
+    with pytest.raises(InputError, match="jobs: 0 is below 1"):
+        list(backfill([], "ckf", 0))
+
+
+def test_several_logs_are_not_published(drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", *map(str, logs(drives)), "--out", str(tmp_path), "--publish"]) == 2
+    assert "error: publish: 3 logs into a folder" in capsys.readouterr().err

@@ -1,0 +1,157 @@
+"""The pipeline and the live loop: visits closed at the end, real time kept or its loss counted, stopped when told."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from edge_agent.app.live_loop import Progress, drive
+from edge_agent.estimators import create
+from edge_agent.inputs.block import Block
+from edge_agent.lab.simulation import SimulatedFleet
+from edge_agent.lab.simulation.blocks import blocks
+from edge_agent.lab.truth_file import TruthRecorder
+from edge_agent.observe.cell_tracker import NOWHERE, Track, locate
+from edge_agent.observe.observation_builder import Records
+from edge_agent.observe.pipeline import Pipeline
+from schemas import grid
+from schemas.config import AgentConfig
+from schemas.wire import Kind
+
+VEHICLES, RATE = 3, 50.0
+
+
+class Basket:
+    """Takes what the loop offers."""
+
+    def __init__(self) -> None:
+        self.taken: list[Records] = []
+
+    def offer(self, *records: Records) -> None:
+        self.taken += records
+
+    def column(self, kind: Kind, name: str) -> np.ndarray:
+        parts = [r.vehicle if name == "vehicle" else r.columns[name] for r in self.taken if r.kind is kind]
+        return np.concatenate(parts)
+
+
+def pipeline_of(fleet: SimulatedFleet) -> Pipeline:
+    return Pipeline(create("ckf", fleet.vehicles), len(fleet.vehicles), AgentConfig())
+
+
+def fleet_blocks(
+    count: int, recorder: TruthRecorder | None = None, seed: int = 1
+) -> tuple[SimulatedFleet, list[Block]]:
+    fleet = SimulatedFleet("demo", VEHICLES, seed, RATE)
+    source = blocks(fleet, RATE, recorder)
+    return fleet, [next(source) for _ in range(count)]
+
+
+def joined(parts: list[Block]) -> Block:
+    return Block(*(np.concatenate([getattr(b, name) for b in parts]) for name in ("t", "time", "signals")))
+
+
+def test_every_visit_of_a_drive_becomes_one_observation_with_a_likelihood() -> None:
+    fleet, parts = fleet_blocks(300)
+    pipeline, basket = pipeline_of(fleet), Basket()
+    for block in parts:
+        basket.offer(*pipeline.step(block)[1:])
+    last = pipeline.finish()
+    assert last is not None
+    basket.offer(last)
+    whole = joined(parts)
+    _, located = locate(Track.start(VEHICLES), whole.t, whole.signals)
+    visits = np.count_nonzero(located.closes & (located.cell != NOWHERE))
+    assert len(basket.column(Kind.OBSERVATION, "cell")) == visits > 20
+    assert len(last.vehicle) == np.count_nonzero(located.cell[-1] != NOWHERE)
+    likelihood = basket.column(Kind.OBSERVATION, "log_likelihood")
+    assert (likelihood.min(axis=1) == 0).all()
+    assert likelihood.any(axis=1).mean() > 0.5
+
+
+def test_the_records_of_a_fleet_do_not_depend_on_the_blocks() -> None:
+    fleet, parts = fleet_blocks(60)
+    whole, pieces = Basket(), Basket()
+    whole.offer(*pipeline_of(fleet).step(joined(parts))[1:])
+    pipeline = pipeline_of(fleet)
+    for block in parts:
+        pieces.offer(*pipeline.step(block)[1:])
+    for kind in Kind:
+        assert len(whole.column(kind, "vehicle"))
+        for name in whole.taken[kind is Kind.STATE].columns:
+            expected, found = whole.column(kind, name), pieces.column(kind, name)
+            assert np.array_equal(expected, found, equal_nan=expected.dtype.kind == "f"), name
+
+
+def test_a_pipeline_without_samples_has_nothing_to_finish() -> None:
+    fleet, _ = fleet_blocks(0)
+    assert pipeline_of(fleet).finish() is None
+
+
+def run(
+    parts: Iterator[Block], fleet: SimulatedFleet, stop: threading.Event, **options: object
+) -> tuple[Progress, Basket, list[float]]:
+    basket, told = Basket(), []
+    report = lambda progress: told.append(progress.signals_s)  # noqa: E731
+    progress = drive(parts, pipeline_of(fleet), basket, stop, report, **options)  # type: ignore[arg-type]
+    return progress, basket, told
+
+
+def test_a_loop_that_keeps_up_is_not_behind_and_takes_its_time() -> None:
+    fleet, parts = fleet_blocks(8)
+    progress, basket, _ = run(iter(parts), fleet, threading.Event())
+    assert (progress.blocks, progress.behind) == (8, 0)
+    assert progress.signals_s == pytest.approx(8 * 0.1 - 1 / RATE)
+    assert len(basket.column(Kind.STATE, "time"))
+
+
+def test_a_loop_that_cannot_keep_up_counts_each_late_block_and_skips_none() -> None:
+    fleet, parts = fleet_blocks(20)
+    seconds = iter(np.arange(1000.0))
+    progress, _, told = run(iter(parts), fleet, threading.Event(), clock=lambda: float(next(seconds)))
+    assert progress.blocks == 20
+    assert progress.behind >= 19
+    assert progress.lag_s > 10
+    assert len(told) > 2
+
+
+def test_the_loop_ends_when_told_and_closes_the_open_visits() -> None:
+    fleet, parts = fleet_blocks(50)
+    stop = threading.Event()
+    stop.set()
+    progress, basket, _ = run(iter(parts), fleet, stop)
+    assert progress.blocks == 1
+    assert len(basket.column(Kind.OBSERVATION, "cell")) == VEHICLES
+
+
+def test_the_loop_ends_after_its_duration() -> None:
+    fleet = SimulatedFleet("demo", VEHICLES, 1, RATE)
+    progress, _, _ = run(blocks(fleet, RATE), fleet, threading.Event(), duration_s=0.3)
+    assert 2 <= progress.blocks <= 6
+
+
+def test_the_truth_is_that_of_the_cells_the_vehicles_were_in(tmp_path_factory: pytest.TempPathFactory) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    recorder = TruthRecorder(("sim-001", "sim-002", "sim-003"))
+    fleet, parts = fleet_blocks(300, recorder)
+    path = tmp_path_factory.mktemp("truth") / "truth.parquet"
+    recorder.write(path)
+    truth = pq.read_table(path)
+    assert set(truth["vehicle"].to_pylist()) == set(recorder.names)
+    mine = truth.filter([name == "sim-001" for name in truth["vehicle"].to_pylist()])
+    enter, leave = (np.array(mine[name].cast(pa.int64())) for name in ("enter_time", "leave_time"))
+    whole = joined(parts)
+    assert enter[0] == whole.time[0, 0]
+    assert leave[-1] == whole.time[-1, 0]
+    assert (enter[1:] - leave[:-1] == round(1e9 / RATE)).all()
+    repeated = np.searchsorted(enter, whole.time[:, 0], side="right") - 1
+    fixes = np.isfinite(whole.signals[:, 0, -3])
+    seen = grid.cell_of(whole.signals[fixes, 0, -3], whole.signals[fixes, 0, -2])
+    assert (np.array(mine["cell"])[repeated[fixes]] == seen).mean() > 0.5
+    assert 0.05 < np.min(np.array(mine["mu"])) <= np.max(np.array(mine["mu"])) < 1.2
+    assert fleet.names == list(recorder.names)

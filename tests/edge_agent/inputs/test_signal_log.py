@@ -1,0 +1,108 @@
+"""Reading a signal log: what is needed, what may be missing, and one line that names what is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from edge_agent.inputs.signal_log import Log, read_log
+from schemas.errors import InputError
+from schemas.signals import CHANNELS, S, per_wheel
+from tests.edge_agent.fakes import BAD_LOGS, a_log
+
+NS = 1_000_000_000
+
+
+def read(tmp_path: Path, columns: dict[str, Any]) -> Log:
+    path = tmp_path / "log.parquet"
+    pq.write_table(pa.table(columns), path)
+    return read_log(path)
+
+
+def test_the_channels_come_in_their_order(tmp_path: Path) -> None:
+    columns = a_log(50)
+    log = read(tmp_path, columns | {"someone_elses": np.ones(50)})
+    assert np.array_equal(log.t, columns["t"])
+    for index, name in enumerate(CHANNELS):
+        assert np.array_equal(log.signals[:, index], columns[name])
+    assert log.start_ns is None
+
+
+def test_a_missing_optional_column_and_null_and_infinity_are_missing_readings(tmp_path: Path) -> None:
+    columns = {name: c for name, c in a_log(5).items() if not name.startswith(("torque", "latitude", "yaw"))}
+    columns |= {"yaw_rate": pa.array([0.1, None, 0.1, 0.1, 0.1]), "ax": np.array([1.0, np.inf, np.nan, -np.inf, 1.0])}
+    log = read(tmp_path, columns)
+    assert np.isnan(log.signals[:, [S.LATITUDE, S.YAW, S.TORQUE, S.TORQUE + 3]]).all()
+    assert np.isnan(log.signals[:, S.YAW_RATE]).tolist() == [False, True, False, False, False]
+    assert np.isnan(log.signals[:, S.AX]).tolist() == [False, True, True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("without", "expected"),
+    [
+        ((), [0.1, 0.2, 0.3, 0.4]),
+        (("delta_rl", "delta_rr"), [0.1, 0.2, 0.0, 0.0]),
+        (("delta_fr", "delta_rl", "delta_rr"), [0.1, 0.1, 0.0, 0.0]),
+        (("delta_fl",), [0.2, 0.2, 0.3, 0.4]),
+    ],
+)
+def test_steering_without_a_column_is_the_other_front_wheels_or_none_at_the_rear(
+    tmp_path: Path, without: tuple[str, ...], expected: list[float]
+) -> None:
+    columns = a_log(3) | {name: np.full(3, 0.1 * (i + 1)) for i, name in enumerate(per_wheel("delta"))}
+    log = read(tmp_path, {name: c for name, c in columns.items() if name not in without})
+    assert log.signals[0, S.DELTA : S.DELTA + 4].tolist() == pytest.approx(expected)
+
+
+MOMENTS = 1_767_225_600 * NS + np.array([0, 10, 25]) * 10_000_000
+
+
+@pytest.mark.parametrize(
+    "column",
+    [
+        pa.array(MOMENTS, pa.timestamp("ns", tz="UTC")),
+        pa.array(MOMENTS // 1000, pa.timestamp("us")),
+        pa.array(MOMENTS, pa.int64()),
+        pa.array(MOMENTS / NS, pa.float64()),
+    ],
+    ids=["ns UTC", "us", "int64 ns", "float s"],
+)
+def test_a_timestamp_gives_seconds_from_its_first_and_the_time_of_day(tmp_path: Path, column: pa.Array[Any]) -> None:
+    columns = {name: c for name, c in a_log(3).items() if name != "t"} | {"timestamp": column}
+    log = read(tmp_path, columns)
+    assert np.allclose(log.t, [0.0, 0.1, 0.25], atol=1e-6)
+    assert log.start_ns == pytest.approx(int(MOMENTS[0]), abs=1000)
+
+
+def test_blocks_tell_each_sample_once_in_order_with_its_absolute_time(tmp_path: Path) -> None:
+    columns = a_log(25)
+    log = read(tmp_path, columns)
+    blocks = list(log.blocks(7 * NS, rows=10))
+    assert [len(b.t) for b in blocks] == [10, 10, 5]
+    assert np.array_equal(np.concatenate([b.t for b in blocks])[:, 0], columns["t"])
+    times = np.concatenate([b.time for b in blocks])[:, 0]
+    assert np.array_equal(times, 7 * NS + np.arange(25) * 10_000_000)
+    assert blocks[0].signals.shape == (10, 1, len(CHANNELS))
+
+
+def test_time_may_stand_still(tmp_path: Path) -> None:
+    columns = a_log(3) | {"t": np.array([0.0, 0.0, 0.01])}
+    assert read(tmp_path, columns).t.tolist() == [0.0, 0.0, 0.01]
+
+
+@pytest.mark.parametrize(("spoil", "message"), BAD_LOGS.values(), ids=BAD_LOGS)
+def test_a_bad_log_is_refused_in_one_line_that_names_field_and_fix(
+    tmp_path: Path, spoil: Callable[[Path], None], message: str
+) -> None:
+    path = tmp_path / "log.parquet"
+    spoil(path)
+    with pytest.raises(InputError, match=message) as caught:
+        read_log(path)
+    assert "\n" not in str(caught.value)
+    assert caught.value.fix

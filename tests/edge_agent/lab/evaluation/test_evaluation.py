@@ -1,0 +1,189 @@
+"""The campaign: names and bars as asked, measures that mean what they say, a report made from figures alone."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edge_agent.cli import main
+from edge_agent.estimators import ESTIMATORS, Estimates
+from edge_agent.estimators.estimates import ONE_FRICTION, Y
+from edge_agent.lab.evaluation import measures
+from edge_agent.lab.evaluation.bars import BARS, figures
+from edge_agent.lab.evaluation.batch import Batch, Scenario, ideal, realistic, repeated
+from edge_agent.lab.evaluation.campaign import DEFAULT, Results
+from edge_agent.lab.evaluation.faults import CASES
+from edge_agent.lab.evaluation.paper_004 import noisy, variances
+from edge_agent.lab.evaluation.printed import OWN, PRINTED
+from edge_agent.lab.evaluation.report import report
+from edge_agent.lab.evaluation.scenarios import FOREIGN, OTHERS, PAPERS, SEDAN, VEHICLES, foreign
+from schemas.runtime.figures import Figure
+from schemas.signals import S
+
+# the bars as they were asked for: name -> (bar, better)
+ASKED = {
+    **{f"papers.004.{kind}.mae_{name}": (bar, "less") for kind in ("constant", "variable")
+       for name, bar in (("vx", 0.002), ("vy", 0.007), ("yaw_rate", 0.002))},
+    "default.dlc.mu_error": (0.05, "less"), "default.dlc.coverage90": (0.85, "more"),
+    "papers.001.rmse_vx": (0.02, "less"), "papers.001.rmse_vy": (0.01, "less"),
+    "papers.001.rmse_beta": (0.001, "less"),
+    **{f"papers.002.{drive}.rmse_{name}": (0.03, "less") for drive in ("sine", "jturn") for name in ("vx", "vy")},
+    "papers.003.accel.mu_error": (0.08, "less"), "papers.003.turn.mu_error": (0.05, "less"),
+    "papers.003.split.low_error": (0.07, "less"), "papers.003.split.high_coverage90": (0.85, "more"),
+    "papers.000.coverage90": (0.87, "more"),
+    "default.jump.accel_s": (0.1, "less"), "default.jump.brake_s": (0.25, "less"),
+    "default.jump.false_per_hour": (1.0, "less"),
+    "default.straight.width_ratio": (0.8, "more"), "default.straight.coverage90": (0.9, "more"),
+    "default.foreign_tyres.coverage90": (0.85, "more"),
+    "default.abs.coverage90": (0.80, "more"), "default.spin.coverage90": (0.80, "more"),
+}  # fmt: skip
+
+
+def fake(mu: float, lower: float, upper: float, like: Batch) -> Estimates:
+    """Estimates that tell the same friction all the time, and the true motion."""
+    told, truth = np.zeros((*like.t.shape, ONE_FRICTION)), like.truth
+    told[..., Y.VX], told[..., Y.VY], told[..., Y.YAW_RATE] = (
+        truth[f"true_{name}"] for name in ("vx", "vy", "yaw_rate")
+    )
+    told[..., Y.SIDESLIP] = np.arctan2(truth["true_vy"], truth["true_vx"])
+    told[..., Y.MU], told[..., Y.MU_LOWER], told[..., Y.MU_UPPER] = mu, lower, upper
+    told[..., Y.VX_STD : Y.MU], told[..., Y.INNOVATION_NIS] = 1.0, 1.0
+    return Estimates(told)
+
+
+@pytest.fixture(scope="module")
+def jumping() -> Batch:
+    """Two drives whose friction falls from .85 to .5."""
+    return realistic(replace(PAPERS["003.jump"], duration_s=5.0), range(2))
+
+
+def test_the_bars_are_those_that_were_asked_for() -> None:
+    assert {bar.name: (bar.bar, bar.better) for bar in BARS} == ASKED
+
+
+def test_what_was_not_measured_is_told_as_missing_except_when_quick() -> None:
+    assert {figure.name for figure in figures(Results(), quick=False)} == set(ASKED)
+    assert not any(figure.holds for figure in figures(Results(), quick=False))
+    assert figures(Results(), quick=True) == []
+
+
+def test_every_printed_figure_names_a_scenario_and_an_estimator_that_exist() -> None:
+    assert set(OWN.values()) | {DEFAULT} <= set(ESTIMATORS)
+    for row in PRINTED:
+        assert not row.real or any(row.real.startswith(f"real.{scenario}.ESTIMATOR.") for scenario in PAPERS), row
+        assert row.same.split(".")[0] in ("ideal", "noise"), row
+
+
+def test_true_motion_has_no_error_and_a_constant_friction_the_error_it_has(jumping: Batch) -> None:
+    found = measures.measures(jumping, fake(0.6, 0.45, 0.7, jumping))
+    assert found["rmse_vx"] == pytest.approx([0.0, 0.0])
+    assert found["nees"] == pytest.approx([0.0, 0.0])
+    assert found["mu_error"] == pytest.approx([0.1, 0.1])
+    after = (jumping.mu == 0.5).mean(axis=0)
+    assert (found["coverage90"] >= after).all()
+    assert (found["coverage90"] < 1.0).all()
+    assert found["width"] == pytest.approx([0.25, 0.25])
+
+
+def test_arrival_is_counted_from_the_change_and_what_never_arrives_counts_to_the_end(jumping: Batch) -> None:
+    assert measures.arrival(jumping, fake(0.55, 0.4, 0.7, jumping)) == pytest.approx([0.0, 0.0])
+    late = fake(0.85, 0.7, 0.9, jumping)
+    late.mu[-50:] = 0.5
+    changed = np.argmax(jumping.mu == 0.5, axis=0)
+    assert measures.arrival(jumping, late) == pytest.approx((len(late.mu) - 50 - changed) / 100.0)
+    assert (measures.arrival(jumping, fake(0.85, 0.7, 0.9, jumping)) > 1.0).all()
+
+
+def test_a_false_change_is_an_interval_that_stays_beside_the_truth(jumping: Batch) -> None:
+    said = fake(0.85, 0.1, 1.0, jumping)
+    assert measures.false_changes(jumping, said).tolist() == [0.0, 0.0]
+    said.mu_upper[20:30] = 0.3
+    assert measures.false_changes(jumping, said).tolist() == [0.0, 0.0]
+    said.mu_upper[50:90, 1] = 0.3
+    assert measures.false_changes(jumping, said).tolist() == [0.0, 1.0]
+
+
+def test_sides_are_told_apart() -> None:
+    batch = realistic(replace(PAPERS["003.split"], duration_s=2.0), range(2))
+    found = measures.sides(batch, fake(0.3, 0.2, 0.4, batch))
+    assert found["low_error"] == pytest.approx([0.0, 0.0])
+    assert found["high_coverage90"] == pytest.approx([0.0, 0.0])
+
+
+def test_the_noise_of_paper_004_is_on_three_signals_and_follows_its_schedule() -> None:
+    exact = repeated(ideal(replace(PAPERS["004.dlc"], duration_s=10.0)), 1)
+    variance = variances(exact.t[:, 0], "variable")
+    assert [variance[k] for k in (0, 150, 250, 350, 450)] == [0.04, 0.01, 0.05, 0.04, 0.01]
+    batch = noisy(exact, variance, [0, 1])
+    error = batch.signals - np.repeat(exact.signals, 2, axis=1)
+    assert np.nanmax(np.abs(np.delete(error, [S.AX, S.AY, S.YAW_RATE], axis=2))) == 0.0
+    assert error[:100, :, S.AX].var() == pytest.approx(0.04, rel=0.4)
+    assert error[100:200, :, S.AX].var() == pytest.approx(0.01, rel=0.4)
+    assert not np.array_equal(error[:, 0], error[:, 1])
+
+
+@pytest.mark.parametrize("kind", FOREIGN)
+def test_foreign_tyres_make_another_drive(kind: str) -> None:
+    usual = Scenario("j-turn", SEDAN, 0.4, duration_s=2.0)
+    own, other = ideal(usual), ideal(foreign(usual, kind))
+    assert np.abs(own.truth["true_vy"] - other.truth["true_vy"]).max() > 1e-3
+
+
+def test_the_report_is_made_from_the_figures_and_hides_nothing() -> None:
+    text = report(
+        [
+            Figure("papers.001.rmse_vx", 0.3, "m/s", 0.02),
+            Figure("real.001.dlc.aco-fckf.rmse_vx", 0.3, "m/s"),
+            Figure("real.001.dlc.aco-fckf.rmse_vx.sd", 0.1, "m/s"),
+        ],
+        seeds=20,
+    )
+    assert "DOES NOT HOLD" in text
+    assert "0 of 1 bars hold" in text
+    assert "0.3 ± 0.1" in text
+    assert "not reproducible" in text
+
+
+@pytest.mark.parametrize(("arguments", "field"), [(["--seeds", "1"], "seeds"), (["--out", "/dev/null/x"], "out")])
+def test_misuse_is_one_line_and_exit_code_two(
+    arguments: list[str], field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["evaluate", "--out", str(tmp_path), "--no-plots", *arguments]) == 2
+    assert capsys.readouterr().err.startswith(f"error: {field}:")
+
+
+def test_the_quick_campaign_writes_figures_report_and_plots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "--out", str(tmp_path), "--quick"]) in (0, 1)
+    told = capsys.readouterr()
+    assert "double lane change" in told.err
+    header, *rows = json.loads((tmp_path / "figures.json").read_text())
+    assert header["campaign"] == "edge-agent evaluate --quick"
+    assert header["seeds"] == [0, 1]
+    named = {row["name"]: row for row in rows}
+    assert named["papers.004.constant.mae_vy"]["holds"]
+    assert {"papers.003.split.low_error", "default.jump.accel_s"} <= set(named)
+    assert {"faults.time-gap.aco-fckf.coverage90", "reliability.aco-fckf.below_35", "bounds.nees.upper"} <= set(named)
+    assert named["faults.no-torque-at-all.paper-aco-fckf.told"]["value"] == 1.0
+    text = (tmp_path / "report.md").read_text()
+    assert all(f"| {case} |" in text for case in CASES)
+    assert "NO (" not in text
+    assert (tmp_path / "report.md").read_text().startswith("# Evaluation")
+    assert {"memberships.png", "reliability.png", "consistency.png", "004.dlc.png"} <= {
+        path.name for path in tmp_path.glob("*.png")
+    }
+
+
+def test_more_seeds_are_driven_and_no_plots_drawn_where_so_asked(tmp_path: Path) -> None:
+    assert main(["evaluate", "--out", str(tmp_path), "--quick", "--seeds", "3", "--no-plots"]) in (0, 1)
+    assert json.loads((tmp_path / "figures.json").read_text())[0]["seeds"] == [0, 1, 2]
+    assert not list(tmp_path.glob("*.png"))
+    assert (tmp_path / "report.md").exists()
+
+
+def test_scenarios_of_papers_and_of_the_default_have_different_names() -> None:
+    assert not set(PAPERS) & set(OTHERS)
+    assert not (set(PAPERS) | set(OTHERS)) & set(VEHICLES)

@@ -1,0 +1,93 @@
+"""Reliability and consistency mean what they say: on answers whose error is known, and on the banks themselves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.estimators import Estimates
+from edge_agent.lab.evaluation.batch import Batch, estimates, realistic
+from edge_agent.lab.evaluation.measures import bounds, consistency
+from edge_agent.lab.evaluation.reliability import LEVELS, between_quantiles, on_the_grid, shares, watched
+from edge_agent.lab.evaluation.scenarios import PAPERS
+from schemas.mugrid import BINS, CENTRES
+from tests.edge_agent.lab.evaluation.test_evaluation import fake
+
+
+@pytest.fixture(scope="module")
+def turning() -> Batch:
+    return realistic(replace(PAPERS["003.turn"], duration_s=4.0), range(3))
+
+
+def test_truths_drawn_from_what_was_stated_lie_below_each_quantile_as_often_as_stated() -> None:
+    rng = np.random.default_rng(0)
+    mean = rng.uniform(0.5, 0.7, 20_000)
+    truth = mean + 0.05 * rng.normal(size=mean.shape)
+    ranks = between_quantiles(truth, mean - 1.6449 * 0.05, mean, mean + 1.6449 * 0.05)
+    assert shares(ranks) == pytest.approx(np.array(LEVELS), abs=0.012)
+
+
+def test_an_overconfident_answer_is_seen_at_both_ends() -> None:
+    rng = np.random.default_rng(1)
+    mean = np.full(20_000, 0.6)
+    truth = mean + 0.1 * rng.normal(size=mean.shape)
+    told = shares(between_quantiles(truth, mean - 1.6449 * 0.05, mean, mean + 1.6449 * 0.05))
+    assert told[0] > 0.15
+    assert told[-1] < 0.85
+
+
+def test_the_prior_is_uniform_and_a_posterior_on_the_grid_is_its_own_distribution() -> None:
+    truth = np.array([0.05, 0.34, 1.2])
+    flat = np.zeros((3, BINS))
+    assert on_the_grid(truth, flat) == pytest.approx((truth - 0.05) / 1.15)
+    prior = (np.full(3, 0.1075), np.full(3, 0.625), np.full(3, 1.1425))
+    assert between_quantiles(truth, *prior) == pytest.approx((truth - 0.05) / 1.15)
+    peak = -0.5 * ((CENTRES - 0.6) / 0.1) ** 2
+    assert on_the_grid(np.array([0.6]), peak[None]) == pytest.approx([0.5], abs=0.02)
+
+
+def test_an_end_that_the_range_cuts_off_does_not_narrow_the_gaussian() -> None:
+    cut = between_quantiles(np.array([0.15]), np.array([0.05]), np.array([0.10]), np.array([0.2645]))
+    assert cut == pytest.approx([0.692], abs=0.01)
+
+
+@pytest.mark.parametrize("estimator", ["aco-fckf", "sr-ukf"])
+def test_watching_a_drive_changes_nothing_that_is_said_of_it(estimator: str, turning: Batch) -> None:
+    plain = estimates(bank_of(estimator, turning.vehicles), turning)
+    said, ranks = watched(bank_of(estimator, turning.vehicles), turning)
+    assert np.array_equal(plain.told, said.told)
+    assert ranks.shape == (3, 3)
+    assert ((ranks >= 0.0) & (ranks <= 1.0)).all()
+
+
+def test_the_whole_posterior_of_the_default_has_the_quantiles_that_it_tells_within_a_bin(turning: Batch) -> None:
+    said, _ = watched(bank_of("aco-fckf", turning.vehicles), turning)
+    for level, told in ((0.05, said.mu_lower), (0.5, said.mu), (0.95, said.mu_upper)):
+        for side in (-1.0, 1.0):
+            beside = told + side * 1.15 / BINS
+            moved = replace(turning, truth={f"true_mu_{w}": beside for w in ("fl", "fr", "rl", "rr")})
+            _, ranks = watched(bank_of("aco-fckf", turning.vehicles), moved)
+            assert (side * (ranks - level) > 0.0).all()
+
+
+def test_consistency_is_full_where_the_spread_is_right_and_none_where_it_is_ten_times_too_small(turning: Batch) -> None:
+    said = fake(0.35, 0.3, 0.4, turning)
+    rng = np.random.default_rng(2)
+    right, wrong = Estimates(said.told.copy()), Estimates(said.told.copy())
+    for one in (right, wrong):
+        one.vx[:] += rng.normal(size=said.vx.shape)
+        one.vy[:] += rng.normal(size=said.vy.shape)
+        one.innovation_nis[:] = rng.chisquare(3, said.vx.shape) / 3.0
+    found = consistency(turning, right)
+    assert found["nees_within"][0] == pytest.approx(0.95, abs=0.03)
+    assert found["nis_within"][0] == pytest.approx(0.95, abs=0.03)
+    wrong.vx_std[:], wrong.vy_std[:] = 0.1 * said.vx_std, 0.1 * said.vy_std
+    assert consistency(turning, wrong)["nees_within"][0] < 0.05
+
+
+def test_bounds_close_in_on_one_with_more_drives() -> None:
+    few, many = bounds("nees", 5), bounds("nees", 500)
+    assert few[0] < many[0] < 1.0 < many[1] < few[1]

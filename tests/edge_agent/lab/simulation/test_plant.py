@@ -1,0 +1,227 @@
+"""The plant against mechanics: Newton, friction circle, energy, circles, signs; then its limits."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from edge_agent.dynamics.parameters import GRAVITY, P
+from edge_agent.lab.simulation import PRESETS, simulate_manoeuvre
+from edge_agent.lab.simulation.plant import (
+    STATES,
+    Q,
+    U,
+    W,
+    X,
+    advance,
+    body_accelerations,
+    command,
+    start_at,
+    substeps_of,
+    wheel_forces,
+)
+from edge_agent.lab.simulation.presets import TrueVehicle
+from schemas.numeric import FloatArray
+
+ROUNDING = 1e-9
+
+
+def some_instant(rng: np.random.Generator, mu: float = 0.6) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """State, parameters, inputs and filled wheels of a vehicle in the middle of something rough."""
+    p = PRESETS["sedan"].row()
+    x, u, w = np.zeros(STATES), np.zeros((len(U), 4)), np.zeros((len(W), 4))
+    x[X.VX], x[X.VY], x[X.YAW_RATE] = rng.uniform(3, 30), rng.normal(0, 1), rng.normal(0, 0.4)
+    x[X.OMEGA : X.OMEGA + 4] = x[X.VX] / p[P.RADIUS] * rng.uniform(0.8, 1.2, 4)
+    x[X.AX_LAGGED], x[X.AY_LAGGED] = rng.uniform(-4, 4, 2)
+    u[U.STEER], u[U.MU] = rng.normal(0, 0.1, 4), mu
+    wheel_forces(x, p, u, w)
+    return x, p, u, w
+
+
+def rolling(speed: float, mu: float, vehicle: TrueVehicle | None = None) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """State, parameters and inputs of a vehicle rolling straight on."""
+    p, x, u = (vehicle or PRESETS["sedan"]).row(), np.zeros(STATES), np.zeros((len(U), 4))
+    start_at(x, p, (0.0, 0.0, 0.0), speed)
+    u[U.MU] = mu
+    return x, p, u
+
+
+def run(x: FloatArray, p: FloatArray, u: FloatArray, seconds: float, dt: float = 1e-3) -> FloatArray:
+    """Wheels at the end of so many seconds with the inputs held."""
+    w = np.zeros((len(W), 4))
+    advance(x, p, u, w, dt, round(seconds / dt))
+    return w
+
+
+def kinetic_energy(x: FloatArray, p: FloatArray) -> float:
+    wheels = p[P.WHEEL_INERTIA] * (x[X.OMEGA : X.OMEGA + 4] ** 2).sum()
+    body = p[P.MASS] * (x[X.VX] ** 2 + x[X.VY] ** 2) + p[P.YAW_INERTIA] * x[X.YAW_RATE] ** 2
+    return float(0.5 * (body + wheels))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_accelerations_are_the_wheel_forces_over_mass_and_inertia(seed: int) -> None:
+    x, p, u, w = some_instant(np.random.default_rng(seed))
+    force = (w[W.FX] + 1j * w[W.FY]) * np.exp(1j * u[U.STEER])  # the body's axes as the complex plane
+    half = 0.5 * np.repeat([p[P.TRACK_FRONT], p[P.TRACK_REAR]], 2) * [1, -1, 1, -1]
+    place = np.repeat([p[P.TO_FRONT], -p[P.TO_REAR]], 2) + 1j * half
+    ax, ay, yaw_acceleration = body_accelerations(x, p, u, w)
+    total = force.sum() - p[Q.DRAG] * x[X.VX] ** 2
+    assert complex(ax, ay) == pytest.approx(total / p[P.MASS], rel=ROUNDING)
+    assert yaw_acceleration == pytest.approx((place.conj() * force).imag.sum() / p[P.YAW_INERTIA], rel=ROUNDING)
+
+
+@pytest.mark.parametrize("mu", [0.05, 0.2, 0.6, 1.2])
+def test_no_wheel_pulls_more_than_its_grip(mu: float) -> None:
+    for seed in range(50):
+        _, _, _, w = some_instant(np.random.default_rng(seed), mu)
+        assert (np.hypot(w[W.FX], w[W.FY]) <= mu * w[W.FZ] * (1 + ROUNDING)).all()
+
+
+def test_loads_add_up_to_the_weight_whatever_the_accelerations() -> None:
+    for seed in range(20):
+        _, p, _, w = some_instant(np.random.default_rng(seed))
+        assert w[W.FZ].sum() == pytest.approx(p[P.MASS] * GRAVITY, rel=ROUNDING)
+
+
+def test_small_slip_does_not_know_the_friction() -> None:
+    forces = []
+    for mu in (0.3, 0.9):
+        x, p, u = rolling(20.0, mu)
+        x[X.OMEGA : X.OMEGA + 4] *= 1.0005
+        w = np.zeros((len(W), 4))
+        wheel_forces(x, p, u, w)
+        forces.append(w[W.FX].sum())
+    assert forces[0] == pytest.approx(forces[1], rel=0.01)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_without_driving_torque_energy_only_falls(seed: int) -> None:
+    x, p, u, _ = some_instant(np.random.default_rng(seed))
+    before = kinetic_energy(x, p)
+    for _ in range(200):
+        run(x, p, u, 0.01)
+        after = kinetic_energy(x, p)
+        assert after <= before
+        before = after
+
+
+def test_steering_left_turns_left_and_loads_the_right_wheels() -> None:
+    x, p, u = rolling(15.0, 0.9)
+    command(p, u, 0.04, 0.0)
+    w = run(x, p, u, 2.0)
+    assert x[X.YAW_RATE] > 0.1
+    assert x[X.Y] > 1.0
+    assert x[X.AY_LAGGED] > 1.0
+    assert w[W.FZ, 1] > w[W.FZ, 0]
+    assert w[W.FZ, 3] > w[W.FZ, 2]
+    assert u[U.STEER, 0] > u[U.STEER, 1]  # the inner wheel turns more
+
+
+@pytest.mark.parametrize("share", [-0.4, 0.3])
+def test_rear_wheels_that_steer_keep_the_circle_and_swing_the_tail(share: float) -> None:
+    """At walking pace the yaw rate is that of the wheels' directions, whoever steers."""
+    circles = []
+    for rear in (0.0, share):
+        p = replace(PRESETS["sedan"], rear_steer=rear).row()
+        x, u, w = np.zeros(STATES), np.zeros((len(U), 4)), np.zeros((len(W), 4))
+        start_at(x, p, (0.0, 0.0, 0.0), 2.0)
+        u[U.MU] = 0.9
+        command(p, u, 0.1, 0.0)
+        assert u[U.STEER, 2:] == pytest.approx(rear * u[U.STEER, :2])
+        for _ in range(1000):
+            advance(x, p, u, w, 1e-3, 1)
+        circles.append((x[X.YAW_RATE] / x[X.VX], x[X.VY] / x[X.VX]))
+    assert circles[1][0] == pytest.approx(circles[0][0], rel=0.02)
+    assert (circles[1][1] - circles[0][1]) * share > 0.0
+
+
+def test_driving_goes_forward_and_loads_the_rear() -> None:
+    x, p, u = rolling(10.0, 0.9)
+    command(p, u, 0.0, 4000.0)
+    w = run(x, p, u, 1.0)
+    assert x[X.VX] > 11.0
+    assert w[W.FZ, 2:].sum() > w[W.FZ, :2].sum() * p[P.TO_FRONT] / p[P.TO_REAR]
+    assert (w[W.TORQUE] > 0).all()
+
+
+@pytest.mark.parametrize("mu", [0.15, 0.5, 0.9])
+def test_an_anti_lock_stop_uses_most_of_the_grip_and_never_more(mu: float) -> None:
+    x, p, u = rolling(20.0, mu)
+    command(p, u, 0.0, -1.2 * p[P.MASS] * GRAVITY)
+    run(x, p, u, 0.3)
+    fast = x[X.VX]
+    run(x, p, u, 0.5)
+    deceleration = (fast - x[X.VX]) / 0.5
+    assert 0.7 * mu * GRAVITY < deceleration < mu * GRAVITY + p[Q.DRAG] * fast**2 / p[P.MASS]
+    assert (x[X.OMEGA : X.OMEGA + 4] > 0.5 * x[X.VX] / p[P.RADIUS]).all()
+
+
+def test_without_slip_control_the_wheels_lock_and_brake_less() -> None:
+    stops = {}
+    for limit in (0.08, np.inf):
+        x, p, u = rolling(20.0, 0.4, replace(PRESETS["sedan"], slip_limit=limit))
+        command(p, u, 0.0, -1.0 * p[P.MASS] * GRAVITY)
+        run(x, p, u, 1.5)
+        stops[limit] = x[X.VX], x[X.OMEGA]
+    assert abs(stops[np.inf][1]) < 0.5
+    assert stops[np.inf][0] > stops[0.08][0] + 0.2
+
+
+def test_a_steady_circle_has_its_centripetal_acceleration() -> None:
+    log, _ = simulate_manoeuvre("constant-radius", mu=0.8, sensors="ideal")
+    truth = {name: log[name].to_numpy()[-500:] for name in ("true_vx", "true_vy", "true_ay", "true_yaw_rate")}
+    speed = np.hypot(truth["true_vx"], truth["true_vy"])
+    assert truth["true_ay"].mean() == pytest.approx((speed**2).mean() / 40.0, rel=0.05)  # his radius is not quite 40 m
+    assert truth["true_ay"].mean() == pytest.approx((truth["true_yaw_rate"] * truth["true_vx"]).mean(), rel=0.01)
+
+
+def test_a_stopped_vehicle_stays_where_it_is() -> None:
+    x, p, u = rolling(3.0, 0.9)
+    command(p, u, 0.05, -8000.0)
+    run(x, p, u, 3.0)
+    place = x[[X.X, X.Y, X.YAW]].copy()
+    run(x, p, u, 5.0)
+    assert abs(x[X.VX]) < 1e-3
+    np.testing.assert_allclose(x[[X.X, X.Y, X.YAW]], place, atol=1e-3)
+
+
+def test_a_wheel_has_the_inertia_that_it_has() -> None:
+    """J ω̇ = T − R F_x, which is how an estimator gets the force: the integrator must not add to J, even when slow."""
+    vehicle = replace(PRESETS["sedan"], drag=0.0, rolling=0.0)
+    for speed in (4.0, 20.0):
+        x, p, u = rolling(speed, 0.9, vehicle)
+        command(p, u, 0.0, 3000.0)
+        run(x, p, u, 0.3)
+        before = x.copy()
+        run(x, p, u, 0.1)
+        heavy = p[P.MASS] + 4 * p[P.WHEEL_INERTIA] / p[P.RADIUS] ** 2
+        assert (x[X.VX] - before[X.VX]) / 0.1 == pytest.approx(3000.0 / heavy, rel=2e-3)
+
+
+def test_finer_steps_give_the_same_drive() -> None:
+    ends = []
+    for dt in (1e-3, 1.25e-4):
+        x, p, u = rolling(12.0, 0.5)
+        command(p, u, 0.06, -1500.0)
+        run(x, p, u, 1.5, dt)
+        ends.append(x)
+    np.testing.assert_allclose(ends[0], ends[1], rtol=2e-3, atol=2e-3)
+
+
+@pytest.mark.parametrize("rate", [10.0, 50.0, 100.0, 128.0, 400.0, 2000.0])
+def test_a_sample_is_cut_into_steps_of_a_millisecond_at_most(rate: float) -> None:
+    assert 1.0 / (rate * substeps_of(rate)) <= 1e-3 * (1 + ROUNDING)
+
+
+@pytest.mark.parametrize("name", [f.name for f in fields(TrueVehicle) if f.name != "vehicle"])
+def test_every_parameter_of_the_true_vehicle_matters(name: str) -> None:
+    changed = replace(PRESETS["van"], **{name: getattr(PRESETS["van"], name) * 0.8 + 0.01})
+    logs = []
+    for vehicle in (PRESETS["van"], changed):
+        drives = [simulate_manoeuvre(m, vehicle=vehicle, sensors="mems-leak")[0] for m in ("acceleration", "braking")]
+        drives.append(simulate_manoeuvre("j-turn", vehicle=vehicle, sensors="mems-leak")[0])
+        logs.append(np.concatenate([drive[c].to_numpy() for drive in drives for c in ("ax", "ay", "omega_fl")]))
+    assert np.abs(logs[0] - logs[1]).max() > 1e-3

@@ -1,0 +1,165 @@
+"""The objective: proper, finite, on drives that the judge does not share; and the command from end to end."""
+
+import argparse
+from dataclasses import astuple, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edge_agent.adaptation.memberships import Memberships
+from edge_agent.app.tuned_memberships import WAYS, Comparison, Score, load
+from edge_agent.cli import tune
+from edge_agent.lab.tuning.objectives import (
+    HELD_OUT,
+    OBJECTIVES,
+    TRAIN,
+    Recorded,
+    Worth,
+    choices,
+    interval_score,
+    objective_on,
+    record,
+    worth,
+)
+from edge_agent.lab.tuning.search import Iteration
+from schemas.errors import InputError
+from schemas.signals import CHANNELS
+
+ESTIMATOR = tune.ESTIMATOR
+
+
+@pytest.fixture(scope="module")
+def drives() -> Recorded:
+    """Three short drives of the training set, one of them with noisy sensors."""
+    return record(TRAIN[:3], 4.0)
+
+
+def test_recorded_drives_stand_side_by_side(drives: Recorded) -> None:
+    assert drives.signals.shape == (400, 3, len(CHANNELS))
+    assert drives.t.shape == drives.mu.shape == (400, 3)
+    assert len(drives.vehicles) == 3
+    assert np.isfinite(drives.signals[:, :, :3]).all()
+
+
+def test_drives_that_judge_share_no_seed_and_no_setting_with_those_that_are_searched_on() -> None:
+    assert not {drive.seed for drive in TRAIN} & {drive.seed for drive in HELD_OUT}
+    assert len({drive.seed for drive in TRAIN + HELD_OUT}) == len(TRAIN + HELD_OUT)
+    searched, judged = ({(drive.manoeuvre, drive.vehicle) for drive in drives} for drives in (TRAIN, HELD_OUT))
+    assert not searched & judged
+
+
+def test_worth_is_finite_and_the_same_every_time(drives: Recorded) -> None:
+    first, second = (worth(Memberships(), drives, ESTIMATOR) for _ in range(2))
+    assert first == second
+    assert np.isfinite(astuple(first)).all()
+    assert 0.0 <= first.coverage <= 1.0
+
+
+def test_worth_of_several_drives_is_the_mean_of_each(drives: Recorded) -> None:
+    single = [
+        worth(
+            Memberships(),
+            Recorded((vehicle,), drives.t[:, [n]], drives.signals[:, [n]], drives.mu[:, [n]]),
+            ESTIMATOR,
+        )
+        for n, vehicle in enumerate(drives.vehicles)
+    ]
+    mean = np.mean([astuple(one) for one in single], axis=0)
+    np.testing.assert_allclose(astuple(worth(Memberships(), drives, ESTIMATOR)), mean, rtol=1e-12)
+
+
+def test_interval_score_pays_for_width_and_twenty_times_for_a_miss() -> None:
+    lower, upper, truth = np.array([0.2, 0.2, 0.2]), np.array([0.6, 0.6, 0.6]), np.array([0.4, 0.1, 0.7])
+    np.testing.assert_allclose(interval_score(lower, upper, truth), [0.4, 2.4, 2.4])
+
+
+def test_interval_score_is_least_at_the_true_quantiles() -> None:
+    """A proper score: neither a wider nor a narrower interval does better on draws from a known distribution."""
+    draws = np.random.default_rng(1).normal(size=200_000)
+    scores = {z: float(interval_score(np.full(1, -z), np.full(1, z), draws).mean()) for z in (1.2, 1.645, 2.2)}
+    assert scores[1.645] < min(scores[1.2], scores[2.2])
+
+
+def test_inflated_noise_does_not_win_the_innovation_likelihood(drives: Recorded) -> None:
+    """R times 4.5 makes the innovations less likely than R as it is, however seldom it is surprised."""
+    usual, inflated = (worth(Memberships(ln_scales=(s, s)), drives, ESTIMATOR) for s in (0.0, 1.5))
+    assert inflated.log_likelihood < usual.log_likelihood
+    assert inflated.nis_ratio < usual.nis_ratio
+
+
+def test_each_objective_maximises_its_own_score(drives: Recorded) -> None:
+    vector = Memberships().to_vector()
+    found = worth(Memberships(), drives, ESTIMATOR)
+    assert set(OBJECTIVES) == {"interval", "innovation"}
+    assert objective_on(drives, ESTIMATOR, "interval")(vector) == -found.interval_score
+    assert objective_on(drives, ESTIMATOR, "innovation")(vector) == found.log_likelihood
+
+
+def test_vector_that_is_no_membership_counts_as_the_worst(drives: Recorded) -> None:
+    vector = Memberships().to_vector()
+    assert objective_on(drives, ESTIMATOR, "interval")(np.full_like(vector, np.nan)) == -np.inf
+
+
+def test_an_unknown_objective_is_refused(drives: Recorded) -> None:
+    with pytest.raises(InputError, match="objective"):
+        objective_on(drives, ESTIMATOR, "rmse")
+
+
+def test_default_is_among_the_choices_and_all_lie_within_the_bounds() -> None:
+    lower, upper = Memberships.bounds()
+    for value, positions, least, largest in zip(Memberships().to_vector(), choices(7), lower, upper, strict=True):
+        assert value in positions
+        assert np.all((least <= positions) & (positions <= largest))
+        assert np.all(np.diff(positions) > 0)
+
+
+def arguments(*words: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    tune.add_arguments(parser)
+    return parser.parse_args(words)
+
+
+@pytest.mark.parametrize("objective", ["interval", "innovation"])
+def test_quick_tuning_writes_a_valid_file_and_says_what_it_does(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], objective: str
+) -> None:
+    out = tmp_path / "tuned.json"
+    assert tune.run(arguments("--quick", "--seed", "4", "--objective", objective, "--out", str(out))) == 0
+    told = capsys.readouterr().out
+    assert told.count("elapsed") == 2 * tune.QUICK_ITERATIONS
+    for way in WAYS:
+        assert f"\n{way} " in told
+    tuned = load(out)
+    scores, provenance = tuned.document.scores, tuned.document.provenance
+    for way in ("random", "colony"):
+        gain = OBJECTIVES[objective](Worth(**scores[way].train.model_dump()))
+        assert gain >= OBJECTIVES[objective](Worth(**scores["default"].train.model_dump()))
+    assert provenance.command == f"edge-agent tune --seed 4 --ants 3 --iterations 2 --objective {objective} --quick"
+    assert provenance.budget.evaluations == {"random": 6, "colony": 6}
+
+
+@pytest.mark.parametrize(("option", "value"), [("--ants", "0"), ("--iterations", "-2"), ("--seed", "-1")])
+def test_options_out_of_range_are_refused_by_name(option: str, value: str) -> None:
+    with pytest.raises(InputError, match=option):
+        tune.run(arguments("--quick", option, value))
+
+
+def test_progress_line_tells_iteration_best_mean_elapsed_and_remaining_time() -> None:
+    lines: list[str] = []
+    now = iter([100.0, 102.0])
+    tell = tune.reporter("colony", 5, lambda: next(now), lines.append)
+    tell(Iteration(1, -1.25, -2.5, 12))
+    words = " ".join(lines[0].split())
+    assert words == "colony 1/5 best -1.2500 mean -2.5000 evaluations 12 elapsed 2 s left 8 s"
+
+
+def test_table_has_a_row_per_way_and_set_of_drives() -> None:
+    score = Score(interval_score=0.5, coverage=0.9, log_likelihood=1.0, nis_ratio=1.1)
+    rows = tune.table({way: Comparison(train=score, held_out=score) for way in WAYS}).splitlines()[1:]
+    assert [row.split()[0] for row in rows] == [way for way in WAYS for _ in range(2)]
+
+
+def test_another_drive_of_the_set_gives_another_worth(drives: Recorded) -> None:
+    other = record((replace(TRAIN[0], seed=77), *TRAIN[1:3]), 4.0)
+    assert worth(Memberships(), other, ESTIMATOR) != worth(Memberships(), drives, ESTIMATOR)

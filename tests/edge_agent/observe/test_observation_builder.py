@@ -1,0 +1,140 @@
+"""The observer: one observation per visit, states in their slots, whatever the blocks."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from edge_agent.observe.cell_tracker import NOWHERE
+from edge_agent.observe.observation_builder import Records
+from schemas import grid, mugrid
+from schemas.config import AgentConfig
+from schemas.wire import Kind, column_types
+from tests.edge_agent.fakes import START_NS, Watch, estimates, ground, part, wanderers
+
+
+def joined(records: list[Records]) -> dict[str, np.ndarray]:
+    """Columns of several blocks, one after the other, with vehicle and urgent."""
+    columns = {name: np.concatenate([r.columns[name] for r in records]) for name in records[0].columns}
+    whose = {name: np.concatenate([getattr(r, name) for r in records]) for name in ("vehicle", "urgent")}
+    return columns | whose
+
+
+def test_one_observation_for_each_finished_visit() -> None:
+    block, told = wanderers(400, 5), estimates(400, 5)
+    located, observations, _ = Watch.of(5).step(block, told)
+    visits = 0
+    for n in range(5):
+        cells = located.cell[np.flatnonzero(located.closes[:, n]), n]
+        visits += np.count_nonzero(cells != NOWHERE) - (located.cell[-1, n] != NOWHERE)
+    assert len(observations.vehicle) == visits > 100
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_any_split_of_the_samples_gives_the_same_records(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    block, told = wanderers(300, 4, seed), estimates(300, 4, seed)
+    _, *whole = Watch.of(4).step(block, told)
+    cuts = [0, *np.sort(rng.choice(np.arange(1, 300), 12, replace=False)).tolist(), 300]
+    watch = Watch.of(4)
+    rows = [slice(a, b) for a, b in pairwise(cuts)]
+    pieces = [watch.step(part(block, r), told.part(r))[1:] for r in rows]
+    for kind in (0, 1):
+        expected, found = joined([whole[kind]]), joined([piece[kind] for piece in pieces])
+        for name, column in expected.items():
+            assert np.array_equal(column, found[name], equal_nan=column.dtype.kind == "f"), name
+
+
+def test_an_observation_tells_its_visit() -> None:
+    """East through three cells at 10 m/s: times, pose, speed and the friction at the end of the second visit."""
+    samples = 25
+    east = np.arange(samples)[:, None] * 1.0
+    block, told = ground(east, np.zeros_like(east), np.zeros_like(east)), estimates(samples, 1)
+    located, observations, _ = Watch.of(1).step(block, told)
+    first, second = np.flatnonzero(located.closes[:, 0])[1:3]
+    columns = observations.columns
+    assert columns["enter_time"][1] == START_NS + first * 100_000_000
+    assert columns["leave_time"][1] == START_NS + (second - 1) * 100_000_000
+    assert columns["mu"][1] == np.float32(told.mu[second - 1, 0])
+    assert columns["mu_upper"][1] == np.float32(told.mu_upper[second - 1, 0])
+    assert columns["speed"][1] == pytest.approx(np.hypot(told.vx, told.vy)[first:second].mean(), rel=1e-6)
+    assert columns["health"][1] == np.bitwise_or.reduce(told.health[first:second, 0])
+    assert told.evidence is not None
+    assert np.array_equal(columns["log_likelihood"][1], mugrid.encode_log_likelihood(told.evidence[second, 0]))
+    assert columns["sector"].tolist() == [0] * len(columns["sector"])
+
+
+def test_the_pose_of_an_observation_lies_in_its_cell() -> None:
+    _, observations, _ = Watch.of(6).step(wanderers(500, 6, 8), estimates(500, 6))
+    columns = observations.columns
+    assert np.array_equal(grid.cell_of(columns["latitude"], columns["longitude"]), columns["cell"])
+
+
+def test_columns_have_the_types_of_the_wire() -> None:
+    _, observations, states = Watch.of(3).step(wanderers(100, 3), estimates(100, 3))
+    for records in (observations, states):
+        assert {n: c.dtype for n, c in records.columns.items()} == column_types(records.kind)
+        assert {len(c) for c in records.columns.values()} == {len(records.vehicle)}
+
+
+def test_a_bank_without_evidence_sends_no_likelihood() -> None:
+    block, told = wanderers(100, 2), estimates(100, 2)
+    bare = type(told)(**{**vars(told), "evidence": None})
+    _, observations, _ = Watch.of(2).step(block, bare)
+    assert observations.columns["log_likelihood"].shape == (len(observations.vehicle), 0)
+
+
+def test_a_visit_that_the_bank_could_not_follow_is_flat() -> None:
+    block, told = wanderers(100, 2), estimates(100, 2)
+    unknown = type(told)(**{**vars(told), "evidence": np.full_like(told.evidence, np.nan)})
+    _, observations, _ = Watch.of(2).step(block, unknown)
+    assert not observations.columns["log_likelihood"].any()
+    assert observations.columns["log_likelihood"].shape[1] == mugrid.BINS
+
+
+@pytest.mark.parametrize(
+    ("mu", "used", "urgent"),
+    [(0.30, 0.05, True), (0.36, 0.05, False), (0.36, 0.25, True), (0.9, 0.8, False)],
+    ids=["upper bound slippery", "only the median", "median with excitation", "dry"],
+)
+def test_only_slippery_visits_are_urgent(mu: float, used: float, urgent: bool) -> None:
+    """The interval is mu ± 0.05, and slippery means below 0.4."""
+    _, observations, states = Watch.of(3).step(wanderers(150, 3), estimates(150, 3, mu=mu, used=used))
+    assert set(observations.urgent.tolist()) == {urgent}
+    assert not states.urgent.any()
+
+
+def test_grip_used_in_the_cell_before_is_not_told_again() -> None:
+    """Braking ends just before the border; the estimator's window still shows it for a second."""
+    samples = 60
+    east = np.arange(samples)[:, None] * 0.5
+    block, told = ground(east, np.zeros_like(east), np.zeros_like(east)), estimates(samples, 1, mu=0.9)
+    used = np.full((samples, 1), 0.1)
+    located, *_ = Watch.of(1).step(block, told)
+    border = np.flatnonzero(located.closes[:, 0])[1]
+    used[border - 5 : border + 9] = 0.7
+    _, observations, _ = Watch.of(1).step(block, type(told)(**{**vars(told), "mu_utilised": used}))
+    assert observations.columns["mu_utilised"][:2].tolist() == pytest.approx([0.7, 0.1])
+
+
+@pytest.mark.parametrize("rate", [0.5, 2.0, 10.0])
+def test_states_come_at_the_set_rate(rate: float) -> None:
+    east = np.zeros((3_001, 2))
+    block = ground(east, east, east, rate_hz=100.0)
+    _, _, states = Watch.of(2, AgentConfig(state_rate_hz=rate)).step(block, estimates(3_001, 2))
+    per_vehicle = np.bincount(states.vehicle)
+    assert per_vehicle.tolist() == [round(30 * rate) + 1] * 2
+    times = states.columns["time"][states.vehicle == 0]
+    assert np.allclose(np.diff(times) / 1e9, 1 / rate, atol=0.011)
+
+
+def test_without_position_there_is_no_state() -> None:
+    east = np.zeros((100, 1))
+    block = ground(east, east, east)
+    block.signals[..., -3] = np.nan
+    _, observations, states = Watch.of(1).step(block, estimates(100, 1))
+    assert not len(states.vehicle)
+    assert not len(observations.vehicle)
+    assert states.kind is Kind.STATE

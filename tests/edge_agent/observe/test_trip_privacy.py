@@ -1,0 +1,51 @@
+"""Trip ends: nothing is told of where a trip began and ended, and everything of what lies between."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edge_agent.observe.observation_builder import Records
+from edge_agent.observe.trip_privacy import NS, TripEnds
+from schemas.numeric import IntArray
+from schemas.wire import Kind
+
+SPEED = 10.0
+
+
+def states(time: IntArray, vehicle: int = 0) -> Records:
+    n = len(time)
+    return Records(Kind.STATE, {"time": time}, np.full(n, vehicle), np.zeros(n, bool))
+
+
+def told(ends: TripEnds, seconds: int, block_s: float = 0.5) -> list[float]:
+    """Times [s] of the states that pass, one a second, of a trip at SPEED."""
+    out = []
+    steps = round(1.0 / 0.1 * block_s)
+    for block in range(round(seconds / block_s)):
+        t = (block * block_s + 0.1 * np.arange(1, steps + 1))[:, None]
+        time = np.rint(t * NS).astype(np.int64)
+        ends.drive(time, np.full(time.shape, SPEED))
+        out += (ends.cut(states(time[time % NS == 0].ravel())).columns["time"] / NS).tolist()
+    return out
+
+
+def test_without_the_setting_every_record_passes_at_once() -> None:
+    assert told(TripEnds(1, 0.0, 0.0), 20) == list(range(1, 21))
+
+
+@pytest.mark.parametrize(("metres", "seconds", "cut"), [(50.0, 0.0, 5.0), (0.0, 7.0, 7.0), (30.0, 8.0, 8.0)])
+def test_both_ends_are_cut_by_the_larger_of_way_and_time(metres: float, seconds: float, cut: float) -> None:
+    found = told(TripEnds(1, metres, seconds), 40)
+    assert min(found) == pytest.approx(cut, abs=1.01)
+    assert max(found) == pytest.approx(40.0 - cut, abs=1.01)
+    assert found == sorted(found)
+    assert len(found) == len(set(found)) == max(found) - min(found) + 1
+
+
+def test_who_stands_still_has_not_left_home() -> None:
+    ends = TripEnds(1, 50.0, 0.0)
+    for k in range(1, 100):
+        time = np.array([[k * NS]])
+        ends.drive(time, np.zeros((1, 1)))
+        assert not len(ends.cut(states(time[0])).vehicle)

@@ -1,0 +1,274 @@
+"""The publisher on real sessions: everything arrives under its own name, once it can, and is settled by answers."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edge_agent.observe.observation_builder import Records
+from edge_agent.publish.batching import Batcher
+from edge_agent.publish.outbox import Spool
+from edge_agent.publish.publisher import Publisher
+from schemas import grid, keys
+from schemas.config import AgentConfig, ZenohSettings
+from schemas.wire import Batch, Kind, StreamAck, encode_ack
+from tests.edge_agent.fakes import Watch, estimates, wanderers
+from tests.edge_agent.service import Router, Service
+from tests.waiting import until
+
+NAMES = ("car-a", "car-b", "car-c")
+Make = Callable[..., Publisher]
+
+
+def drive(seed: int = 0, samples: int = 200) -> tuple[Records, Records]:
+    """Observations and states of a random drive of three vehicles."""
+    _, observations, states = Watch.of(3).step(wanderers(samples, 3, seed), estimates(samples, 3, seed, mu=0.8))
+    return observations, states
+
+
+def rows(batches: list[Batch], kind: Kind) -> int:
+    """Records received, each identity once."""
+    return sum({(b.vehicle, b.boot, b.region, b.seq): b.rows for b in batches if b.kind is kind}.values())
+
+
+def settings(router: Router, tmp_path: Path, **changes: object) -> AgentConfig:
+    quick = {"flush_s": 0.05, "resend_s": 0.2, "spool": tmp_path / "spool.sqlite"}
+    return AgentConfig.model_validate({"zenoh": router.settings, **quick, **changes})
+
+
+def publisher_of(config: AgentConfig, names: tuple[str, ...] = NAMES) -> Publisher:
+    publisher = Publisher(names, Spool(config.spool, first_resend_s=config.resend_s), config, "test")
+    publisher.start()
+    return publisher
+
+
+def test_every_record_arrives_once_under_its_vehicles_key_and_is_settled(
+    router: Router, service: Service, tmp_path: Path
+) -> None:
+    publisher = publisher_of(settings(router, tmp_path))
+    observations, states = drive()
+    publisher.offer(observations, states)
+    until(lambda: publisher.counts.acknowledged[Kind.STATE] == len(states.vehicle))
+    assert publisher.close(within_s=5.0)
+    assert publisher.unsettled() == 0
+    assert rows(service.batches, Kind.OBSERVATION) == len(observations.vehicle)
+    assert rows(service.batches, Kind.STATE) == len(states.vehicle)
+    for key, batch in zip(service.keys, service.batches, strict=True):
+        parsed = keys.parse(key)
+        assert (parsed.who, parsed.place, parsed.topic.name) == (batch.vehicle, batch.region, batch.kind)
+        assert batch.estimator == "test"
+
+
+def test_columns_arrive_as_they_were_observed(router: Router, service: Service, tmp_path: Path) -> None:
+    publisher = publisher_of(settings(router, tmp_path))
+    observations, _ = drive()
+    publisher.offer(observations)
+    assert publisher.close(within_s=10.0)
+    for n, name in enumerate(NAMES):
+        mine = sorted((b for b in service.batches if b.vehicle == name), key=lambda b: (b.region, b.seq))
+        regions = grid.region_of(observations.columns["cell"])
+        order = np.lexsort([np.arange(len(regions)), regions])
+        chosen = order[observations.vehicle[order] == n]
+        for column, sent in observations.columns.items():
+            received = np.concatenate([b.columns[column] for b in mine])
+            assert np.array_equal(received, sent[chosen], equal_nan=sent.dtype.kind == "f"), column
+
+
+def test_what_the_service_does_not_answer_is_sent_again_until_it_does(
+    router: Router, service: Service, tmp_path: Path
+) -> None:
+    service.answer = False
+    publisher = publisher_of(settings(router, tmp_path))
+    observations, _ = drive()
+    publisher.offer(observations)
+    service.wait(lambda batches: len(batches) > len({b.seq for b in batches}) + 6)
+    service.answer = True
+    assert publisher.close(within_s=20.0)
+    assert publisher.unsettled() == 0
+    assert publisher.counts.resent_batches >= 3
+    assert publisher.counts.acknowledged[Kind.OBSERVATION] == len(observations.vehicle)
+    assert rows(service.batches, Kind.OBSERVATION) == len(observations.vehicle)
+
+
+def test_a_lost_router_is_waited_for_and_nothing_is_lost(router: Router, tmp_path: Path) -> None:
+    publisher = publisher_of(settings(router, tmp_path))
+    before, after = drive(1)[0], drive(2)[0]
+    with Service(router) as service:
+        publisher.offer(before)
+        service.wait(lambda batches: rows(batches, Kind.OBSERVATION) == len(before.vehicle))
+    until(lambda: publisher.links == len(NAMES))
+    router.stop()
+    publisher.offer(after)
+    until(lambda: publisher.unsettled() >= len(after.vehicle))
+    router.start()
+    with Service(router) as service:
+        until(lambda: publisher.unsettled() == 0)
+        assert rows(service.batches, Kind.OBSERVATION) >= len(after.vehicle)
+    assert publisher.close(within_s=2.0)
+
+
+def test_an_agent_may_start_before_the_router(tmp_path: Path) -> None:
+    router = Router()
+    router.stop()
+    publisher = publisher_of(settings(router, tmp_path))
+    observations, _ = drive()
+    publisher.offer(observations)
+    until(lambda: publisher.unsettled() == len(observations.vehicle))
+    assert publisher.links == 0
+    router.start()
+    with Service(router) as service:
+        until(lambda: publisher.unsettled() == 0)
+        assert rows(service.batches, Kind.OBSERVATION) == len(observations.vehicle)
+    assert publisher.close(within_s=2.0)
+    router.stop()
+
+
+def test_without_a_router_it_leaves_in_time_and_keeps_everything_for_the_next_start(tmp_path: Path) -> None:
+    nobody = ZenohSettings(connect=["tcp/127.0.0.1:9"])
+    config = AgentConfig(zenoh=nobody, spool=tmp_path / "spool.sqlite", flush_s=0.05)
+    publisher = publisher_of(config)
+    observations, _ = drive()
+    publisher.offer(observations)
+    assert publisher.close(within_s=0.5)
+    assert publisher.unsettled() == len(observations.vehicle)
+    again = Spool(config.spool)
+    assert again.records(set(NAMES)) == len(observations.vehicle)
+    again.close()
+
+
+def test_batches_of_an_earlier_start_are_sent_under_their_old_identity(
+    router: Router, service: Service, tmp_path: Path
+) -> None:
+    service.answer = False
+    config = settings(router, tmp_path)
+    first = publisher_of(config)
+    first.offer(drive()[0])
+    service.wait(lambda batches: len(batches) >= 3)
+    first.close(within_s=0.1)
+    earlier = set(service.identities())
+    service.batches.clear()
+    service.answer = True
+    second = publisher_of(config)
+    assert second.close(within_s=20.0)
+    assert set(service.identities()) == earlier
+    assert second.unsettled() == 0
+
+
+def test_a_rejected_batch_is_settled_counted_and_logged(
+    router: Router, service: Service, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    service.refuse = lambda batch: "speed" if batch.vehicle == "car-b" else None
+    publisher = publisher_of(settings(router, tmp_path))
+    observations, _ = drive()
+    theirs = int((observations.vehicle == 1).sum())
+    with caplog.at_level(logging.WARNING):
+        publisher.offer(observations)
+        assert publisher.close(within_s=20.0)
+    assert publisher.unsettled() == 0
+    assert publisher.counts.rejected[Kind.OBSERVATION] == theirs
+    assert publisher.counts.acknowledged[Kind.OBSERVATION] == len(observations.vehicle) - theirs
+    assert "of car-b was rejected at row 0: speed" in caplog.text
+
+
+def test_acknowledgements_that_cannot_be_read_or_are_anothers_are_counted_and_settle_nothing(
+    router: Router, service: Service, tmp_path: Path
+) -> None:
+    service.answer = False
+    publisher = publisher_of(settings(router, tmp_path))
+    observations, _ = drive()
+    publisher.offer(observations)
+    service.wait(lambda batches: rows(batches, Kind.OBSERVATION) == len(observations.vehicle))
+    mine = next(b for b in service.batches if b.vehicle == "car-a")
+    service.put_ack("car-a", b"\xff\xff garbage")
+    forged = StreamAck(mine.boot, mine.kind, mine.region, ((1, 99),))
+    service.put_ack("car-a", encode_ack("car-b", [forged]))
+    until(lambda: publisher.counts.bad_acks == 2)
+    assert publisher.unsettled() == len(observations.vehicle)
+    publisher.close(within_s=0.1)
+
+
+def test_a_full_disk_is_waited_for(
+    router: Router, service: Service, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """SQLite may not grow its file beyond the pages that it has, then it may."""
+    config = settings(router, tmp_path)
+    spool = Spool(config.spool)
+    database = spool._database
+    (pages,) = database.execute("PRAGMA page_count").fetchone()
+    database.execute(f"PRAGMA max_page_count = {pages}")
+    publisher = Publisher(NAMES, spool, config, "test")
+    publisher.start()
+    observations, states = drive(samples=1000)
+    publisher.offer(observations, states)
+    until(lambda: "the spool refuses" in caplog.text)
+    assert publisher.unsettled() == len(observations.vehicle) + len(states.vehicle)
+    database.execute("PRAGMA max_page_count = 1000000")
+    assert publisher.close(within_s=20.0)
+    assert publisher.unsettled() == publisher.dropped == 0
+    assert rows(service.batches, Kind.OBSERVATION) == len(observations.vehicle)
+    for stream in {(b.vehicle, b.kind, b.region) for b in service.batches}:
+        seqs = {b.seq for b in service.batches if (b.vehicle, b.kind, b.region) == stream}
+        assert seqs == set(range(1, len(seqs) + 1))
+
+
+def test_each_vehicle_shows_that_it_is_alive_until_it_leaves(router: Router, service: Service, tmp_path: Path) -> None:
+    def alive() -> set[str]:
+        return {str(r.ok.key_expr) for r in service.session.liveliness().get(f"{keys.ROOT}/alive/*") if r.ok}
+
+    publisher = publisher_of(settings(router, tmp_path))
+    until(lambda: alive() == {keys.alive_key(name) for name in NAMES})
+    publisher.close(within_s=1.0)
+    until(lambda: not alive())
+
+
+def test_many_sessions_open_together(router: Router, tmp_path: Path) -> None:
+    names = tuple(f"sim-{n:03}" for n in range(36))
+    publisher = publisher_of(settings(router, tmp_path), names)
+    until(lambda: publisher.links == 36)
+    assert publisher.close(within_s=1.0)
+
+
+def batches_of(batcher: Batcher, now: float, everything: bool = False) -> list[tuple[str, int]]:
+    return sorted((d.vehicle, d.records) for d in batcher.due(now, everything=everything))
+
+
+def one_vehicle(records: int, urgent: bool = False) -> Records:
+    """The first records of one drive, of the first vehicle and in one region."""
+    observations, _ = drive(samples=3000)
+    chosen = np.flatnonzero(observations.vehicle == 0)[:records]
+    assert len(chosen) == records
+    columns = {name: column[chosen] for name, column in observations.columns.items()}
+    columns["cell"] = np.full(records, columns["cell"][0])
+    return Records(Kind.OBSERVATION, columns, observations.vehicle[chosen], np.full(records, urgent))
+
+
+def test_a_batch_waits_for_its_time_or_for_fifty_records() -> None:
+    batcher = Batcher(NAMES, 1, "test", flush_s=1.0, rows=50)
+    batcher.add(one_vehicle(30), now=0.0)
+    assert batches_of(batcher, now=0.9) == []
+    batcher.add(one_vehicle(30), now=0.9)
+    assert batches_of(batcher, now=0.9) == [("car-a", 50)]
+    assert batches_of(batcher, now=1.8) == []
+    assert batches_of(batcher, now=2.0) == [("car-a", 10)]
+
+
+def test_a_slippery_visit_takes_its_batch_along_at_once() -> None:
+    batcher = Batcher(NAMES, 1, "test", flush_s=1.0, rows=50)
+    batcher.add(one_vehicle(2), now=0.0)
+    batcher.add(one_vehicle(1, urgent=True), now=0.1)
+    assert batches_of(batcher, now=0.1) == [("car-a", 3)]
+
+
+def test_a_batch_never_spans_regions() -> None:
+    records = one_vehicle(4)
+    records.columns["cell"][2:] += 1 << (2 * (grid.CELL_ZOOM - grid.REGION_ZOOM))
+    batcher = Batcher(NAMES, 1, "test", flush_s=1.0, rows=50)
+    batcher.add(records, now=0.0)
+    drafts = batcher.due(now=0.0, everything=True)
+    assert sorted(d.records for d in drafts) == [2, 2]
+    assert len({d.region for d in drafts}) == 2
+    assert batcher.records == 0
