@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from fleet_service.app.engine import Engine
 from fleet_service.archive.segments import Writer
-from fleet_service.engine import Engine
-from fleet_service.ingest import Message
+from fleet_service.ingest.inbox import Message
 from schemas import wire
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure

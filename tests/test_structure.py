@@ -161,7 +161,7 @@ def test_a_generator_as_an_argument_is_pure() -> None:
 
 
 def test_an_import_across_packages_is_seen() -> None:
-    assert crossings(ast.parse("def f():\n    import fleet_service.service"), "edge_agent")
+    assert crossings(ast.parse("def f():\n    import fleet_service.app.service"), "edge_agent")
     assert crossings(ast.parse("from edge_agent import agent"), "schemas")
     assert not crossings(ast.parse("from schemas import grid"), "edge_agent")
 

@@ -18,7 +18,7 @@ from fleet_service.archive.pseudonyms import number
 from fleet_service.fusion import Folded, Fusion, Observations, evidence
 from fleet_service.fusion.constants import EPOCH_NS
 from fleet_service.fusion.space import places
-from fleet_service.streams import Streams
+from fleet_service.ingest.dedup import Streams
 from schemas import grid
 from schemas.numeric import IntArray
 from schemas.tables import US, US_STEP

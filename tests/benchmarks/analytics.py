@@ -31,7 +31,7 @@ from fleet_service.archive.compaction import compact
 from fleet_service.archive.export import Part
 from fleet_service.archive.rebuild import Since, replay
 from fleet_service.fusion import Fusion
-from fleet_service.map_state import cell_table
+from fleet_service.serve.map_state import cell_table
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind

@@ -80,8 +80,8 @@ def per_observation_s(cells: int, per_s: int = 5_000) -> float:
 
 def resident() -> None:
     """Print the resident memory [MB] of a service's process with 10⁶ cells of three visits in a day."""
-    import fleet_service.service  # noqa: F401 what a service has loaded
-    from fleet_service.map_state import MapState
+    import fleet_service.app.service  # noqa: F401 what a service has loaded
+    from fleet_service.serve.map_state import MapState
 
     fusion, _ = filled(CELLS, 3, 86_400.0)
     MapState(fusion).tiles()

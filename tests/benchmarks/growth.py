@@ -16,7 +16,7 @@ from typing import Final
 
 import numpy as np
 
-from fleet_service.engine import Engine
+from fleet_service.app.engine import Engine
 from fleet_service.fusion.constants import EPOCH_NS
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure

@@ -21,8 +21,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_service.engine import Engine
-from fleet_service.ingest import TURN_BYTES, TURN_MESSAGES, Message
+from fleet_service.app.engine import Engine
+from fleet_service.ingest.inbox import TURN_BYTES, TURN_MESSAGES, Message
 from schemas import grid, keys, mugrid, wire
 from schemas.config import ServiceConfig
 from schemas.runtime.batch_decoder import decode_many

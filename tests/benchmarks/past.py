@@ -16,9 +16,9 @@ import zenoh
 from deploy.router import open_router
 from fleet_service.analytics import synthetic
 from fleet_service.analytics.synthetic import DAY_S, START_NS, World
+from fleet_service.app.engine import Engine
+from fleet_service.app.service import Service
 from fleet_service.archive.compaction import compact
-from fleet_service.engine import Engine
-from fleet_service.service import Service
 from schemas import grid, keys
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.numeric import FloatArray, IntArray

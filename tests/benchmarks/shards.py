@@ -22,8 +22,8 @@ from typing import Final
 import zenoh
 
 from deploy.router import open_router
-from fleet_service.engine import Engine
-from fleet_service.ingest import Message
+from fleet_service.app.engine import Engine
+from fleet_service.ingest.inbox import Message
 from schemas import keys, wire
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.runtime.figures import Figure

@@ -18,10 +18,10 @@ from typing import Final
 import pyarrow as pa
 
 from deploy.router import open_router
+from fleet_service.app.engine import ALERTS, Engine
 from fleet_service.archive import checkpoints
 from fleet_service.checkpoint import tables_of
-from fleet_service.engine import ALERTS, Engine
-from fleet_service.ingest import Message
+from fleet_service.ingest.inbox import Message
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
 from tests.benchmarks.fusion import CELLS, START, filled

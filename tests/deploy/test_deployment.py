@@ -21,7 +21,7 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from fleet_service.client import ask
+from fleet_service.client.map_client import ask
 from fleet_service.enrolment.fleet import Enrolment
 from schemas.config import AgentConfig, ServiceConfig, load
 from schemas.runtime.zenoh_session import configuration

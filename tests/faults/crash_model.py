@@ -26,7 +26,7 @@ from fleet_service.archive.compaction import compact
 from fleet_service.archive.log import Log
 from fleet_service.archive.rebuild import restore_streams
 from fleet_service.archive.segments import Rows
-from fleet_service.streams import Streams
+from fleet_service.ingest.dedup import Streams
 from schemas import grid
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind

@@ -20,8 +20,8 @@ import numpy as np
 import pyarrow as pa
 import zenoh
 
-from fleet_service.engine import Engine
-from fleet_service.ingest import Message
+from fleet_service.app.engine import Engine
+from fleet_service.ingest.inbox import Message
 from schemas import grid, keys, query, wire
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure

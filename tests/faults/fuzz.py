@@ -16,8 +16,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.dataset as ds
 
-from fleet_service.engine import Engine
-from fleet_service.ingest import Message
+from fleet_service.app.engine import Engine
+from fleet_service.ingest.inbox import Message
 from schemas import grid, query, wire
 from schemas.config import ServiceConfig
 from schemas.errors import InputError, WireError

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import zenoh
 
-from fleet_service.service import Service
+from fleet_service.app.service import Service
 from schemas import keys, wire
 from schemas.config import ServiceConfig
 from schemas.errors import WireError

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from google.protobuf import json_format
 
-from fleet_service.ingest import Message
+from fleet_service.ingest.inbox import Message
 from schemas import grid, keys, wire
 from schemas.proto import gripmap_pb2 as pb
 from schemas.wire import Kind

@@ -15,12 +15,12 @@ from typing import Final
 
 import numpy as np
 
+from fleet_service.app.engine import Engine
 from fleet_service.archive import reading, segments
 from fleet_service.archive.pseudonyms import Pseudonyms, number
 from fleet_service.archive.rebuild import restore_streams
-from fleet_service.engine import Engine
-from fleet_service.ingest import Message
-from fleet_service.streams import Streams
+from fleet_service.ingest.dedup import Streams
+from fleet_service.ingest.inbox import Message
 from schemas import wire
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure

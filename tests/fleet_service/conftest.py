@@ -13,7 +13,7 @@ import zenoh
 from hypothesis import settings
 
 from deploy.router import open_router
-from fleet_service.service import Service
+from fleet_service.app.service import Service
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.runtime.zenoh_session import open_session
 from tests.waiting import until

@@ -19,9 +19,9 @@ from fleet_service.cli import main
 from schemas import wire
 from schemas.config import ZenohSettings
 from schemas.runtime.zenoh_session import open_session
+from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.conftest import Running, running
 from tests.fleet_service.examples import CELL, SECOND, batch, key
-from tests.fleet_service.test_service import Fleet
 from tests.waiting import until
 
 COMMAND = [sys.executable, "-m", "fleet_service.cli"]

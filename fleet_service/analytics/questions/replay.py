@@ -11,8 +11,8 @@ from fleet_service.analytics.engines import Engine
 from fleet_service.analytics.options import Options
 from fleet_service.archive.rebuild import Since, replay
 from fleet_service.fusion import Fusion
-from fleet_service.map_state import cell_table
-from fleet_service.weather import archived
+from fleet_service.ingest.weather import archived
+from fleet_service.serve.map_state import cell_table
 from schemas import grid, tables
 
 TOLD_ROWS: Final = 1_000_000  # between two lines of progress

@@ -15,11 +15,11 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
+from fleet_service.app.engine import Engine
 from fleet_service.archive import reading, segments
 from fleet_service.archive.files import lock
 from fleet_service.archive.pseudonyms import Pseudonyms, number, texts
-from fleet_service.engine import Engine
-from fleet_service.ingest import Message
+from fleet_service.ingest.inbox import Message
 from schemas import tables, wire
 from schemas.config import ServiceConfig
 from schemas.errors import InputError

@@ -12,10 +12,10 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from fleet_service.app.engine import Engine
 from fleet_service.archive import checkpoints, reading
 from fleet_service.archive.compaction import compact
-from fleet_service.engine import Engine
-from fleet_service.ingest import Message
+from fleet_service.ingest.inbox import Message
 from schemas import wire
 from schemas.config import ServiceConfig
 from schemas.numeric import FloatArray

@@ -17,10 +17,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from fleet_service.app.engine import Engine
 from fleet_service.archive import compaction, files, layout, reading, segments
 from fleet_service.archive.compaction import compact, compacting
 from fleet_service.archive.segments import Writer
-from fleet_service.engine import Engine
 from schemas import grid, tables
 from schemas.config import ServiceConfig
 from schemas.errors import InputError

@@ -11,12 +11,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from fleet_service.app.engine import Engine
 from fleet_service.archive import export, layout, mirror, reading, retention, rollup, segments
 from fleet_service.archive.compaction import compact
 from fleet_service.archive.pseudonyms import Pseudonyms
 from fleet_service.archive.segments import Writer
 from fleet_service.cli import main
-from fleet_service.engine import Engine
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
 from schemas.wire import Kind

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fleet_service.alerts import Alerts
 from fleet_service.fusion import Fusion
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.trust import newcomer
+from fleet_service.serve.alerts import Alerts
 from tests.fleet_service.examples import belief, observations, slippery, value
 
 HONEST, LIARS = np.arange(20), np.arange(100, 108)

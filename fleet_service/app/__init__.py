@@ -1,0 +1,1 @@
+"""The running service: engine, sessions, jobs, metrics."""

@@ -1,0 +1,280 @@
+"""The service without its network: messages in; alerts, tiles, acknowledgements and answers out.
+
+One worker calls `take`, `begin_flush`, `written`, `flush`, `tiles` and `fading`; queries come from other threads, so
+that a lock guards the map.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext, suppress
+from dataclasses import asdict
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_service.app.precompile import warm_up
+from fleet_service.archive import checkpoints, reading
+from fleet_service.archive.files import lock
+from fleet_service.archive.log import Log
+from fleet_service.archive.pseudonyms import Pseudonyms
+from fleet_service.archive.rebuild import Since, observations, replay, restore_streams
+from fleet_service.checkpoint import fusion_from, tables_of
+from fleet_service.fusion import Fusion
+from fleet_service.fusion.weather import Reports
+from fleet_service.ingest.acks import Acks
+from fleet_service.ingest.dedup import BatchId, Streams
+from fleet_service.ingest.inbox import Admitted, Intake, Message
+from fleet_service.ingest.validation import Clock
+from fleet_service.ingest.weather import WeatherDesk, archived
+from fleet_service.serve.alerts import Alerts
+from fleet_service.serve.map_state import MapState, cell_table
+from fleet_service.serve.query import answer
+from fleet_service.serve.tile_cache import Tiles
+from schemas import grid, wire
+from schemas.config import ServiceConfig
+from schemas.errors import InputError
+from schemas.numeric import IntArray
+from schemas.query import MapQuery
+from schemas.tables import MAP_SCHEMA
+from schemas.wire import Alert, Kind
+
+# Rows that wait for the disk at the most; beyond, nothing is taken from the queue until a segment is written.
+WAITING_ROWS = 1_000_000
+ALERTS = "alerts"  # table of a checkpoint
+CHECKPOINT_WAIT_S = 0.2  # between two looks whether the service stops
+SNAPSHOT_SLOTS = 20_000  # at once: the lock is held for 40 ms, and little memory is needed
+
+
+class Engine:
+    """State of one service, rebuilt from its archive; `seen` is the latest time at which it received a report [ns].
+
+    Args:
+        config: settings.
+        root: of the archive; it is locked while the engine is open.
+
+    Raises:
+        InputError: another service holds the archive.
+        OSError: the archive cannot be read or written.
+    """
+
+    def __init__(self, config: ServiceConfig, root: Path) -> None:
+        self._config, self._root = config, root
+        self._lock_file = lock(root)
+        self.counts: Counter[str] = Counter()
+        self.report_lag_s = 0.0  # between the end of the newest visit and its arrival
+        self.failing = False  # the last segment could not be written
+        self.fusion, standing, since = self._restored()
+        self.map = MapState(self.fusion)
+        self._alerts = Alerts(self.fusion)
+        self._alerts.resume(standing)
+        self._guard = threading.Lock()
+        self._tiles = Tiles(self.map, self._guard, config.public_vehicles)
+        self._acks = Acks()
+        streams = Streams()
+        self._intake = Intake(streams, Pseudonyms(root / "keys"), self.counts, self._acks)
+        self._log: Log[BatchId] = Log(root, config.name)
+        self.weather = WeatherDesk(root, config.name, self.fusion, self.counts)
+        self._heard = since or 0  # when the last report of any kind came [ns]
+        self._checkpoint_wanted = threading.Event()
+        self._checkpoints: queue.SimpleQueue[tuple[dict[str, pa.Table], int]] = queue.SimpleQueue()
+        used = archived(root)  # before the observations, which it acts on
+        self.fusion.weather(used if since is None else archived(root, received_after=since))
+        restored = np.array_split(np.arange(self.fusion.size), self.fusion.size // SNAPSHOT_SLOTS + 1)
+        rest = replay(root, self.fusion, Since(received=since))  # first of all: it sets damaged files aside
+        for slots in chain(restored, (folded.slots for folded in rest)):
+            self._alerts.folded(slots)
+            self.map.changed(slots)
+        self.seen = restore_streams(root, streams)
+        self.counts["files_set_aside"] = reading.set_aside(root)
+        if config.weather is not None:
+            self._use(self.weather.begin(config.weather, used, time.time_ns()))
+        warm_up()
+        pa.default_memory_pool().release_unused()  # the archive went through it
+
+    def _restored(self) -> tuple[Fusion, list[Alert], int | None]:
+        """Fusion and alerts of the newest checkpoint that can be read, and until when all is in it; or a new one."""
+        for path in checkpoints.newest(self._root):
+            try:
+                tables, received = checkpoints.load(path)
+                standing = [Alert(**row) for row in tables.pop(ALERTS).to_pylist()]
+                return fusion_from(tables, self._config.lateness_s), standing, received
+            except (OSError, pa.ArrowInvalid, InputError, KeyError, TypeError):
+                self.counts["checkpoints_refused"] += 1
+        return Fusion(self._config.lateness_s), [], None
+
+    def checkpoint(self, stop: threading.Event) -> tuple[dict[str, pa.Table], int] | None:
+        """What the fusion knows, and until when everything received is in it [ns]; None if stopped meanwhile.
+
+        The worker takes it, right after a segment: then every row that is in it is on disk. Called by another thread.
+        """
+        self._checkpoint_wanted.set()
+        while not stop.is_set():
+            with suppress(queue.Empty):
+                return self._checkpoints.get(timeout=CHECKPOINT_WAIT_S)
+        return None
+
+    def close(self) -> None:
+        """Give the archive free."""
+        self._log.close()
+        self._lock_file.close()
+
+    @property
+    def full(self) -> bool:
+        """Whether too many rows wait for the disk."""
+        return self._log.rows >= WAITING_ROWS
+
+    @property
+    def unsettled(self) -> int:
+        """Batches that are admitted and not on disk yet."""
+        return self._log.unsettled
+
+    @property
+    def alerts(self) -> int:
+        """Cells under an alert."""
+        return len(self._alerts.raised)
+
+    @property
+    def alerted(self) -> IntArray:
+        """Slots under an alert, (k,)."""
+        return np.array(sorted(self._alerts.raised), np.int64)
+
+    def standing(self, wanted: Callable[[int], bool]) -> list[tuple[int, bytes]]:
+        """Tile and payload of the alerts that stand, for the tiles that are wanted."""
+        tiles: dict[int, list[Alert]] = {}
+        with self._guard:
+            for alert in self._alerts.standing:
+                tiles.setdefault(int(grid.tile_of(alert.cell)), []).append(alert)
+        return [(tile, wire.encode_standing(alerts)) for tile, alerts in tiles.items() if wanted(tile)]
+
+    def take(self, messages: Sequence[Message], now: int, slack: int = 0) -> list[Alert]:
+        """Admit and fuse; returns the alerts that this raises or clears. `slack`: the true time may be so far ahead."""
+        clock = Clock(now, int(self._config.clock_ahead_s * 1e9) + slack, int(self._config.oldest_s * 1e9))
+        out: list[Alert] = []
+        self._heard = max(self._heard, now)
+        for kind, admitted in self._intake.admit(messages, clock).items():
+            if kind is Kind.OBSERVATION:
+                out += self._fuse(admitted)
+            self.counts[kind] += len(admitted.rows["row"])
+            self._log.add(kind, admitted.rows, admitted.batches)
+        return out
+
+    def _fuse(self, admitted: Admitted) -> list[Alert]:
+        rows = admitted.rows
+        self.report_lag_s = float((rows["received_at"] - rows["leave_time"]).min()) * 1e-9
+        with self._guard:
+            folded = self.fusion.fold(observations(rows, rows["vehicle_number"]))
+            self.map.changed(folded.slots)
+            raised = self._alerts.folded(folded.slots)
+            if raised:
+                self._tiles.settle()
+        rows["late"], rows["weight"] = folded.late, folded.weight
+        self.counts["late"] += int(folded.late.sum())
+        return raised
+
+    def overcast(self, now: int) -> None:
+        """Let the weather act that was heard since the last call."""
+        self._heard = max(self._heard, now)
+        self._use(self.weather.take(now))
+
+    def _use(self, reports: Reports | None) -> None:
+        if reports is not None:
+            with self._guard:
+                self.fusion.weather(reports)
+            self.counts["weather"] += len(reports.time)
+
+    def flush(self) -> list[tuple[str, bytes]]:
+        """Write what waits as durable segments; returns vehicle and bytes of the acknowledgements to put after it.
+
+        A full disk is counted and tried again at the next call; nothing of it is acknowledged.
+        """
+        told = self._settled(self._log.flush)
+        if not self.failing and self._checkpoint_wanted.is_set():
+            self._checkpoint_wanted.clear()
+            with self._guard:
+                alerts = pa.Table.from_pylist([asdict(alert) for alert in self._alerts.standing])
+                self._checkpoints.put((tables_of(self.fusion) | {ALERTS: alerts}, self._heard))
+        return told
+
+    def begin_flush(self) -> list[tuple[str, bytes]]:
+        """As `flush`, but messages may be taken while segments are written; `written` gives what is acknowledged.
+
+        If a checkpoint is wanted, all of which must be on disk, it is `flush`.
+        """
+        if self._checkpoint_wanted.is_set():
+            return self.flush()
+        self._log.begin()
+        return []
+
+    def written(self) -> list[tuple[str, bytes]]:
+        """The acknowledgements to put after a flush that was begun, once it has ended."""
+        return self._settled(self._log.end) if self._log.ended else []
+
+    def _settled(self, durable: Callable[[], list[BatchId]]) -> list[tuple[str, bytes]]:
+        try:
+            self._intake.settled(durable())
+        except OSError:
+            self.counts["segment_failures"] += 1
+            self.failing = True
+        else:
+            self.failing = False
+            self._tiles.settle()
+        return self._acks.messages()
+
+    def tiles(self, now: int) -> list[tuple[int, bytes]]:
+        """Tile and Arrow stream of every tile that changed since the last call, as far as it is public."""
+        made = ((tile, self._tiles.make(tile, now)) for tile in self.map.take_dirty())
+        return [(tile, shown.payload) for tile, shown in made if shown.cells.num_rows]
+
+    def whole_map(self, now: int) -> pa.Table:
+        """All public cells; the lock is held for a few at a time, so that ingest goes on."""
+        tables = []
+        for start in range(0, self.fusion.size, SNAPSHOT_SLOTS):
+            with self._guard:
+                slots = np.arange(start, min(start + SNAPSHOT_SLOTS, self.fusion.size))
+                public = slots[self.fusion.live.vehicles[slots] >= self._config.public_vehicles]
+                tables.append(cell_table(self.fusion, public, now))
+        return pa.concat_tables([*tables, MAP_SCHEMA.empty_table()])
+
+    def fading(self, now: int) -> list[Alert]:
+        """Alerts that time alone cleared."""
+        with self._guard:
+            return self._alerts.faded(now)
+
+    def answer(
+        self, query: MapQuery, wanted: Callable[[int], bool], now: int, only: int | None = None
+    ) -> Iterator[tuple[int, bytes]]:
+        """Tile and payload of every reply to a query, each made when it is taken; see `answer.answer`.
+
+        Raises:
+            InputError: a route too long, a time in the future, or an archive that cannot be read.
+        """
+        least = max(query.min_vehicles, self._config.public_vehicles)
+        query = query.model_copy(update={"min_vehicles": least})
+        if query.at is None:
+            return answer(self._tiles, query, wanted, now, only)
+        at = int(query.at.timestamp() * 1e9)
+        if at > now:
+            raise InputError("at", "lies in the future", "give a time that has been")
+        past = Fusion(self._config.lateness_s)
+        try:
+            past.weather(archived(self._root, received_until=at))
+            for _ in replay(self._root, past, Since(until=at, box=_box(query))):
+                pass  # folding is what counts; the alerts of then are history
+        except OSError as error:
+            raise InputError("at", f"the archive cannot be read ({error.strerror})", "ask again later") from error
+        return answer(Tiles(MapState(past), nullcontext(), least), query, wanted, at, only)
+
+
+def _box(query: MapQuery) -> tuple[float, float, float, float] | None:
+    """What a query looks at, if that is less than everything."""
+    if query.route is None:
+        return query.bbox
+    longitudes, latitudes = zip(*query.route, strict=True)
+    return min(longitudes), min(latitudes), max(longitudes), max(latitudes)

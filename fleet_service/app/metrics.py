@@ -1,0 +1,88 @@
+"""What an operator sees of a service in numbers, and what counts as trouble."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from fleet_service.app.engine import Engine
+from fleet_service.archive import segments
+from schemas.config import ServiceConfig
+from schemas.runtime.metrics import Metric, gauge
+from schemas.wire import Kind
+
+STALLED_S: Final = 5.0  # without a turn of the worker, which takes milliseconds
+FULL: Final = 0.9  # of the queue
+_FAMILIES: Final = (  # prefix of the counts, name, label, text
+    ("refused.", "refused_messages", "reason", "batches that were refused, by reason"),
+    ("bad_queries.", "bad_queries", "field", "queries that were refused, by parameter"),
+)
+_SINGLE: Final = {
+    "duplicates": "batches that came again",
+    "overload": "messages dropped because the queue was full",
+    "limited": "messages dropped because their vehicle sent too much",
+    "late": "observations archived and not fused",
+    "queries": "queries",
+}
+
+
+class Pulse(NamedTuple):
+    """What only the running service knows: seconds since the worker's last turn, the queue, routers, clock lag [s]."""
+
+    turn_age_s: float
+    queued: int
+    routers: int
+    clock_lag_s: float
+
+
+def metrics(engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path) -> list[Metric]:
+    """All values, now."""
+    counts = dict(engine.counts)
+    found = [Metric(name, "counter", text, _below(counts, prefix), label) for prefix, name, label, text in _FAMILIES]
+    found += [Metric(name, "counter", text, {"": counts.get(name, 0)}) for name, text in _SINGLE.items()]
+    kinds = {"observation": counts.get(Kind.OBSERVATION, 0), "state": counts.get(Kind.STATE, 0)}
+    failures, runs = _ending(counts, "_failures"), _ending(counts, "_runs")
+    return [
+        *found,
+        Metric("rows", "counter", "rows admitted", kinds, "kind"),
+        Metric("failures", "counter", "what could not be done and is tried again", failures, "work"),
+        Metric("runs", "counter", "rounds of upkeep", runs, "work"),
+        Metric("segments", "gauge", "segments that wait for compaction", _per_kind(root, segments.paths), "kind"),
+        gauge("queue_messages", "messages that wait", pulse.queued),
+        gauge("queue_capacity", "messages that may wait", config.queue_batches),
+        gauge("routers", "routers that the session is connected to", pulse.routers),
+        gauge("worker_turn_age_seconds", "since the worker's last turn", pulse.turn_age_s),
+        gauge("clock_lag_seconds", "by which the system's clock is behind", pulse.clock_lag_s),
+        gauge("report_lag_seconds", "between the end of the newest visit and its arrival", engine.report_lag_s),
+        gauge("unsettled_batches", "batches that are admitted and not on disk yet", engine.unsettled),
+        gauge("cells", "cells and sectors with a belief", engine.fusion.size),
+        gauge("window_observations", "observations younger than the checkpoint", engine.fusion.waiting),
+        gauge("alerts", "cells under an alert", engine.alerts),
+        gauge("damaged_files", "files set aside, as last counted", counts.get("files_set_aside", 0)),
+    ]  # fmt: skip
+
+
+def troubles(engine: Engine, pulse: Pulse, config: ServiceConfig) -> list[str]:
+    """What is not as it should be."""
+    found = [] if pulse.routers else ["no router is connected"]
+    if pulse.turn_age_s > STALLED_S:
+        found.append(f"the worker has done nothing for {pulse.turn_age_s:.0f} s")
+    if engine.failing:
+        found.append("segments cannot be written")
+    if pulse.queued > FULL * config.queue_batches:
+        found.append("the queue is full")
+    return found
+
+
+def _below(counts: Mapping[str, int], prefix: str) -> dict[str, float]:
+    return {name.removeprefix(prefix): n for name, n in counts.items() if name.startswith(prefix)}
+
+
+def _ending(counts: Mapping[str, int], ending: str) -> dict[str, float]:
+    return {name.removesuffix(ending): n for name, n in counts.items() if name.endswith(ending)}
+
+
+def _per_kind(root: Path, listing: Callable[[Path, Kind], list[Path]]) -> dict[str, float]:
+    names = {Kind.OBSERVATION: "observation", Kind.STATE: "state"}
+    return {name: float(len(listing(root, kind))) for kind, name in names.items()}

@@ -1,0 +1,61 @@
+"""Kernels loaded or compiled before the service is ready: compiling takes seconds, and vehicles wait meanwhile."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from fleet_service.fusion import Fusion, Observations
+from fleet_service.fusion.constants import EPOCH_NS
+from fleet_service.fusion.likelihoods import at_least, levelled
+from fleet_service.fusion.shape import unshaped
+from fleet_service.fusion.space import shares
+from fleet_service.serve.alerts import Alerts
+from fleet_service.serve.map_state import cell_table
+from schemas import mugrid
+from schemas.runtime.jit import kernel_cache
+
+CELLS: Final = 1 << 14  # more than a map has room for at first
+COMPILE: Final = "from fleet_service.app.precompile import live; live()"
+DONE: Final = "fleet_service.compiled"  # in the cache, once all of it is there
+
+
+def warm_up() -> None:
+    """Load the kernels. If they were never compiled, a process of its own does it: the compiler leaves a hundred
+    megabytes of holes, into which a service would grow for hours."""
+    done = Path(kernel_cache("fleet_service")) / DONE
+    if not done.exists():
+        beside = subprocess.run([sys.executable, "-c", COMPILE], stderr=subprocess.DEVNULL, check=False)
+        if beside.returncode == 0:
+            with suppress(OSError):  # then it is looked for again at the next start
+                done.parent.mkdir(parents=True, exist_ok=True)
+                done.touch()
+    live()
+
+
+def live() -> None:
+    """Take a throw-away map through its life: fold, grow, advance, fold late within the window, settle, believe."""
+    fusion = Fusion(2 * EPOCH_NS * 1e-9)
+    for epoch, cells in ((1, 2), (2, CELLS), (1, 2), (9, 2)):
+        o = _visits(epoch * EPOCH_NS, cells)
+        Alerts(fusion).folded(fusion.fold(o).slots)
+        fusion.slots_of(o.cell, o.sector)
+    at_least(np.zeros(1))
+    levelled(np.zeros((1, mugrid.BINS), np.uint8), np.zeros(1))
+    shares(np.ones(1), np.ones(1))
+    cell_table(fusion, np.arange(2), 10 * EPOCH_NS)
+
+
+def _visits(time: int, cells: int) -> Observations:
+    """One visit to each of so many cells, by two vehicles."""
+    one, number, sector = np.ones(cells, np.int64), np.arange(cells), np.zeros(cells, np.int8)
+    told = unshaped(mugrid.encode_log_likelihood(np.zeros((cells, mugrid.BINS))), np.zeros(cells))
+    return Observations(
+        time * one, number, sector, (sector - 1).astype(np.int8), number % 2, one, one, number, *told,
+        np.full((cells, 1), -1), np.zeros((cells, 1), np.float32),
+    )  # fmt: skip

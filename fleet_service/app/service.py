@@ -1,0 +1,212 @@
+"""The running service: Zenoh on one side, the engine on the other, one worker between them.
+
+subscribers ─► inbox ─► worker: take ─► alerts at once
+                                flush ─► thread: segment on disk ─► acknowledgements
+                                tiles once a second
+queryables  ─► answers, in Zenoh's threads
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Final
+
+import zenoh
+
+from fleet_service.app.clock import SteadyClock
+from fleet_service.app.engine import Engine
+from fleet_service.app.jobs import archive_jobs, upkeep
+from fleet_service.app.metrics import Pulse, metrics, troubles
+from fleet_service.enrolment.fleet import Enrolment
+from fleet_service.ingest.inbox import Inbox, Message
+from fleet_service.ingest.rate_limit import Limits
+from fleet_service.ingest.weather import Heard
+from fleet_service.serve.queryable import Replies
+from schemas import grid, keys, wire
+from schemas.config import ServiceConfig, load
+from schemas.query import MapQuery
+from schemas.runtime import zenoh_session
+from schemas.runtime.metrics import serving
+from schemas.runtime.process import Line
+from schemas.wire import Alert, Kind
+
+IDLE_S: Final = 0.05  # longest wait for a message; bounds how late a segment or a tile can be
+STATUS_S: Final = 5.0
+LEAVE_S: Final = 1.5  # of the three seconds in which a service is gone
+LAG_S: Final = 1.0  # of the system's clock that is worth telling
+
+
+class Service:
+    """One service.
+
+    Args:
+        config: settings.
+        root: of the archive.
+        say: takes the lines for the operator.
+
+    Raises:
+        InputError: the archive belongs to another service.
+    """
+
+    def __init__(self, config: ServiceConfig, root: Path, say: Callable[[str], None]) -> None:
+        self._config, self._root, self._say = config, root, say
+        known = None if config.fleet is None else set(load(config.fleet, Enrolment).vehicles)
+        self.engine = Engine(config, root)
+        self._clock = SteadyClock(self.engine.seen)
+        limits = Limits(config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, known, self.engine.counts)
+        self._replies = Replies(self._answer, self.engine.counts)
+        self.inbox = Inbox(config.queue_batches, self.engine.counts, limits)
+        self._session: zenoh.Session | None = None
+        self._turned_at = self._put_at = self._flushed_at = self._said_at = time.monotonic()
+        self._said = 0
+
+    def run(self, stop: threading.Event) -> None:
+        """Serve until `stop` is set; then flush, acknowledge and leave."""
+        try:
+            with self._seen() as address:
+                session = zenoh_session.open_session(self._config.zenoh, stop, self._config.name)
+                if session is not None:
+                    self._serve(session, stop, f", {address}" if address else "")
+        finally:
+            self.engine.close()
+
+    def _serve(self, session: zenoh.Session, stop: threading.Event, address: str) -> None:
+        with (
+            session,
+            upkeep(archive_jobs(self.engine, self._config, self._root), self.engine.counts, self._say),
+            self._declared(session),
+        ):
+            self._session = session
+            self._say(f"ready: {self._config.name}, {self.engine.fusion.size} cells from the archive{address}")
+            while not stop.is_set():
+                self._turn(session, stop)
+            self._leave(session)
+
+    def _seen(self) -> AbstractContextManager[str | None]:
+        """Metrics and health, where the settings want them."""
+        config, engine, root = self._config, self.engine, self._root
+
+        def pulse() -> Pulse:
+            routers = len(list(self._session.info.routers_zid())) if self._session else 0
+            return Pulse(time.monotonic() - self._turned_at, len(self.inbox), routers, self._clock.lag() * 1e-9)
+
+        return serving(
+            config.metrics_host, config.metrics_port,
+            lambda: metrics(engine, pulse(), config, root), lambda: troubles(engine, pulse(), config),
+        )  # fmt: skip
+
+    @contextmanager
+    def _declared(self, session: zenoh.Session) -> Iterator[None]:
+        regions = self._config.regions
+        token = session.liveliness().declare_token(keys.shard_key(self._config.name))
+        inputs = [
+            session.declare_subscriber(f"{keys.ROOT}/{kind}/{region}/*", self.inbox.callback(kind))
+            for kind in Kind
+            for region in regions
+        ]
+        inputs += [session.declare_subscriber(f"{keys.ROOT}/weather/{region}", self._weather) for region in regions]
+        queryables = [
+            session.declare_queryable(f"{keys.ROOT}/map/{region}/*", self._replies, complete=True) for region in regions
+        ]
+        queryables += [
+            session.declare_queryable(f"{keys.ROOT}/alert/{region}/*", self._standing, complete=True)
+            for region in regions
+        ]
+        try:
+            yield
+        finally:
+            for subscriber in inputs:
+                subscriber.undeclare()
+            for queryable in queryables:
+                queryable.undeclare()
+            token.undeclare()
+
+    def _standing(self, asked: zenoh.Query) -> None:
+        """Tell who came late which alerts stand."""
+        expression = asked.key_expr
+        with asked:
+            for tile, alerts in self.engine.standing(
+                lambda tile: expression.intersects(zenoh.KeyExpr(keys.alert_key(tile)))
+            ):
+                asked.reply(keys.alert_key(tile), alerts, encoding=wire.STANDING_ENCODING)
+
+    def _weather(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            heard = Heard(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding))
+            self.engine.weather.hear(heard)
+
+    def _turn(self, session: zenoh.Session, stop: threading.Event) -> None:
+        if self.engine.full:
+            stop.wait(IDLE_S)
+        else:
+            self._take(session, self.inbox.drain(IDLE_S))
+        now = self._turned_at = time.monotonic()
+        self._acknowledge(session, self.engine.written())
+        if now - self._flushed_at >= self._config.segment_s:
+            self._flushed_at = now
+            self._acknowledge(session, self.engine.begin_flush())
+            self.engine.overcast(self._clock.now())
+        if now - self._put_at >= self._config.put_s:
+            self._put_at = now
+            self._put_alerts(session, self.engine.fading(self._clock.now()))
+            self._put_tiles(session)
+        if now - self._said_at >= STATUS_S:
+            self._status(now)
+
+    def _leave(self, session: zenoh.Session) -> None:
+        """Take what is waiting, as far as LEAVE_S allows, and settle it; the rest its senders keep."""
+        deadline = time.monotonic() + LEAVE_S
+        while not self.engine.full and time.monotonic() < deadline:
+            messages = self.inbox.drain(0.0)
+            if not messages:
+                break
+            self._take(session, messages)
+        self._acknowledge(session, self.engine.flush())
+        self._put_tiles(session)
+        self._status(time.monotonic())
+
+    def _take(self, session: zenoh.Session, messages: list[Message]) -> None:
+        if messages:
+            self._put_alerts(session, self.engine.take(messages, self._clock.now(), self._clock.slack()))
+
+    def _acknowledge(self, session: zenoh.Session, acks: list[tuple[str, bytes]]) -> None:
+        for vehicle, ack in acks:
+            put(session, keys.ack_key(vehicle), ack, wire.ACK_ENCODING)
+
+    def _put_tiles(self, session: zenoh.Session) -> None:
+        for tile, stream in self.engine.tiles(self._clock.now()):
+            put(session, keys.map_key(tile), stream, wire.ARROW)
+
+    def _put_alerts(self, session: zenoh.Session, alerts: list[Alert]) -> None:
+        for alert in alerts:
+            put(session, keys.alert_key(int(grid.tile_of(alert.cell))), wire.encode_alert(alert), wire.ALERT_ENCODING)
+
+    def _status(self, now: float) -> None:
+        counts = self.engine.counts
+        rate = (counts[Kind.OBSERVATION] - self._said) / max(now - self._said_at, 1e-9)
+        self._said_at, self._said = now, counts[Kind.OBSERVATION]
+        behind = self._clock.lag() * 1e-9
+        rest = ", ".join(f"{name} {n}" for name, n in sorted(counts.items()) if n and name not in set(Kind))
+        text = (
+            f"status: {counts[Kind.OBSERVATION]} observations ({rate:.0f}/s), {counts[Kind.STATE]} states, "
+            f"{self.engine.fusion.size} cells, {self.engine.alerts} alerts, queue {len(self.inbox)}"
+            + (f"; {rest}" if rest else "")
+            + (f"; the system's clock is {behind:.0f} s behind" if behind >= LAG_S else "")
+        )
+        self._say(Line(text, cells=self.engine.fusion.size, queue=len(self.inbox), counts=dict(counts)))
+
+    def _answer(self, wanted: MapQuery, near: Callable[[int], bool], only: int | None) -> Iterator[tuple[int, bytes]]:
+        return self.engine.answer(wanted, near, self._clock.now(), only)
+
+
+def put(session: zenoh.Session, key: str, payload: bytes, encoding: str) -> None:
+    """Put with the quality of service of the key's topic."""
+    topic = keys.parse(key).topic
+    congestion = zenoh.CongestionControl.BLOCK if topic.block else zenoh.CongestionControl.DROP
+    session.put(
+        key, payload, encoding=encoding, priority=getattr(zenoh.Priority, topic.priority), congestion_control=congestion
+    )

@@ -1,0 +1,69 @@
+"""`fleet-service analyze`: one of the questions, on a part of an archive, in the terminal and as a file."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from fleet_service.analytics.options import Options
+from fleet_service.analytics.questions import QUESTIONS
+from fleet_service.cli.archive import add_part, moment
+from schemas.errors import InputError
+
+if TYPE_CHECKING:
+    from fleet_service.cli.archive import Commands
+
+ENDINGS: Final = (".parquet", ".geo.parquet", ".geojson", ".csv", ".png", ".svg", ".html")
+
+
+def add_command(commands: Commands) -> None:
+    """Declare it."""
+    about = "; ".join(f"{question.name}: {question.about}" for question in QUESTIONS.values())
+    analyze = commands.add_parser("analyze", help="ask the archive: " + ", ".join(QUESTIONS), description=about)
+    analyze.add_argument("question", metavar="NAME", help=" | ".join(QUESTIONS))
+    analyze.add_argument("--archive", metavar="DIR", type=Path, required=True, help="compacted files are read")
+    add_part(analyze)
+    analyze.add_argument("--out", metavar="FILE", type=Path, help=f"ends in {', '.join(ENDINGS)}")
+    analyze.add_argument("--engine", default="duckdb", metavar="duckdb|spark", help="default %(default)s")
+    analyze.add_argument("--at", metavar="TIME", help="before-after: of the treatment; replay: of the map")
+    analyze.add_argument("--stations", metavar="FILE", type=Path, help="weather: readings, CSV or Parquet")
+    analyze.add_argument("--step", metavar="SECONDS", type=float, default=0.0, help="replay: between frames")
+    analyze.add_argument("--min-vehicles", metavar="K", type=int, default=2, help="worst, spells: default %(default)s")
+    analyze.set_defaults(command=_analyze)
+
+
+def _analyze(arguments: argparse.Namespace) -> int:
+    question = QUESTIONS.get(arguments.question)
+    if question is None:
+        raise InputError("question", f"{arguments.question!r} is none", f"use one of {', '.join(QUESTIONS)}")
+    if arguments.out is not None and arguments.out.suffix not in ENDINGS:
+        raise InputError("out", f"{arguments.out.name} has no known ending", f"use one of {', '.join(ENDINGS)}")
+    from fleet_service.analytics import engines, output
+    from fleet_service.archive.export import Part
+    from schemas import query
+
+    if arguments.engine not in engines.ENGINES:
+        raise InputError("engine", f"{arguments.engine!r} is none", f"use one of {', '.join(engines.ENGINES)}")
+    bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
+    now = time.time_ns()
+    part = Part(moment(arguments.since, "from", 0), moment(arguments.until, "to", now), bbox)
+    engine = engines.Engine(arguments.engine, arguments.archive, part, progress=sys.stderr.isatty())
+    at = moment(arguments.at, "at", -1)
+    options = Options(
+        at=None if at < 0 else at, stations=arguments.stations, least_vehicles=arguments.min_vehicles,
+        step_s=arguments.step, say=_say,
+    )  # fmt: skip
+    _say(f"{question.name}: {len(engine.files('observations'))} files, {engine.rows():,} observations")
+    found = question.ask(engine, options)
+    print(output.text(found, question))
+    if arguments.out is not None:
+        output.write(found, question, arguments.out)
+        _say(f"written: {arguments.out}")
+    return 0
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)

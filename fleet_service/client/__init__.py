@@ -1,0 +1,1 @@
+"""Asking the map and watching it, as a third party would."""

@@ -1,0 +1,1 @@
+"""Messages in: queue, rate limits, validation, dedup, acknowledgements; weather."""

@@ -1,0 +1,80 @@
+"""Acknowledgements: settled sequence numbers, gathered per vehicle and stream, as messages."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from typing import Final
+
+from fleet_service.ingest.dedup import BatchId, Stream
+from schemas.wire import Kind, StreamAck, encode_ack
+from schemas.wire.batches import Head
+
+# A message is never larger than its receiver reads (wire.MAX_BYTES): 16 streams of 24 refusals of 150 bytes.
+STREAMS_PER_ACK: Final = 16
+ITEMS_PER_STREAM: Final = 24
+AckedStream = tuple[int, Kind, int]  # boot, kind, region
+
+
+class Acks:
+    """What is to be told to whom."""
+
+    def __init__(self) -> None:
+        self._durable: dict[Stream, list[int]] = defaultdict(list)
+        self._rejected: dict[str, dict[AckedStream, list[tuple[int, int, str]]]] = defaultdict(
+            lambda: defaultdict(list)
+        )
+
+    def durable(self, batches: Iterable[BatchId]) -> None:
+        """The batches are on disk."""
+        durable = self._durable
+        for stream, seq in batches:
+            durable[stream].append(seq)
+
+    def rejected(self, vehicle: str, batch: Head, row: int, reason: str) -> None:
+        """The batch was refused for good."""
+        self._rejected[vehicle][batch.boot, batch.kind, batch.region].append((batch.seq, row, reason))
+
+    def messages(self) -> list[tuple[str, bytes]]:
+        """Vehicle and `Ack` bytes of everything gathered; starts anew."""
+        told: dict[str, dict[AckedStream, list[int]]] = {vehicle: {} for vehicle in self._rejected}
+        for stream, seqs in self._durable.items():
+            told.setdefault(stream.vehicle, {}).setdefault(stream.key[1:], []).extend(seqs)
+        out = []
+        for vehicle, durable in sorted(told.items()):
+            rejected = self._rejected.get(vehicle, {})
+            streams = [
+                part
+                for stream in sorted(durable.keys() | rejected.keys())
+                for part in _parts(stream, ranges(durable.get(stream, ())), tuple(rejected.get(stream, ())))
+            ]
+            out += [
+                (vehicle, encode_ack(vehicle, streams[at : at + STREAMS_PER_ACK]))
+                for at in range(0, len(streams), STREAMS_PER_ACK)
+            ]
+        self._durable.clear()
+        self._rejected.clear()
+        return out
+
+
+def _parts(
+    stream: AckedStream, durable: tuple[tuple[int, int], ...], rejected: tuple[tuple[int, int, str], ...]
+) -> Iterator[StreamAck]:
+    """What is to be told about a stream, in pieces."""
+    for at in range(0, max(len(durable), len(rejected)), ITEMS_PER_STREAM):
+        some = slice(at, at + ITEMS_PER_STREAM)
+        yield StreamAck(*stream, durable[some], rejected[some])
+
+
+def ranges(numbers: Iterable[int]) -> tuple[tuple[int, int], ...]:
+    """Runs of consecutive numbers, each of which may come more than once; both ends included."""
+    ordered = sorted(set(numbers))
+    if ordered and ordered[-1] - ordered[0] == len(ordered) - 1:  # as most often
+        return ((ordered[0], ordered[-1]),)
+    out: list[tuple[int, int]] = []
+    for n in ordered:
+        if out and out[-1][1] == n - 1:
+            out[-1] = (out[-1][0], n)
+        else:
+            out.append((n, n))
+    return tuple(out)

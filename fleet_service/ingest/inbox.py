@@ -1,0 +1,260 @@
+"""Messages in: a bounded queue behind the Zenoh subscribers, and the way from bytes to admitted rows.
+
+The subscriber's callback only copies bytes into the queue. When the queue is full the message is dropped and counted;
+it is not acknowledged, so that its sender keeps it and sends it again: that is the back-pressure.
+"""
+
+from __future__ import annotations
+
+import queue
+from collections import Counter
+from collections.abc import Callable, Sequence
+from itertools import compress
+from time import sleep
+from typing import Final, NamedTuple
+
+import numpy as np
+import zenoh
+
+from fleet_service.archive.pseudonyms import Pseudonyms, number, texts
+from fleet_service.archive.segments import Rows, stepped
+from fleet_service.ingest import validation
+from fleet_service.ingest.acks import Acks
+from fleet_service.ingest.dedup import BatchId, Stream, Streams
+from fleet_service.ingest.rate_limit import Limits
+from fleet_service.ingest.validation import Clock, Refusal
+from schemas.grid import cell_of
+from schemas.numeric import BoolArray, IntArray
+from schemas.runtime.batch_decoder import decode_many
+from schemas.wire import Kind
+from schemas.wire.batches import Decoded, Head, Heads
+
+FIRST_TIME: Final = {Kind.OBSERVATION: "enter_time", Kind.STATE: "time"}  # by which a batch is too old
+# Of a turn of the worker, so that a flood does not delay alerts, answers and segments by more than a moment. Most of
+# the work is by the record, of which 160 bytes are one.
+TURN_MESSAGES: Final = 4096
+TURN_BYTES: Final = 768 * 1024
+# A turn costs as much as a hundred records even if it brings one. So what comes within a moment of the first message is
+# taken with it, unless enough waits already: at 2 000 messages a second that is a fifth of the processor time, and the
+# interpreter is free for answers.
+GATHER_S: Final = 0.01
+GATHERED: Final = 64  # messages
+DAY_NS: Final = 86_400 * 10**9
+FORGET_NS: Final = 600 * 10**9  # between two looks for streams too old to matter
+
+
+class Message(NamedTuple):
+    """One sample of a subscriber."""
+
+    kind: Kind
+    key: str
+    payload: bytes
+    encoding: str
+
+
+class Inbox:
+    """The bounded queue.
+
+    Args:
+        capacity: messages at the most; one more for each further thread of callbacks that puts at the same instant.
+        counts: where drops are counted, under `overload`.
+        limits: who may send how much.
+    """
+
+    def __init__(self, capacity: int, counts: Counter[str], limits: Limits) -> None:
+        self._queue: queue.SimpleQueue[Message] = queue.SimpleQueue()  # without locks in Python, a fifth of the cost
+        self._capacity, self._counts, self._limits = capacity, counts, limits
+
+    def callback(self, kind: Kind) -> Callable[[zenoh.Sample], None]:
+        """The subscriber's callback for one kind."""
+
+        def take(sample: zenoh.Sample) -> None:
+            key, payload = str(sample.key_expr), sample.payload
+            if sample.kind == zenoh.SampleKind.PUT and self._limits.lets(key, len(payload)):
+                self.put(Message(kind, key, payload.to_bytes(), str(sample.encoding)))
+
+        return take
+
+    def put(self, message: Message) -> None:
+        """Enqueue, or drop and count."""
+        if self._queue.qsize() < self._capacity:
+            self._queue.put(message)
+        else:
+            self._counts["overload"] += 1
+
+    def drain(self, wait_s: float) -> list[Message]:
+        """What is there, as much as a turn takes; waits up to `wait_s` for the first, and then a moment for more."""
+        out: list[Message] = []
+        size = 0
+        try:
+            if wait_s > 0:
+                out.append(self._queue.get(timeout=wait_s))
+                if self._queue.qsize() < GATHERED:
+                    sleep(GATHER_S)
+            while len(out) < TURN_MESSAGES and size < TURN_BYTES:
+                out.append(self._queue.get_nowait())
+                size += len(out[-1].payload)
+        except queue.Empty:
+            pass
+        return out
+
+    def __len__(self) -> int:
+        return self._queue.qsize()
+
+
+class Admitted(NamedTuple):
+    """Batches of one kind that were let in, and their rows as the archive wants them (without `late` and `weight`)."""
+
+    batches: list[BatchId]
+    rows: Rows
+
+
+class Intake:
+    """Decodes, asks the questions of `admit`, counts and settles refusals. Python is touched per message, not per row.
+
+    Args:
+        streams: what was admitted before; is brought up to date.
+        pseudonyms: of the vehicles.
+        counts: refusals by rule, under `refused.RULE`, and duplicates.
+        acks: takes the refusals and what is durable already.
+    """
+
+    def __init__(self, streams: Streams, pseudonyms: Pseudonyms, counts: Counter[str], acks: Acks) -> None:
+        self._streams, self._pseudonyms, self._counts, self._acks = streams, pseudonyms, counts, acks
+        self._pending: set[BatchId] = set()  # admitted, not yet on disk
+        self._known: dict[Kind, dict[tuple[str, int, int, int], Stream]] = {kind: {} for kind in Kind}
+        self._forgot = 0
+
+    def admit(self, messages: Sequence[Message], clock: Clock) -> dict[Kind, Admitted]:
+        """Rows of the good and new batches, by kind."""
+        if clock.now - self._forgot > FORGET_NS:
+            self._forgot = clock.now
+            self._streams.forget(clock.now - clock.oldest)
+            for known in self._known.values():
+                known.clear()
+        out = {}
+        for kind in Kind:
+            ours = [m for m in messages if m.kind is kind]
+            if ours and (admitted := self._admit(kind, ours, clock)).batches:
+                out[kind] = admitted
+        return out
+
+    def settled(self, batches: Sequence[BatchId]) -> None:
+        """The batches' rows are on disk: acknowledge them."""
+        self._pending.difference_update(batches)
+        self._acks.durable(batches)
+
+    def _admit(self, kind: Kind, messages: list[Message], clock: Clock) -> Admitted:
+        found_owners = [validation.owner_of(message.key) for message in messages]
+        if None in found_owners:
+            self._count("key", found_owners.count(None))
+            messages = [message for message, owner in zip(messages, found_owners, strict=True) if owner is not None]
+        found = decode_many(kind, [(message.payload, message.encoding) for message in messages])
+        for _, error in found.errors:
+            self._count(error.field)
+        time = found.columns[FIRST_TIME[kind]][np.cumsum(found.sizes) - found.sizes]
+        keyed = [owner for owner in found_owners if owner is not None]
+        owners = keyed if len(found.places) == len(keyed) else [keyed[place] for place in found.places]
+        broken, rules = validation.check_heads(kind, owners, found.heads, time, clock)
+        for place in np.flatnonzero(broken >= 0).tolist():
+            self._refuse(str(owners[place].who), found.heads.at(place), rules[broken[place]])
+        new = self._new(kind, found.heads, time, broken < 0)
+        return self._rows(kind, new, time, found, clock) if new else Admitted([], {})
+
+    def _new(self, kind: Kind, heads: Heads, time: IntArray, good: BoolArray) -> dict[BatchId, int]:
+        """Those of the good batches that were not admitted before, each once, and their places."""
+        out: dict[BatchId, int] = {}
+        numbers = (heads.boot, heads.region, time // DAY_NS, heads.seq, heads.first_held)
+        batches = zip(range(len(good)), heads.vehicle, *(column.tolist() for column in numbers), strict=True)
+        known, pending, again = self._known[kind], self._pending, 0
+        for place, vehicle, boot, region, day, seq, first_held in compress(batches, good.tolist()):
+            name = vehicle, boot, region, day
+            stream = known.get(name) or self._look_up(kind, name, int(time[place]))
+            if stream is None:
+                continue
+            stream.raise_to(first_held)
+            batch = stream, seq
+            if stream.admitted(seq):
+                again += 1
+                if batch not in pending:
+                    self._acks.durable([batch])
+            elif batch in out:
+                again += 1
+            else:
+                out[batch] = place
+        if again:
+            self._counts["duplicates"] += again
+        return out
+
+    def _look_up(self, kind: Kind, name: tuple[str, int, int, int], time: int) -> Stream | None:
+        """The stream of a (vehicle, boot, region, day); None without a key: the vehicle keeps its batch until the disk
+        is well again."""
+        vehicle, boot, region, _ = name
+        try:
+            pseudonym = self._pseudonyms.of(vehicle, time)
+        except OSError:
+            self._counts["key_failures"] += 1
+            return None
+        stream = self._known[kind][name] = self._streams[number(pseudonym), boot, kind, region]
+        stream.vehicle = vehicle
+        return stream
+
+    def _rows(self, kind: Kind, new: dict[BatchId, int], time: IntArray, found: Decoded, clock: Clock) -> Admitted:
+        batches, (rows, heads, sizes) = list(new), _chosen(found, list(new.values()))
+        rows["region"] = np.repeat(heads.region, sizes)
+        broken, rules = validation.check_rows(kind, rows, rows["region"], clock)
+        rows["row"] = np.arange(len(rows["region"]), dtype=np.int32)
+        rows["row"] -= np.repeat((np.cumsum(sizes) - sizes).astype(np.int32), sizes)
+        good = np.ones(len(batches), bool)
+        owner = np.repeat(np.arange(len(batches)), sizes)
+        for index in np.flatnonzero(broken >= 0).tolist():  # only refused rows are visited one by one
+            place = int(owner[index])
+            if good[place]:
+                good[place] = False
+                refusal = rules[broken[index]]._replace(row=int(rows["row"][index]))
+                self._refuse(batches[place][0].vehicle, heads.at(place), refusal)
+        first = time[list(new.values())].tolist()
+        for place, at in compress(enumerate(first), good.tolist()):
+            stream, seq = batches[place]
+            if not stream.admit(seq, at):  # no room to remember it: older ones must come first, it is no rejection
+                self._counts["too_many_gaps"] += 1
+                good[place] = False
+        if not good.all():
+            rows = {name: column[good[owner]] for name, column in rows.items()}
+            batches, heads, sizes = list(compress(batches, good)), heads.take(good), sizes[good]
+        self._pending.update(batches)
+        return Admitted(batches, _named(kind, batches, heads, rows, sizes, clock))
+
+    def _refuse(self, vehicle: str, head: Head, refusal: Refusal) -> None:
+        if refusal.rule != "vehicle":  # else the name in the batch is not the sender's, and nor is the stream
+            self._acks.rejected(vehicle, head, refusal.row, refusal.reason)
+        self._count(refusal.rule)
+
+    def _count(self, rule: str, times: int = 1) -> None:
+        if times:
+            self._counts[f"refused.{rule}"] += times
+
+
+def _chosen(found: Decoded, places: list[int]) -> tuple[Rows, Heads, IntArray]:
+    """Rows, heads and sizes of the batches at these places, which are in order."""
+    rows: Rows = {**found.columns, "told": found.with_likelihood}
+    if len(places) == len(found.sizes):
+        return rows, found.heads, found.sizes
+    kept = np.zeros(len(found.sizes), bool)
+    kept[places] = True
+    mine = np.repeat(kept, found.sizes)
+    return {name: column[mine] for name, column in rows.items()}, found.heads.take(kept), found.sizes[kept]
+
+
+def _named(kind: Kind, batches: list[BatchId], heads: Heads, rows: Rows, sizes: IntArray, clock: Clock) -> Rows:
+    """Rows with what their batches say of themselves, as the archive wants them."""
+    numbers = np.array([stream.key[0] for stream, _ in batches], np.int64)
+    told = {
+        "vehicle": texts(numbers), "vehicle_number": numbers, "estimator": np.array(heads.estimator, np.bytes_),
+        "boot": heads.boot, "seq": heads.seq, "first_held": heads.first_held,
+    }  # fmt: skip
+    rows |= {name: np.repeat(values, sizes) for name, values in told.items()}
+    rows["received_at"] = np.full(len(rows["row"]), clock.now, np.int64)
+    if kind is Kind.STATE:
+        rows["cell"] = cell_of(rows["latitude"], rows["longitude"])
+    return stepped(rows)

@@ -1,0 +1,168 @@
+"""Attacks on the map: what a few can do that the honest vehicles alone would not have let happen.
+
+The attackers of `random`, `shifted_pose` and `flood_one_cell` are enrolled vehicles that were honest, and so trusted,
+until the attack begins. `newcomers` are new names. `replayed` goes through the service's admission: old messages
+again, other vehicles' messages on an own key, and old visits under an own name.
+Counted are cells whose alert differs from that of the same drive without the attack at any minute of it: dry or wet
+ones (μ > CLEARLY_DRY) that are raised, icy ones (μ < CLEARLY_ICY) that are suppressed, with ENOUGH honest excited
+vehicles.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.random import Generator
+
+from fleet_service.app.engine import Engine
+from fleet_service.ingest.inbox import Message
+from fleet_service.lab import agent, town
+from fleet_service.lab.agent import Errors, Told
+from fleet_service.lab.bars import ATTACKS
+from fleet_service.lab.drive import CELL, watch
+from fleet_service.lab.messages import Sent, clock_of, messages, rebadged
+from fleet_service.lab.score import excited_vehicles
+from fleet_service.lab.town import CELLS, LENGTH, Town, Visits
+from schemas.config import ServiceConfig
+from schemas.numeric import BoolArray, FloatArray, IntArray
+
+VEHICLES, ATTACKERS, FLOODERS, NAMES = 60, 6, 3, 40
+BEGIN, MINUTES = 18, 26  # minute in which the attack begins; length of the drive
+FLOOD: Final = 400  # visits of one flooder to its cell
+CLEARLY_DRY, CLEARLY_ICY, ENOUGH = 0.5, 0.25, 5
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A drive before the attack."""
+
+    town: Town
+    visits: Visits
+    counted: BoolArray  # (cells,) with ENOUGH excited vehicles when it begins
+
+
+def drive_of(rng: Generator) -> Drive:
+    """The honest part."""
+    place = town.build(rng, MINUTES, 0.0)
+    visits = town.drive(rng, place, Errors.draw(rng, VEHICLES), MINUTES)
+    return Drive(place, visits, excited_vehicles(visits, place, BEGIN, VEHICLES) >= ENOUGH)
+
+
+def measure(seeds: range) -> dict[str, float]:
+    """Alerts raised or suppressed, summed over the seeds, per attack."""
+    out = dict.fromkeys((f"fusion.attack.{name}" for name in ATTACKS), 0.0)
+    for seed in seeds:
+        rng = np.random.default_rng([seed, 7])
+        drive = drive_of(rng)
+        alone = watch(np.random.default_rng([seed, 8]), drive.visits, MINUTES).alerted
+        for name, attack in VISITS.items():
+            visits = attack(rng, drive)
+            attacked = watch(np.random.default_rng([seed, 8]), visits, MINUTES).alerted
+            out[f"fusion.attack.{name}"] += differing(drive, alone, attacked)
+        out["fusion.attack.replayed"] += replayed(rng, drive)
+    return out
+
+
+def differing(drive: Drive, alone: list[BoolArray], attacked: list[BoolArray]) -> int:
+    """Cells in which the attack raised or suppressed an alert."""
+    raised, suppressed = np.zeros(CELLS, bool), np.zeros(CELLS, bool)
+    for minute in range(BEGIN, MINUTES):
+        raised |= attacked[minute] & ~alone[minute]
+        suppressed |= alone[minute] & ~attacked[minute]
+    mu = drive.town.mu[BEGIN]
+    return int(np.sum(drive.counted & ((raised & (mu > CLEARLY_DRY)) | (suppressed & (mu < CLEARLY_ICY)))))
+
+
+def _attackers(v: Visits, count: int) -> BoolArray:
+    return (v.vehicle < count) & (v.seconds >= 60.0 * BEGIN)
+
+
+def random(rng: Generator, drive: Drive) -> Visits:
+    """Sure values of anything, at every visit."""
+    v = drive.visits
+    claim = rng.uniform(0.05, 1.2, len(v))
+    return _claiming(v, _attackers(v, ATTACKERS), claim)
+
+
+def _claiming(v: Visits, lying: BoolArray, claim: FloatArray) -> Visits:
+    told = Told(
+        v.told.reading, v.told.std, np.where(lying, claim, v.told.used),
+        np.where(lying[:, None], agent.sure(claim), v.told.log_likelihood),
+    )  # fmt: skip
+    return Visits(v.seconds, v.vehicle, v.place, v.mu, v.excited & ~lying, told)
+
+
+def shifted_pose(rng: Generator, drive: Drive) -> Visits:
+    """What they truly learn, told of a place elsewhere in the town."""
+    v = drive.visits
+    moved = (v.place + int(rng.integers(CELLS // 4, 3 * CELLS // 4))) % CELLS
+    return Visits(v.seconds, v.vehicle, np.where(_attackers(v, ATTACKERS), moved, v.place), v.mu, v.excited, v.told)
+
+
+def victims(drive: Drive) -> IntArray:
+    """The driest and the iciest cell that count."""
+    mu = np.where(drive.counted, drive.town.mu[BEGIN], np.nan)
+    return np.array([np.nanargmax(mu), np.nanargmin(mu)])
+
+
+def flood_one_cell(rng: Generator, drive: Drive) -> Visits:
+    """Hundreds of visits a minute: ice on the driest cell, dry on the iciest; the values vary, so as to look new."""
+    count = FLOODERS * FLOOD
+    seconds = rng.uniform(60.0 * BEGIN, 60.0 * MINUTES, count)
+    which = rng.integers(0, 2, count)
+    claim = np.where(which == 0, rng.choice([0.1, 0.3], count), rng.choice([0.7, 1.1], count))
+    return _added(drive.visits, seconds, rng.integers(0, FLOODERS, count), victims(drive)[which], claim)
+
+
+def newcomers(rng: Generator, drive: Drive) -> Visits:
+    """Forty new names that each pass once and agree: ice on the road of the driest cell, dry on that of the iciest."""
+    roads = victims(drive) // LENGTH * LENGTH
+    who, which, along = (a.ravel() for a in np.meshgrid(np.arange(NAMES), np.arange(2), np.arange(LENGTH)))
+    seconds: FloatArray = 60.0 * BEGIN + rng.uniform(0.0, 300.0, NAMES)[who] + 20.0 * which + along
+    claim: FloatArray = np.where(which == 0, 0.2, 0.85)
+    return _added(drive.visits, seconds, VEHICLES + who, roads[which] + along, claim)
+
+
+def _added(v: Visits, seconds: FloatArray, vehicle: IntArray, place: IntArray, claim: FloatArray) -> Visits:
+    std = np.full(len(claim), agent.SURE_STD)
+    told = (claim, std, claim, agent.sure(claim))
+    joined = (np.concatenate([a, b]) for a, b in zip(vars(v.told).values(), told, strict=True))
+    both = Visits(
+        np.append(v.seconds, seconds), np.append(v.vehicle, vehicle), np.append(v.place, place),
+        np.append(v.mu, np.full(len(claim), np.nan)), np.append(v.excited, np.zeros(len(claim), bool)), Told(*joined),
+    )  # fmt: skip
+    return town.take(both, np.argsort(both.seconds, kind="stable"))
+
+
+VISITS: Final[dict[str, Callable[[Generator, Drive], Visits]]] = {
+    "random": random, "shifted_pose": shifted_pose, "flood_one_cell": flood_one_cell, "newcomers": newcomers,
+}  # fmt: skip
+
+
+def replayed(rng: Generator, drive: Drive) -> int:
+    """Every message of the town's first minutes again, as it was, on other keys, and under another name."""
+    sent = messages(drive.visits)
+    at = drive.visits.seconds[[m.last for m in sent]]
+    old = np.flatnonzero(at < 60.0 * BEGIN)
+    again = rng.choice(old, min(len(old), 600), replace=False)
+    forged = [m for k in again.tolist() for m in (sent[k].message, *rebadged(sent[k].message, VEHICLES + k % NAMES))]
+    alone, attacked = _alerted(sent, at, []), _alerted(sent, at, forged)
+    return differing(drive, alone, attacked)
+
+
+def _alerted(sent: list[Sent], at: FloatArray, forged: list[Message]) -> list[BoolArray]:
+    out = []
+    with tempfile.TemporaryDirectory() as folder:
+        engine = Engine(ServiceConfig(), Path(folder))
+        for minute in range(MINUTES):
+            part = [sent[k].message for k in np.flatnonzero((at >= 60.0 * minute) & (at < 60.0 * (minute + 1)))]
+            extra = forged[minute - BEGIN :: MINUTES - BEGIN] if minute >= BEGIN else []
+            engine.take([*part, *extra], clock_of(60.0 * (minute + 1)))
+            out.append(np.isin(engine.fusion.slots_of(CELL, np.zeros(CELLS, np.int64)), engine.alerted))
+        engine.close()
+    return out

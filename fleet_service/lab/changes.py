@@ -1,0 +1,75 @@
+"""Ice that comes and goes on one road of a town: how many excited passes the map needs. Pure."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.random import Generator
+
+from fleet_service.archive.rebuild import observations
+from fleet_service.fusion import Fusion
+from fleet_service.fusion.belief import SLIPPERY_SHARE
+from fleet_service.lab import town
+from fleet_service.lab.agent import Errors
+from fleet_service.lab.drive import CELL, LATENESS_S, rows_of
+from fleet_service.lab.town import LENGTH, Town
+from fleet_service.serve.alerts import CLEAR_BELOW, RAISE_ABOVE
+from schemas.numeric import FloatArray, IntArray
+
+DRY, ICE = 0.85, 0.20
+VEHICLES, MINUTES, CHANGE = 60, 40, 22  # the road changes after so many minutes
+EXCITEMENT: Final = 0.3  # of a pass over the road
+UNREACHED: Final = 99  # passes, where the drive ended before the map had seen it
+
+
+def changing(rng: Generator, before: float, after: float) -> Town:
+    """A town whose first road is `before` and becomes `after`."""
+    drawn = town.build(rng, MINUTES, 0.0)
+    mu, excitement = drawn.mu.copy(), drawn.excitement.copy()
+    mu[:CHANGE, :LENGTH], mu[CHANGE:, :LENGTH], excitement[:LENGTH] = before, after, EXCITEMENT
+    return Town(mu, excitement, drawn.changed, drawn.common)
+
+
+def delays(rng: Generator, before: float, after: float) -> IntArray:
+    """Excited passes over each cell of the road, (LENGTH,), until the map has seen the change.
+
+    Ice is seen when P(μ < .4) > .9; its end, when P(μ < .4) < .1, which ends an alert. A pass is one excited visit that
+    the map heard of the cell, whether or not it was the right cell.
+    """
+    place = changing(rng, before, after)
+    visits = town.drive(rng, place, Errors.draw(rng, VEHICLES), MINUTES)
+    o = observations(rows_of(visits), visits.vehicle)
+    here = (visits.place < LENGTH) & visits.excited & (visits.seconds >= 60.0 * CHANGE)
+    passes, seen = np.zeros(LENGTH, np.int64), np.full(LENGTH, UNREACHED)
+    fusion = Fusion(LATENESS_S)
+    for part in np.split(np.arange(len(visits)), np.flatnonzero(here) + 1):
+        if not len(part) or (seen < UNREACHED).all():
+            continue
+        fusion.fold(o.take(part))
+        if here[part[-1]]:
+            cell = visits.place[part[-1]]
+            passes[cell] += 1
+            if seen[cell] == UNREACHED and _seen(fusion, int(cell), after < before):
+                seen[cell] = passes[cell]
+    return seen
+
+
+def _seen(fusion: Fusion, cell: int, ice: bool) -> bool:
+    slot = fusion.slots_of(CELL[cell : cell + 1], np.zeros(1, np.int64))[0]
+    slippery = float(fusion.believed(np.array([slot]))[0] @ SLIPPERY_SHARE)
+    return slippery > RAISE_ABOVE if ice else slippery < CLEAR_BELOW
+
+
+def measure(seeds: range) -> dict[str, float]:
+    """Medians and 95 % quantiles over the cells of all seeds; and the share of cells after each number of passes."""
+    out: dict[str, float] = {}
+    for name, before, after in (("ice_onset", DRY, ICE), ("ice_end", ICE, DRY)):
+        found: FloatArray = np.concatenate(
+            [delays(np.random.default_rng([seed, 5]), before, after).astype(float) for seed in seeds]
+        )
+        out[f"fusion.{name}.passes.median"] = float(np.median(found))
+        out[f"fusion.{name}.passes.p95"] = float(np.quantile(found, 0.95, method="higher"))
+        for passes in range(1, 16):
+            out[f"fusion.{name}.share_after.{passes}"] = float(np.mean(found <= passes))
+    return out

@@ -1,0 +1,115 @@
+"""Visits through the service's own path: rows as the archive has them → `observations` → `Fusion.fold` → alerts.
+
+Deliveries are as in life: a few rows come late (some beyond the lateness), and some twice; `Streams` drops
+the second ones, as in the service.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.random import Generator
+
+from fleet_service.archive.rebuild import observations
+from fleet_service.fusion import Fusion, Observations
+from fleet_service.ingest.dedup import Streams
+from fleet_service.lab.town import CELLS, NS, START, Visits, cell_numbers
+from fleet_service.serve.alerts import Alerts
+from schemas import grid, mugrid
+from schemas.numeric import BoolArray, FloatArray, IntArray
+from schemas.wire import Kind
+
+LATENESS_S: Final = 120.0
+DELAY_S: Final = 4.0  # mean; a batch waits a second, and the network now and then
+LATE_SHARE, LATE_S = 0.02, 300.0  # ... and some lie in a spool for minutes: up to this long
+TWICE_SHARE: Final = 0.03
+CELL: Final = cell_numbers()
+
+
+def rows_of(v: Visits) -> dict[str, Any]:
+    """Visits as columns of the archive, as far as the fusion reads them; every row is a batch of its own."""
+    n, nan = len(v), np.full(len(v), np.nan, np.float32)
+    cell = CELL[v.place]
+    order = np.lexsort((v.seconds, v.vehicle))
+    seq = np.empty(n, np.int64)
+    first = np.searchsorted(v.vehicle[order], v.vehicle[order])
+    seq[order] = np.arange(n) - first + 1
+    return {
+        "leave_time": START + (v.seconds * NS).astype(np.int64), "cell": cell, "latitude": grid.centre(cell)[0],
+        "sector": np.zeros(n, np.int8),
+        "yaw": np.zeros(n, np.float32), "position_std": np.full(n, 1.5, np.float32), "boot": v.vehicle + 1,
+        "region": grid.region_of(cell), "seq": seq, "row": np.zeros(n, np.int32), "told": np.ones(n, bool),
+        "log_likelihood": mugrid.encode_log_likelihood(v.told.log_likelihood),
+        "mu": nan, "mu_lower": nan, "mu_upper": nan, "mu_utilised": v.told.used.astype(np.float32),
+    }  # fmt: skip
+
+
+def arrivals(rng: Generator, v: Visits) -> tuple[FloatArray, IntArray]:
+    """When each delivery comes [s] and which visit it brings, in order of arrival: some late, some twice."""
+    n = len(v)
+    delay = rng.exponential(DELAY_S, n) + np.where(rng.random(n) < LATE_SHARE, rng.uniform(0.0, LATE_S, n), 0.0)
+    twice = np.flatnonzero(rng.random(n) < TWICE_SHARE)
+    which = np.concatenate([np.arange(n), twice])
+    at = v.seconds[which] + np.concatenate([delay, delay[twice] + rng.exponential(5.0, len(twice))])
+    order = np.argsort(at, kind="stable")
+    return at[order], which[order]
+
+
+def novel(rows: dict[str, Any], vehicle: IntArray, which: IntArray) -> IntArray:
+    """Those deliveries that the service admits: each identity once."""
+    streams, kept = Streams(), []
+    region, boot, seq = rows["region"].tolist(), rows["boot"].tolist(), rows["seq"].tolist()
+    for k, row in enumerate(which.tolist()):
+        stream = streams[int(vehicle[row]), boot[row], Kind.OBSERVATION, region[row]]
+        if not stream.admitted(seq[row]):
+            stream.admit(seq[row])
+            kept.append(k)
+    return np.array(kept, np.int64)
+
+
+@dataclass
+class Watched:
+    """A fusion with its alerts, asked minute by minute; `beliefs` (minutes, cells, 32), `alerted` (minutes, cells)."""
+
+    fusion: Fusion
+    alerts: Alerts
+    beliefs: list[FloatArray] = field(default_factory=list)
+    alerted: list[BoolArray] = field(default_factory=list)
+    late: int = 0
+
+    def snapshot(self, now: int) -> None:
+        """Note what the map says at `now` [ns]."""
+        slots = self.fusion.slots_of(CELL, np.zeros(CELLS, np.int64))
+        known = slots >= 0
+        belief = np.tile(mugrid.PRIOR, (CELLS, 1))
+        belief[known] = self.fusion.beliefs(slots[known], now)
+        self.alerts.faded(now)
+        self.beliefs.append(belief)
+        self.alerted.append(np.isin(slots, list(self.alerts.raised)) & known)
+
+
+def minutes(o: Observations, at: FloatArray, count: int) -> Iterator[Observations]:
+    """The observations that arrive in each minute."""
+    for rows in np.split(np.arange(len(at)), np.searchsorted(at, 60.0 * np.arange(1, count + 1)))[:count]:
+        yield o.take(rows)
+
+
+def watch(rng: Generator, v: Visits, count: int) -> Watched:
+    """Deliver the visits and ask the map after each of `count` minutes."""
+    rows = rows_of(v)
+    at, which = arrivals(rng, v)
+    kept = novel(rows, v.vehicle, which)
+    at, which = at[kept], which[kept]
+    fusion = Fusion(LATENESS_S)
+    watched = Watched(fusion, Alerts(fusion))
+    o = observations(rows, v.vehicle).take(which)
+    for minute, part in enumerate(minutes(o, at, count), 1):
+        if len(part.time):
+            folded = fusion.fold(part)
+            watched.alerts.folded(folded.slots)
+            watched.late += int(folded.late.sum())
+        watched.snapshot(START + minute * 60 * NS)
+    return watched

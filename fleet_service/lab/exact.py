@@ -1,0 +1,89 @@
+"""What must hold to rounding: the order of arrival, the replay from an archive; and what unexcited visits cannot do."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.random import Generator
+
+from fleet_service.app.engine import Engine
+from fleet_service.archive.rebuild import observations
+from fleet_service.fusion import Fusion
+from fleet_service.lab import agent, town
+from fleet_service.lab.agent import Errors
+from fleet_service.lab.drive import CELL, LATENESS_S, rows_of
+from fleet_service.lab.messages import clock_of, messages
+from fleet_service.lab.town import Visits
+from schemas import mugrid
+from schemas.config import ServiceConfig
+from schemas.numeric import FloatArray
+
+VEHICLES, MINUTES = 40, 20
+UNEXCITED: Final = (1, 3, 10, 100, 1000)
+PARTS: Final = 60  # portions in which a shuffled drive comes
+
+
+def difference(a: Fusion, b: Fusion) -> float:
+    """Largest difference of any probability in any cell of two fusions; 1 where one has a cell that the other lacks."""
+    there = b.slots_of(a.cell[: a.size], a.sector[: a.size])
+    if a.size != b.size or (there < 0).any():
+        return 1.0
+    now = int(max(a.live.time[: a.size].max(), b.live.time[: b.size].max()))
+    return float(np.abs(a.beliefs(np.arange(a.size), now) - b.beliefs(there, now)).max())
+
+
+def drive(rng: Generator) -> Visits:
+    """Twenty minutes in a town where some vehicles lie, so that weights differ."""
+    visits = town.drive(rng, town.build(rng, MINUTES, 0.3), Errors.draw(rng, VEHICLES), MINUTES)
+    return town.lied(visits, np.arange(VEHICLES) < VEHICLES // 8, 0.25)
+
+
+def order(rng: Generator) -> float:
+    """In order of time against any order within the lateness."""
+    visits = drive(rng)
+    o = observations(rows_of(visits), visits.vehicle)
+    straight, mixed = Fusion(LATENESS_S), Fusion(LATENESS_S)
+    straight.fold(o)
+    arrival = np.argsort(visits.seconds + rng.uniform(0.0, 0.5 * LATENESS_S, len(visits)))
+    late = sum(int(mixed.fold(o.take(rows)).late.sum()) for rows in np.array_split(arrival, PARTS))
+    return 1.0 if late else difference(straight, mixed)
+
+
+def replay(rng: Generator) -> float:
+    """A service that took messages, some of them late or twice, against one that starts from its archive."""
+    visits = drive(rng)
+    sent = messages(visits)
+    at = visits.seconds[[m.last for m in sent]] + rng.uniform(0.0, 1.5 * LATENESS_S, len(sent))
+    with tempfile.TemporaryDirectory() as folder:
+        engine = Engine(ServiceConfig(), Path(folder))
+        for portion in np.array_split(np.argsort(at), PARTS):
+            now = clock_of(float(at[portion].max()))
+            engine.take([sent[k].message for k in (*portion, *portion[::7])], now)
+            engine.flush()
+        engine.close()
+        again = Engine(ServiceConfig(), Path(folder))
+        again.close()
+        return difference(engine.fusion, again.fusion)
+
+
+def upper_shift(rng: Generator) -> float:
+    """Largest fall of an upper end below the prior's, by any of UNEXCITED numbers of vehicles on any surface."""
+    prior = float(mugrid.quantiles(mugrid.PRIOR, 0.95))
+    worst = -np.inf
+    for vehicles in UNEXCITED:
+        for mu, _, _ in town.SURFACES.values():
+            n = max(vehicles, 200)
+            seconds: FloatArray = np.sort(rng.random(n)) * 3600.0
+            who, along = rng.integers(0, vehicles, n), np.zeros(n, np.int64)
+            shares = agent.shares(rng, np.zeros(n, bool))
+            road: FloatArray = np.full(n, mu)
+            told = agent.tell(rng, Errors.draw(rng, vehicles), who, road, 0.0 * road, shares, agent.noise(rng, along))
+            fusion = Fusion(LATENESS_S)
+            fusion.fold(observations(rows_of(Visits(seconds, who, along, road, along > 0, told)), who))
+            slot = fusion.slots_of(CELL[:1], np.zeros(1, np.int64))
+            belief = fusion.beliefs(slot, int(fusion.live.time[slot[0]]))
+            worst = max(worst, prior - float(mugrid.quantiles(belief, 0.95)[0]))
+    return worst

@@ -1,0 +1,146 @@
+"""Fleets with and without misbehaving vehicles: coverage, error, alerts, and the rules beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from fleet_service.lab import rules, town
+from fleet_service.lab.agent import Errors
+from fleet_service.lab.bars import COUNTS
+from fleet_service.lab.drive import watch
+from fleet_service.lab.score import (
+    LEVELS,
+    Scores,
+    coverage,
+    coverage_by_count,
+    earlier_visits,
+    excited_vehicles,
+    joined,
+    reliability,
+    rmse,
+    safe,
+    snapshots,
+)
+from schemas.numeric import BoolArray, FloatArray
+
+VEHICLES: Final = 60
+CHANGING: Final = 0.1  # share of roads that get another surface during the drive
+DRY, ICY = 0.7, 0.25  # truths that count as dry and as ice
+ENOUGH, EARLIER = 5, 20  # excited vehicles of the cell-minutes that count, and earlier visits of every vehicle
+
+
+class Fleet(NamedTuple):
+    """One campaign: share of vehicles that always claim `claim`; from which minute it counts, and how long it is.
+
+    Vehicles are judged by what they did before, so where some misbehave coverage and error count from `begin` on: by
+    then every vehicle has some 200 visits, a day of a car's life. The rates of alerts count as soon as each vehicle has
+    EARLIER visits, two minutes after the service knew nobody; `…_settled` are those from `begin` on.
+    """
+
+    name: str
+    share: float
+    claim: float
+    begin: int
+    minutes: int
+
+
+FLEETS: Final = (
+    Fleet("clean", 0.0, 0.0, 0, 40),
+    Fleet("mis05", 0.05, 0.25, 18, 40),
+    Fleet("mis15", 0.15, 0.25, 18, 40),
+    Fleet("mis15_dry", 0.15, 0.85, 18, 40),
+    Fleet("mis30_colluding", 0.30, 0.25, 18, 40),
+)
+AT: Final = (5, 10, 20, 30, 40)
+
+
+@dataclass
+class Found:
+    """What a campaign found over its seeds."""
+
+    ours: list[Scores] = field(default_factory=list)
+    theirs: list[list[Scores]] = field(default_factory=lambda: [[] for _ in rules.RULES])
+    false_ice: list[BoolArray] = field(default_factory=list)
+    missed_ice: list[BoolArray] = field(default_factory=list)
+    false_settled: list[BoolArray] = field(default_factory=list)
+    missed_settled: list[BoolArray] = field(default_factory=list)
+
+
+def one(fleet: Fleet, seed: int, found: Found) -> None:
+    """Drive one seed and note what the map said."""
+    rng = np.random.default_rng([seed, 1])
+    place, errors = town.build(rng, fleet.minutes, CHANGING), Errors.draw(rng, VEHICLES)
+    visits = town.drive(rng, place, errors, fleet.minutes)
+    if fleet.share:
+        visits = town.lied(visits, np.arange(VEHICLES) < round(fleet.share * VEHICLES), fleet.claim)
+    watched = watch(rng, visits, fleet.minutes)
+    at = tuple(minute for minute in AT if minute > fleet.begin)
+    found.ours.append(snapshots(watched.beliefs, place, visits, at, VEHICLES))
+    for scores, theirs in zip(rules.scores(visits, place, at, VEHICLES), found.theirs, strict=True):
+        theirs.append(scores)
+    for minute in range(1, fleet.minutes + 1):
+        if earlier_visits(visits, 60.0 * minute, VEHICLES).min() < EARLIER:
+            continue
+        counted = excited_vehicles(visits, place, minute, VEHICLES) >= ENOUGH
+        mu, alerted = place.mu[minute], watched.alerted[minute - 1]
+        dry, icy = alerted[counted & (mu > DRY)], ~alerted[counted & (mu < ICY)]
+        found.false_ice.append(dry)
+        found.missed_ice.append(icy)
+        if minute > fleet.begin:
+            found.false_settled.append(dry)
+            found.missed_settled.append(icy)
+
+
+def measure(seeds: range, tell: Callable[[str], None]) -> dict[str, float]:
+    """All campaigns; `tell` hears the progress."""
+    out: dict[str, float] = {}
+    for fleet in FLEETS:
+        found = Found()
+        for seed in seeds:
+            one(fleet, seed, found)
+        tell(f"{fleet.name}: {len(joined(found.ours).error)} answers")
+        out |= _figures(fleet, found)
+    return out
+
+
+def _figures(fleet: Fleet, found: Found) -> dict[str, float]:
+    ours, out = joined(found.ours), {}
+    name = f"fusion.{fleet.name}"
+    out[f"{name}.rmse"], out[f"{name}.coverage90"], out[f"{name}.safe95"] = rmse(ours), coverage(ours), safe(ours)
+    out[f"{name}.interval_score"] = float(ours.interval.mean())
+    out[f"fusion.false_ice.{fleet.name}"] = _share(found.false_ice)
+    out[f"fusion.missed_ice.{fleet.name}"] = _share(found.missed_ice)
+    out[f"fusion.false_ice_settled.{fleet.name}"] = _share(found.false_settled)
+    out[f"fusion.missed_ice_settled.{fleet.name}"] = _share(found.missed_settled)
+    best = np.inf
+    for rule, scores in zip(rules.RULES, map(joined, found.theirs), strict=True):
+        label = f"rule.{fleet.name}.{rule.replace(' ', '_')}"
+        out |= {f"{label}.rmse": rmse(scores), f"{label}.coverage90": coverage(scores)}
+        out[f"{label}.interval_score"] = float(scores.interval.mean())
+        best = min(best, float(scores.interval.mean()))
+    out[f"fusion.vs_best_rule.{fleet.name}"] = float(ours.interval.mean()) / best
+    if fleet.name == "clean":
+        out |= _curves(ours)
+    if fleet.name == "mis15_dry":
+        out["fusion.missed_ice.mis15"] = out[f"fusion.missed_ice.{fleet.name}"]
+    return out
+
+
+def _curves(ours: Scores) -> dict[str, float]:
+    """Coverage and error by the number of excited vehicles, and the reliability diagram."""
+    out = {f"fusion.clean.coverage90.n{n}": share for n, share in coverage_by_count(ours).items()}
+    for n, end in zip(COUNTS, (*COUNTS[1:], VEHICLES + 1), strict=True):
+        error: FloatArray = ours.error[(ours.vehicles >= n) & (ours.vehicles < end)]
+        out[f"fusion.clean.rmse.n{n}"] = float(np.sqrt(np.mean(error**2))) if len(error) else float("nan")
+    return out | {
+        f"fusion.clean.reliability.{level:.2f}": float(share)
+        for level, share in zip(LEVELS, reliability(ours), strict=True)
+    }
+
+
+def _share(minutes: list[BoolArray]) -> float:
+    return float(np.concatenate(minutes).mean()) if sum(map(len, minutes)) else float("nan")

@@ -1,0 +1,73 @@
+"""Visits as the messages that the service would hear, so that admission judges them as in life."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from fleet_service.ingest.inbox import Message
+from fleet_service.lab.drive import rows_of
+from fleet_service.lab.town import NS, START, Visits
+from schemas import grid, keys, wire
+from schemas.numeric import IntArray
+from schemas.wire import Batch, Kind, decode
+
+BATCH_ROWS = 12  # the cells of one road
+
+
+class Sent(NamedTuple):
+    """A message, and the index of its last visit."""
+
+    message: Message
+    last: int
+
+
+def name_of(vehicle: int) -> str:
+    """Enrolled name of a simulated vehicle."""
+    return f"car-{vehicle:05d}"
+
+
+def clock_of(seconds: float) -> int:
+    """Time of the service [ns] so long after the start."""
+    return START + int(seconds * NS) + NS
+
+
+def messages(v: Visits) -> list[Sent]:
+    """Each vehicle's visits in batches, in order of time per vehicle and region."""
+    rows, out = rows_of(v), []
+    latitude, longitude = grid.centre(rows["cell"])
+    order = np.lexsort((v.seconds, rows["region"], v.vehicle))
+    streams = np.flatnonzero(np.diff(v.vehicle[order]) | np.diff(rows["region"][order])) + 1
+    for stream in np.split(order, streams):
+        for seq, start in enumerate(range(0, len(stream), BATCH_ROWS), 1):
+            out.append(_message(v, rows, latitude, longitude, stream[start : start + BATCH_ROWS], seq))
+    return out
+
+
+def _message(
+    v: Visits, rows: dict[str, np.ndarray], latitude: np.ndarray, longitude: np.ndarray, part: IntArray, seq: int
+) -> Sent:  # fmt: skip
+    n = len(part)
+    columns: dict[str, np.ndarray] = {
+        "enter_time": rows["leave_time"][part] - NS, "leave_time": rows["leave_time"][part],
+        "cell": rows["cell"][part], "sector": rows["sector"][part], "latitude": latitude[part],
+        "longitude": longitude[part], "position_std": np.full(n, 1.5), "yaw": np.zeros(n), "yaw_std": np.full(n, 0.02),
+        "speed": np.full(n, 13.0), "mu_utilised": rows["mu_utilised"][part],
+        "log_likelihood": rows["log_likelihood"][part],
+    }  # fmt: skip
+    vehicle, region = int(v.vehicle[part[0]]), int(rows["region"][part[0]])
+    name = name_of(vehicle)
+    batch = Batch(Kind.OBSERVATION, name, vehicle + 1, region, seq, 1, columns, "synthetic")
+    key = keys.observation_key(region, name)
+    return Sent(Message(Kind.OBSERVATION, key, wire.encode(batch), wire.ENCODING[Kind.OBSERVATION]), int(part[-1]))
+
+
+def rebadged(message: Message, thief: int) -> tuple[Message, Message]:
+    """Another's message on the thief's own key; and its visits in a batch of the thief's own."""
+    batch = decode(message.payload, message.encoding, message.kind)
+    name = name_of(thief)
+    key = keys.observation_key(batch.region, name)
+    own = replace(batch, vehicle=name, boot=thief + 1)
+    return message._replace(key=key), message._replace(key=key, payload=wire.encode(own))

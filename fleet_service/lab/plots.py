@@ -1,0 +1,80 @@
+"""Plots of the campaign, made from its figures and from nothing else. Needs matplotlib (the `demo` extra)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from fleet_service.lab.bars import COUNTS
+from fleet_service.lab.rules import RULES
+from schemas.errors import InputError
+from schemas.runtime.figures import Figure
+
+SIZE = (5.5, 4.2)
+
+
+def draw(found: Sequence[Figure], folder: Path) -> list[Path]:
+    """Write the four plots into `folder`.
+
+    Raises:
+        InputError: matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure as Canvas
+    except ImportError as error:
+        raise InputError("plots", "matplotlib is not installed", "pip install 'gripmap[demo]'") from error
+    values = {figure.name: figure.value for figure in found}
+    paths = []
+    for name, plot in (
+        ("reliability", _reliability), ("rmse", _rmse), ("delay", _delay), ("misbehaving", _misbehaving)
+    ):  # fmt: skip
+        canvas = Canvas(figsize=SIZE, layout="constrained")
+        axes = canvas.subplots()
+        plot(axes, values)
+        paths.append(folder / f"{name}.png")
+        canvas.savefig(paths[-1], dpi=130)
+    return paths
+
+
+def _family(values: Mapping[str, float], prefix: str) -> tuple[list[float], list[float]]:
+    pairs = sorted((float(name.removeprefix(prefix)), v) for name, v in values.items() if name.startswith(prefix))
+    return [x for x, _ in pairs], [y for _, y in pairs]
+
+
+def _reliability(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401 matplotlib has no types here
+    axes.plot([0, 1], [0, 1], color="0.7")
+    axes.plot(*_family(values, "fusion.clean.reliability."), marker="o", markersize=3)
+    axes.set(title="Reliability, honest fleet", xlabel="said: P(μ ≤ x)", ylabel="happened: share of truths ≤ x")
+
+
+def _rmse(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
+    axes.plot(COUNTS, [values.get(f"fusion.clean.rmse.n{n}", float("nan")) for n in COUNTS], marker="o", label="fusion")
+    axes.axhline(0.05, color="0.7", linewidth=1)
+    axes.set(
+        title="Error against excited vehicles", xlabel="excited vehicles of the cell", ylabel="RMSE of the median",
+        xscale="log", ylim=(0, None),
+    )  # fmt: skip
+
+
+def _delay(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
+    for name, label in (("ice_onset", "ice comes: P(μ < .4) > .9"), ("ice_end", "ice goes: alert cleared")):
+        axes.plot(*_family(values, f"fusion.{name}.share_after."), marker="o", markersize=3, label=label)
+    axes.set(title="Detection delay", xlabel="excited passes", ylabel="share of cells", ylim=(0, 1.02))
+    axes.legend()
+
+
+def _misbehaving(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
+    shares = {"clean": 0.0, "mis05": 5.0, "mis15": 15.0, "mis30_colluding": 30.0}
+    axes.plot(shares.values(), [values.get(f"fusion.{n}.rmse", float("nan")) for n in shares], "o-", label="fusion")
+    for rule in RULES:
+        label = rule.replace(" ", "_")
+        axes.plot(
+            shares.values(), [values.get(f"rule.{n}.{label}.rmse", float("nan")) for n in shares], marker=".",
+            linewidth=1, label=rule,
+        )  # fmt: skip
+    axes.set(
+        title="Error against misbehaving vehicles", xlabel="% that always claim .25, sure", ylabel="RMSE of the median",
+        ylim=(0, None),
+    )  # fmt: skip
+    axes.legend(fontsize=7)

@@ -1,0 +1,100 @@
+"""The rules that people would use instead, each a mean and a variance per cell. Pure, compiled.
+
+All of them get what an agent of such a system would send: the *posterior* (m, P) of its own filter, which carries what
+it believed in the cell before. Each lets its variance grow between reports as the fusion's own drift does.
+
+    newest report         the last posterior
+    inverse variance      all posteriors, each sample's: SAMPLES alike ones per pass, information added up
+    one per pass          one posterior per pass, information added up
+    covariance inters.    one per pass, with weights in proportion to information (W. Niehsen, FUSION 2002)
+    federated reset       the cell is the master; local filters start from it, so that only the reading is added
+                          (N. A. Carlson, IEEE Trans. Aerospace and Electronic Systems 26(3), 1990)
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from fleet_service.lab.score import Scores, excited_vehicles, joined, of_intervals
+from fleet_service.lab.town import CELLS, Town, Visits
+from schemas import mugrid
+from schemas.numeric import FloatArray, IntArray
+from schemas.runtime.jit import compiled
+
+RULES: Final = ("newest report", "inverse variance", "one per pass", "covariance intersection", "federated reset")
+SAMPLES: Final = 10  # posteriors that an agent at 10 Hz sends while it is in a cell
+PRIOR_MEAN: Final = 0.5 * (mugrid.LOWER + mugrid.UPPER)
+PRIOR_VAR: Final = (mugrid.UPPER - mugrid.LOWER) ** 2 / 12.0
+ROAD_VAR: Final = 0.05**2  # per cell driven: surfaces change every few cells
+DRIFT_VAR: Final = 0.04**2 / 3600.0  # per second
+_NEWEST, _ALL, _ONE, _INTERSECTION, _FEDERATED = range(5)
+
+
+@compiled
+def posteriors(vehicle: IntArray, reading: FloatArray, std: FloatArray, vehicles: int) -> FloatArray:
+    """(m, P) that each visit's vehicle sends, (n, 2): its filter's, which goes back to the prior along the road."""
+    mean, variance = np.full(vehicles, PRIOR_MEAN), np.full(vehicles, PRIOR_VAR)
+    out = np.empty((len(vehicle), 2))
+    for k in range(len(vehicle)):
+        who = vehicle[k]
+        p = min(variance[who] + ROAD_VAR, PRIOR_VAR)
+        m = mean[who]
+        if np.isfinite(reading[k]):
+            gain = p / (p + std[k] ** 2)
+            m += gain * (reading[k] - m)
+            p *= 1.0 - gain
+        mean[who], variance[who] = m, p
+        out[k, 0], out[k, 1] = m, p
+    return out
+
+
+@compiled
+def fuse(place: IntArray, seconds: FloatArray, sent: FloatArray, reading: FloatArray, std: FloatArray,
+         asked: FloatArray, cells: int) -> FloatArray:  # fmt: skip
+    """Mean and variance per asking time, rule and cell, (times, 5, cells, 2)."""
+    mean, variance = np.full((5, cells), PRIOR_MEAN), np.full((5, cells), PRIOR_VAR)
+    last = np.zeros(cells)
+    out = np.empty((len(asked), 5, cells, 2))
+    k = 0
+    for t in range(len(asked)):
+        while k < len(place) and seconds[k] < asked[t]:
+            cell = place[k]
+            for rule in range(5):
+                variance[rule, cell] = min(variance[rule, cell] + DRIFT_VAR * (seconds[k] - last[cell]), PRIOR_VAR)
+            last[cell] = seconds[k]
+            m, p = sent[k, 0], sent[k, 1]
+            for rule in range(5):
+                own, m0 = 1.0 / variance[rule, cell], mean[rule, cell]
+                added, m1 = 1.0 / p, m
+                if rule == _NEWEST:
+                    own = 0.0
+                elif rule == _ALL:
+                    added *= SAMPLES
+                elif rule == _INTERSECTION:
+                    share = own / (own + added)
+                    own, added = share * own, (1.0 - share) * added
+                elif rule == _FEDERATED:
+                    told = np.isfinite(reading[k])
+                    added, m1 = (1.0 / std[k] ** 2, reading[k]) if told else (0.0, m0)
+                mean[rule, cell] = (own * m0 + added * m1) / (own + added)
+                variance[rule, cell] = 1.0 / (own + added)
+            k += 1
+        out[t, :, :, 0], out[t, :, :, 1] = mean, variance
+    return out
+
+
+def scores(v: Visits, town: Town, at: tuple[int, ...], vehicles: int) -> list[Scores]:
+    """Scores of each of RULES at some minutes, for the cells with an excited vehicle."""
+    sent = posteriors(v.vehicle, v.told.reading, v.told.std, vehicles)
+    asked = 60.0 * np.array(at, float)
+    found = fuse(v.place, v.seconds, sent, v.told.reading, v.told.std, asked, CELLS)
+    out: list[list[Scores]] = [[] for _ in RULES]
+    for k, minute in enumerate(at):
+        n = excited_vehicles(v, town, minute, vehicles)
+        for rule, per_rule in enumerate(out):
+            mean, half = found[k, rule, :, 0], 1.645 * np.sqrt(found[k, rule, :, 1])
+            lower, mid, upper = (np.clip(mean + sign * half, mugrid.LOWER, mugrid.UPPER) for sign in (-1.0, 0.0, 1.0))
+            per_rule.append(of_intervals(lower, mid, upper, town.mu[minute], n, np.full(CELLS, np.nan)).taken(n >= 1))
+    return [joined(per_rule) for per_rule in out]

@@ -1,0 +1,128 @@
+"""A town of roads, cell behind cell, their friction in time, and who drives where and when. Pure.
+
+Every road has stretches of one surface; most passes are unexcited, and where drivers brake or steer is a property of
+the place: a few cells hear many excited vehicles, most hear hardly any. Where all do the same they share an error.
+Fixes are noisy, so that a visit is sometimes told of the cell before or behind.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.random import Generator
+
+from fleet_service.lab import agent
+from fleet_service.lab.agent import Errors, Told
+from schemas import grid
+from schemas.numeric import BoolArray, FloatArray, IntArray
+
+NS: Final = 1_000_000_000
+START: Final = 1_800_000_000 * NS
+ROADS, LENGTH = 10, 12  # cells of a road
+CELLS: Final = ROADS * LENGTH
+STRETCH: Final = 4  # cells of one surface
+SURFACES: Final = {"dry": (0.85, 0.08, 0.45), "wet": (0.55, 0.07, 0.25), "snow": (0.30, 0.04, 0.15),
+                   "ice": (0.15, 0.03, 0.15)}  # mean, spread, share  # fmt: skip
+LEAST, MOST = 0.08, 1.10  # of any road
+DRIFT: Final = 0.03  # per square root of an hour
+ZONE: Final = 6  # cells of one EXCITEMENT: braking from 50 km/h, or a bend, takes some 60 m
+EXCITEMENT: Final = ((0.40, 0.2), (0.08, 0.4), (0.02, 0.4))  # P(a pass is excited), share of such cells
+CELL_M, FIX_STD_M = 10.0, 1.5
+_NORTH, _WEST = 57.70, 11.90
+
+
+def cell_numbers(cells: int = CELLS) -> IntArray:
+    """Quadints of the town's cells, (cells,): each road runs east, the roads lie a few cells apart."""
+    x, y = grid.deinterleave(grid.cell_of(_NORTH, _WEST))
+    k = np.arange(cells)
+    return grid.interleave(x + k % LENGTH, y + 3 * (k // LENGTH))
+
+
+@dataclass(frozen=True)
+class Town:
+    """Friction (minutes + 1, cells) at the beginning of each minute, P(a pass is excited) (cells,), the minute of
+    each cell's change of surface (cells,), infinite without one, and the vehicles' common error (cells,)."""
+
+    mu: FloatArray
+    excitement: FloatArray
+    changed: FloatArray
+    common: FloatArray
+
+    def at(self, seconds: FloatArray, place: IntArray) -> FloatArray:
+        """Friction at a time and place, (n,)."""
+        return np.asarray(self.mu[np.minimum((seconds // 60.0).astype(np.int64), len(self.mu) - 1), place])
+
+
+def build(rng: Generator, minutes: int, changing: float) -> Town:
+    """Draw a town. `changing` is the share of roads that get another surface at some minute."""
+    names, share = list(SURFACES.values()), [s[2] for s in SURFACES.values()]
+    stretches = CELLS // STRETCH
+
+    def surface() -> FloatArray:
+        drawn = rng.choice(len(names), stretches, p=share)
+        mean, spread = (np.array([n[k] for n in names])[drawn] for k in (0, 1))
+        return np.repeat(mean + spread * rng.normal(size=stretches), STRETCH)
+
+    steps = DRIFT * np.sqrt(1 / 60) * np.vstack([np.zeros(stretches), rng.normal(size=(minutes, stretches))])
+    before, after = surface(), surface()
+    change = np.where(rng.random(ROADS) < changing, rng.uniform(0.2, 0.8, ROADS) * minutes, np.inf).repeat(LENGTH)
+    now = np.where(np.arange(minutes + 1)[:, None] < change, before, after)
+    classes, weights = zip(*EXCITEMENT, strict=True)
+    excitement = np.repeat(rng.choice(classes, CELLS // ZONE, p=weights), ZONE)
+    mu = np.clip(now + np.repeat(steps.cumsum(axis=0), STRETCH, axis=1), LEAST, MOST)
+    common = np.repeat(agent.COMMON * rng.spawn(1)[0].normal(size=CELLS // ZONE), ZONE)  # same towns with and without
+    return Town(mu, excitement, np.ceil(change), common)
+
+
+@dataclass(frozen=True)
+class Visits:
+    """Visits in order of time, (n,): seconds since the start, vehicle, place told, true μ, whether excited, what."""
+
+    seconds: FloatArray
+    vehicle: IntArray
+    place: IntArray
+    mu: FloatArray
+    excited: BoolArray
+    told: Told
+
+    def __len__(self) -> int:
+        return len(self.seconds)
+
+
+def drive(rng: Generator, town: Town, errors: Errors, minutes: float, roads_per_minute: float = 1.0) -> Visits:
+    """Let a fleet drive: each vehicle passes whole roads, `roads_per_minute` on average, at random times."""
+    vehicles = len(errors.slope)
+    passes = rng.poisson(vehicles * minutes * roads_per_minute)
+    begin, who = rng.random(passes) * minutes * 60.0, rng.integers(0, vehicles, passes)
+    along = np.tile(np.arange(LENGTH), passes)
+    seconds = np.repeat(begin, LENGTH) + along
+    vehicle, place = np.repeat(who, LENGTH), np.repeat(rng.integers(0, ROADS, passes) * LENGTH, LENGTH) + along
+    excited = rng.random(len(place)) < town.excitement[place]
+    mu = town.at(seconds, place)
+    shares, noise = agent.shares(rng, excited), agent.noise(rng, along)
+    told = agent.tell(rng, errors, vehicle, mu, town.common[place], shares, noise)
+    offset = rng.uniform(0.0, CELL_M, len(place)) + FIX_STD_M * rng.normal(size=len(place))
+    told_at = place + np.clip(np.floor(offset / CELL_M).astype(np.int64), -1, 1)
+    told_place = np.where(told_at // LENGTH == place // LENGTH, told_at, place)
+    order = np.argsort(seconds, kind="stable")
+    visits = Visits(seconds, vehicle, told_place, mu, excited, told)
+    return take(visits, order)
+
+
+def take(v: Visits, rows: IntArray | BoolArray) -> Visits:
+    """Some of the visits."""
+    told = Told(v.told.reading[rows], v.told.std[rows], v.told.used[rows], v.told.log_likelihood[rows])
+    return Visits(v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], told)
+
+
+def lied(v: Visits, liars: BoolArray, claim: float) -> Visits:
+    """The visits with those of `liars` (V,) claiming `claim`, sure, at every visit."""
+    lying = liars[v.vehicle]
+    readings = np.where(lying, claim, v.told.reading)
+    told = Told(
+        readings, np.where(lying, agent.SURE_STD, v.told.std), np.where(lying, claim, v.told.used),
+        np.where(lying[:, None], agent.sure(claim), v.told.log_likelihood),
+    )  # fmt: skip
+    return Visits(v.seconds, v.vehicle, v.place, v.mu, v.excited & ~lying, told)

@@ -1,0 +1,1 @@
+"""The map out: cells, tiles, queries, alerts."""

@@ -1,0 +1,97 @@
+"""What a running service does for its archive beside its work."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from fleet_service.app.engine import Engine
+from fleet_service.app.jobs import Job, archive_jobs, upkeep
+from fleet_service.archive.compaction import compacting
+from fleet_service.cli import main
+from fleet_service.ingest.inbox import Message
+from schemas import wire
+from schemas.config import ServiceConfig, ZenohSettings
+from schemas.errors import InputError
+from schemas.wire import Kind
+from tests.fleet_service.app.test_service import Fleet, now
+from tests.fleet_service.archive.rows import identities
+from tests.fleet_service.conftest import running
+from tests.fleet_service.examples import batch, key
+from tests.waiting import until
+
+
+def test_a_running_service_compacts_and_keeps_every_row_once(
+    router: ZenohSettings, session: zenoh.Session, tmp_path: Path
+) -> None:
+    moment = now()
+    with running(router, tmp_path, compact_s=0.05) as run:
+        fleet = Fleet(session).meet()
+        for seq in range(1, 11):
+            fleet.settle(*(batch(f"sim-{k:03}", seq, moment, [0.8]) for k in range(3)))
+        until(lambda: not list((tmp_path / "inbox").glob("*.parquet")))
+        until(lambda: any(line.startswith("compacted: ") for line in run.lines))
+    assert len(set(identities(tmp_path, Kind.OBSERVATION))) == len(identities(tmp_path, Kind.OBSERVATION)) == 30
+    with running(router, tmp_path) as again:
+        assert again.service.engine.fusion.live.visits[0] == 30
+        assert main(["compact", "--archive", str(tmp_path)]) == 0  # beside it
+
+
+def test_a_job_that_fails_is_counted_said_and_done_again(tmp_path: Path) -> None:
+    turns: list[int] = []
+
+    def work(stop: threading.Event) -> str | None:
+        turns.append(1)
+        if len(turns) == 1:
+            raise OSError("no disk")
+        return "well" if len(turns) == 2 else None
+
+    counts: Counter[str] = Counter()
+    lines: list[str] = []
+    with upkeep([Job("mending", 0.001, work)], counts, lines.append):
+        until(lambda: len(turns) > 2)
+    assert counts["mending_failures"] == 1
+    assert lines == ["mending failed: no disk", "well"]
+
+
+def test_a_job_of_no_interval_is_never_done(tmp_path: Path) -> None:
+    done: Callable[[threading.Event], str | None] = lambda _: "done"  # noqa: E731
+    lines: list[str] = []
+    with upkeep([Job("never", 0.0, done)], Counter(), lines.append):
+        pass
+    assert not lines
+
+
+def test_the_command_says_when_another_compacts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with compacting(tmp_path):
+        assert main(["compact", "--archive", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.startswith("error: archive: ")
+
+
+def test_rounds_of_no_rows_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compact", "--archive", str(tmp_path), "--round-rows", "0"]) == 2
+    assert capsys.readouterr().err.startswith("error: round-rows: ")
+
+
+def test_a_compaction_that_fails_is_said_and_one_that_runs_is_stopped_with_the_service(tmp_path: Path) -> None:
+    engine = Engine(ServiceConfig(), tmp_path)
+    with closing(engine):
+        engine.take(
+            [Message(Kind.OBSERVATION, key("sim-001"), wire.encode(batch("sim-001", 1, now(), [0.8])), "")], now()
+        )
+        engine.flush()
+        compaction, *_ = archive_jobs(engine, ServiceConfig(), tmp_path)
+        with compacting(tmp_path), pytest.raises(InputError, match="being compacted"):
+            compaction.work(threading.Event())
+        stopped = threading.Event()
+        stopped.set()
+        assert compaction.work(stopped) is None
+        assert list((tmp_path / "inbox").glob("*.parquet"))
+        assert (compaction.work(threading.Event()) or "").startswith("compacted: 1 rows of 1 segments")
+        assert compaction.work(threading.Event()) is None

@@ -1,0 +1,83 @@
+"""Kill -9 of the service while vehicles publish: every acknowledged batch is kept, none twice."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import zenoh
+
+from fleet_service.archive import reading
+from schemas.config import ZenohSettings
+from schemas.wire import Kind
+from tests.fleet_service.app.test_service import Fleet
+from tests.fleet_service.examples import SECOND, batch
+from tests.waiting import until
+
+VEHICLES, BATCHES, KILLS = 6, 60, 3
+
+
+@contextmanager
+def service(router: ZenohSettings, folder: Path) -> Iterator[subprocess.Popen[str]]:
+    """A service process that is ready; it is gone after the block."""
+    config = folder / "service.json"
+    config.write_text(json.dumps({"zenoh": {"connect": router.connect}, "segment_s": 0.05}))
+    words = ["run", "--config", str(config), "--archive", str(folder / "archive")]
+    process = subprocess.Popen([sys.executable, "-m", "fleet_service.cli", *words], stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("ready: ")
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_a_killed_service_keeps_what_it_acknowledged_and_counts_nothing_twice(
+    router: ZenohSettings, session: zenoh.Session, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(7)
+    sent = [
+        batch(f"sim-{vehicle:03}", seq, time.time_ns() - SECOND, [0.8, 0.7, 0.6])
+        for seq in range(1, BATCHES + 1)
+        for vehicle in range(VEHICLES)
+    ]
+    fleet = Fleet(session)
+    for turn in range(KILLS + 1):
+        with service(router, tmp_path) as process:
+            waiting = fleet.unsettled(sent)
+            left = 0 if turn == KILLS else len(waiting) - int(rng.integers(1, len(waiting) // 2))
+
+            def few_enough(left: int = left) -> bool:
+                for one in fleet.unsettled(sent)[:20]:
+                    fleet.publish(one)
+                return len(fleet.unsettled(sent)) <= left
+
+            until(few_enough)
+            for one in fleet.unsettled(sent):
+                fleet.publish(one)
+            if turn == KILLS:
+                process.terminate()
+                assert process.wait(10) == 0
+        held = archived(tmp_path)
+        assert all(one in held for one in identities(fleet))
+    assert len(held) == len(set(held)) == 3 * len(sent)
+
+
+def identities(fleet: Fleet) -> list[tuple[int, int, int]]:
+    """Boot, seq and row of everything acknowledged."""
+    boots = {f"sim-{vehicle:03}": batch(f"sim-{vehicle:03}", 1, 0, [0.8]).boot for vehicle in range(VEHICLES)}
+    return [(boots[v], seq, row) for v, seqs in list(fleet.durable.items()) for seq in list(seqs) for row in range(3)]
+
+
+def archived(folder: Path) -> list[tuple[int, int, int]]:
+    """Boot, seq and row of everything in the segments."""
+    table = pa.concat_tables(reading.read(folder / "archive", Kind.OBSERVATION, ["boot", "seq", "row"]))
+    return list(zip(*(table[name].to_pylist() for name in ("boot", "seq", "row")), strict=True))

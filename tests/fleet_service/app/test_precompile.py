@@ -1,0 +1,71 @@
+"""Nothing is compiled any more once the service is ready: vehicles would wait for it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from fleet_service.app import precompile
+
+SCRIPT = """
+import gc, pathlib, tempfile, time
+from numba.core.dispatcher import Dispatcher
+from fleet_service.app.engine import Engine
+from fleet_service.ingest.inbox import Message
+from fleet_service.app.precompile import warm_up
+from schemas import keys, wire
+from schemas.config import ServiceConfig
+from schemas.query import MapQuery
+from tests.faults.load import visits
+import numpy as np
+
+def kernels():
+    found = [d for d in gc.get_objects() if isinstance(d, Dispatcher)]
+    ours = [d for d in found if d.py_func.__module__.startswith("fleet_service")]
+    return {(d.py_func.__name__, str(signature)) for d in ours for signature in d.signatures}
+
+def drive(root):
+    engine = Engine(ServiceConfig(), root)
+    columns = visits(np.random.default_rng(0), np.zeros(8000, np.int64), time.time_ns(), 256).columns
+    home = columns["cell"] >> 22
+    mine = np.flatnonzero(home == home[0])
+    for seq, part in enumerate(np.array_split(mine, len(mine) // 40), 1):
+        taken = {name: column[part] for name, column in columns.items()}
+        batch = wire.Batch(wire.Kind.OBSERVATION, "sim-001", seq, int(home[0]), seq, 1, taken, "test")
+        key, encoding = keys.observation_key(int(home[0]), "sim-001"), wire.ENCODING[batch.kind]
+        engine.take([Message(batch.kind, key, wire.encode(batch), encoding)], time.time_ns())
+    engine.flush()
+    engine.tiles(time.time_ns())
+    engine.fading(time.time_ns())
+    list(engine.answer(MapQuery(), lambda tile: True, time.time_ns()))
+    assert engine.fusion.size > 2100, engine.counts
+    engine.close()
+
+warm_up()
+warm = kernels()
+root = pathlib.Path(tempfile.mkdtemp())
+drive(root)
+drive(root)
+print(sorted(kernels() - warm))
+"""
+
+
+def test_a_ready_service_compiles_nothing() -> None:
+    heard = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=False)
+    assert heard.stdout.strip() == "[]", heard.stdout + heard.stderr
+
+
+def test_what_was_never_compiled_is_compiled_by_a_process_of_its_own_and_once(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    ran = tmp_path / "ran"
+    monkeypatch.setattr(precompile, "kernel_cache", lambda package: str(tmp_path / package))
+    monkeypatch.setattr(precompile, "COMPILE", "raise SystemExit(1)")
+    precompile.warm_up()
+    monkeypatch.setattr(precompile, "COMPILE", f"open({str(ran)!r}, 'a').write('once')")
+    for _ in range(3):
+        precompile.warm_up()
+    assert ran.read_text() == "once"

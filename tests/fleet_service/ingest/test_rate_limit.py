@@ -1,0 +1,134 @@
+"""Who is listened to, and how much: buckets against the clock, names that are made up, long acknowledgements."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from fleet_service.ingest import rate_limit
+from fleet_service.ingest.acks import Acks
+from fleet_service.ingest.dedup import Stream
+from fleet_service.ingest.rate_limit import LEAST_BYTES, Limits
+from schemas import wire
+from schemas.config import ServiceConfig, ZenohSettings
+from schemas.errors import InputError
+from schemas.wire import Kind
+from schemas.wire.batches import Head
+from tests.fleet_service.conftest import running
+from tests.fleet_service.examples import SECOND, batch, key
+from tests.secured import enrolment
+from tests.waiting import matched, until
+
+RATE, BURST = 10_000.0, 50_000.0
+
+
+class Clock:
+    """A clock that is set by hand."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def buckets(clock: Clock, known: set[str] | None = None) -> tuple[Limits, Counter[str]]:
+    counts: Counter[str] = Counter()
+    return Limits(RATE, BURST, known, counts, clock), counts
+
+
+def test_a_vehicle_may_send_a_burst_and_then_its_rate() -> None:
+    clock = Clock()
+    found, counts = buckets(clock)
+    assert sum(found.lets("obs/a", 5_000) for _ in range(100)) == BURST / 5_000
+    clock.now = 2.0
+    assert sum(found.lets("obs/a", 5_000) for _ in range(100)) == 2 * RATE / 5_000
+    assert counts == {"limited": 200 - 10 - 4}
+
+
+def test_small_messages_cost_what_it_takes_to_read_one() -> None:
+    found, _ = buckets(Clock())
+    assert sum(found.lets("obs/a", 1) for _ in range(1000)) == BURST // LEAST_BYTES
+
+
+def test_one_that_sends_too_much_takes_nothing_from_the_others() -> None:
+    found, _ = buckets(Clock())
+    for _ in range(1000):
+        found.lets("obs/1202/310/232/loud", 60_000)
+    assert found.lets("obs/1202/310/232/quiet", 300)
+
+
+def test_who_is_not_enrolled_is_not_looked_at() -> None:
+    found, counts = buckets(Clock(), {"car-1"})
+    assert found.lets("obs/1202/310/232/car-1", 300)
+    assert not any(found.lets(f"obs/1202/310/232/{name}", 300) for name in ("car-2", "**", ""))
+    assert counts == {"refused.unknown": 3}
+    assert len(found) == 1
+
+
+def test_names_that_are_made_up_share_one_bucket_and_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rate_limit, "MOST_NAMES", 100)
+    clock = Clock()
+    found, _ = buckets(clock)
+    through = sum(found.lets(f"obs/made-up-{number}", int(BURST)) for number in range(10_000))
+    assert through == 101
+    assert len(found) == 101
+    clock.now = BURST / RATE
+    assert found.lets("obs/after-a-while", 300), "buckets that are full again are forgotten"
+    assert len(found) == 1
+
+
+def test_an_acknowledgement_is_never_larger_than_its_receiver_reads() -> None:
+    acks, sent = Acks(), [batch("sim-001", seq, 0, [0.8]) for seq in range(1, 3001, 2)]
+    for one in sent:
+        head = Head(one.kind, one.vehicle, one.boot, one.region, one.seq, one.first_held, one.estimator)
+        acks.rejected("sim-001", head, 0, "x" * 120)
+    stream = Stream((1, sent[0].boot, sent[0].kind, sent[0].region))
+    stream.vehicle = "sim-001"
+    acks.durable((stream, seq) for seq in range(5001, 9001, 2))
+    messages = acks.messages()
+    told = [part for _, payload in messages for part in wire.decode_ack(payload)[1]]
+    assert max(len(payload) for _, payload in messages) <= wire.MAX_BYTES
+    assert [seq for part in told for seq, _, _ in part.rejected] == list(range(1, 3001, 2))
+    assert [first for part in told for first, _ in part.durable] == list(range(5001, 9001, 2))
+
+
+def test_a_service_listens_to_those_on_its_list_and_drops_without_an_answer_what_is_too_much(
+    router: ZenohSettings, session: zenoh.Session, tmp_path: Path
+) -> None:
+    file = tmp_path / "fleet.json"
+    file.write_text(enrolment(vehicles=["car-1"]).model_dump_json())
+    with running(router, tmp_path / "archive", fleet=file, vehicle_kb_s=1.0, vehicle_burst_kb=64.0) as run:
+        counts = run.service.engine.counts
+        heard: list[bytes] = []
+        session.declare_subscriber("gripmap/v1/ack/*", lambda sample: heard.append(sample.payload.to_bytes()))
+        publisher = session.declare_publisher(key("car-1"))
+        matched(publisher)
+        for name in ("car-2", "car-1"):
+            for seq in range(1, 101):
+                sent = batch(name, seq, time.time_ns() - SECOND, [0.8])
+                session.put(key(name), wire.encode(sent), encoding=wire.ENCODING[Kind.OBSERVATION])
+        until(lambda: counts["limited"] + counts[Kind.OBSERVATION] == 100)
+        assert counts["refused.unknown"] == 100
+        assert 60 <= counts[Kind.OBSERVATION] < 100
+        until(lambda: heard)
+        rejected = [
+            refusal for payload in heard for stream in wire.decode_ack(payload)[1] for refusal in stream.rejected
+        ]
+        assert not rejected, "too much is not a fault of the batch"
+
+
+def test_a_region_that_is_none_is_refused_in_the_configuration() -> None:
+    with pytest.raises(ValueError, match="regions"):
+        ServiceConfig(regions=["**"])
+
+
+def test_the_list_of_a_service_is_read_when_it_is_made(router: ZenohSettings, tmp_path: Path) -> None:
+    with (
+        pytest.raises(InputError, match="^config: cannot read"),
+        running(router, tmp_path, fleet=tmp_path / "none.json"),
+    ):
+        pass

@@ -1,0 +1,124 @@
+"""Weather in: from a file and over Zenoh, refused with a reason, archived, and the same after a restart."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import zenoh
+
+from fleet_service.app.engine import Engine
+from fleet_service.ingest.inbox import Message
+from fleet_service.ingest.weather import Heard, archived, read_file
+from schemas import grid, keys, mugrid, tables, weather, wire
+from schemas.config import ServiceConfig
+from schemas.errors import InputError, WireError
+from schemas.weather import Report
+from schemas.wire import Kind
+from tests.fleet_service.conftest import Running
+from tests.fleet_service.examples import REGION, SECOND, batch, key
+from tests.waiting import matched, until
+
+
+def test_a_report_survives_the_wire_and_what_is_left_out_is_unknown() -> None:
+    prior = np.full(mugrid.BINS, 1.0 / mugrid.BINS)
+    got = weather.decode(weather.encode(Report(17, road_temperature=-2.5, precipitation=0.25, prior=prior)))
+    assert (got.time, got.road_temperature, got.precipitation) == (17, -2.5, 0.25)
+    assert np.isnan(got.air_temperature)
+    assert got.prior == pytest.approx(prior)
+    by_hand = weather.decode(b'{"time": "5", "airTemperature": 3.5}', wire.JSON)
+    assert (by_hand.time, by_hand.air_temperature) == (5, 3.5)
+    assert np.isnan(by_hand.precipitation)
+    assert by_hand.prior is None
+
+
+@pytest.mark.parametrize(
+    ("report", "field"),
+    [(Report(1), "weather"), (Report(1, road_temperature=400.0), "road_temperature"),
+     (Report(1, precipitation=-1.0), "precipitation"), (Report(1, air_temperature=float("inf")), "air_temperature"),
+     (Report(1, prior=np.ones(3) / 3), "prior"), (Report(1, prior=np.ones(mugrid.BINS)), "prior"),
+     (Report(1, prior=np.r_[-1.0, 2.0, np.zeros(mugrid.BINS - 2)]), "prior")],
+)  # fmt: skip
+def test_a_report_that_breaks_a_rule_is_refused_by_name(report: Report, field: str) -> None:
+    with pytest.raises(WireError, match=f"^{field}: .*; "):
+        weather.decode(weather.encode(report))
+
+
+def file(path: Path, **columns: object) -> Path:
+    pq.write_table(pa.table(columns), path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("columns", "complaint"),
+    [({"region": ["1202300230"]}, "row 0: no region, time and numbers"),
+     ({"region": ["1202300230"], "time": [1], "wind": [3.0]}, "wind is no column"),
+     ({"region": ["1202300230"], "time": [1], "precipitation": [-9999.0]}, "row 0, precipitation: -9999 lies outside"),
+     ({"region": [-1], "time": [1], "precipitation": [1.0]}, "row 0, region: is no z10 region"),
+     ({"region": ["12x"], "time": [1], "precipitation": [1.0]}, "row 0: no region")],
+)  # fmt: skip
+def test_a_wrong_weather_file_is_refused_with_row_and_column(
+    tmp_path: Path, columns: dict[str, list[Any]], complaint: str
+) -> None:
+    with pytest.raises(InputError, match=complaint):
+        read_file(file(tmp_path / "w.parquet", **columns))
+    with pytest.raises(InputError, match="cannot read"):
+        read_file(tmp_path / "none.parquet")
+
+
+def drive(engine: Engine, begin: int, seq: int) -> None:
+    """Three vehicles, one visit each, at a time [ns]."""
+    for k in range(3):
+        sent = batch(f"sim-00{k}", seq, begin + k * SECOND, [0.8])
+        engine.take([Message(Kind.OBSERVATION, key(sent.vehicle), wire.encode(sent), "")], begin + 60 * SECOND)
+    engine.flush()
+
+
+def beliefs(engine: Engine, now: int) -> np.ndarray:
+    return engine.fusion.beliefs(np.arange(engine.fusion.size), now)
+
+
+def test_a_restart_from_the_archive_has_the_weather_that_was_used_and_gives_the_same_map(tmp_path: Path) -> None:
+    start = time.time_ns() - 7200 * SECOND
+    path = file(
+        tmp_path / "w.parquet", region=[grid.quadkey(REGION, grid.REGION_ZOOM)],
+        time=pa.array([start - 600 * SECOND], pa.timestamp("ns", "UTC")), air_temperature=[5.0], precipitation=[3.0],
+    )  # fmt: skip
+    config = ServiceConfig(weather=path)
+    engine = Engine(config, tmp_path / "a")
+    drive(engine, start, 1)
+    told = weather.encode(Report(start + 1200 * SECOND, road_temperature=-1.0, precipitation=1.0))
+    engine.weather.hear(Heard(keys.weather_key(REGION), told, wire.WEATHER_ENCODING))
+    engine.weather.hear(Heard(keys.weather_key(REGION), b"garbage", ""))
+    engine.overcast(start + 1300 * SECOND)
+    drive(engine, start + 3000 * SECOND, 2)
+    assert (engine.counts["weather"], engine.counts["refused.weather"]) == (2, 1)
+    engine.close()
+    again, dry = Engine(config, tmp_path / "a"), Engine(ServiceConfig(), tmp_path / "b")
+    drive(dry, start, 1)
+    drive(dry, start + 3000 * SECOND, 2)
+    now = start + 5000 * SECOND
+    np.testing.assert_allclose(beliefs(again, now), beliefs(engine, now), atol=1e-6)
+    assert np.abs(beliefs(dry, now) - beliefs(engine, now)).max() > 1e-3
+    assert len(archived(tmp_path / "a").time) == 2  # the file's row is known already
+    assert pq.read_schema(next((tmp_path / "a" / "weather").glob("*"))).equals(tables.WEATHER_ARCHIVE)
+    again.close()
+    dry.close()
+
+
+def test_a_running_service_takes_weather_over_its_key(
+    service: Running, session: zenoh.Session, start: Callable[..., Any]
+) -> None:
+    publisher = session.declare_publisher(keys.weather_key(REGION))
+    matched(publisher)
+    publisher.put(weather.encode(Report(time.time_ns(), precipitation=2.0)), encoding=wire.WEATHER_ENCODING)
+    publisher.put(weather.encode(Report(5, precipitation=2.0)), encoding=wire.WEATHER_ENCODING)
+    counts = service.service.engine.counts
+    until(lambda: counts["weather"] == 1 and counts["refused.weather"] == 1)
+    publisher.undeclare()

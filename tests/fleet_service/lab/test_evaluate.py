@@ -1,0 +1,110 @@
+"""The campaign, tiny: every figure of the issue is there, and the parts do what they say."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleet_service.cli import main
+from fleet_service.lab import agent, attacks, bars, campaign, changes, exact, fleets, rules, town
+from fleet_service.lab.drive import arrivals, novel, rows_of
+from fleet_service.lab.score import coverage, of_beliefs, safe
+from schemas import mugrid
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A campaign of seconds: few minutes, few vehicles. Its values mean nothing."""
+    brief = tuple(fleet._replace(begin=0, minutes=6) for fleet in fleets.FLEETS)
+    for module, name, value in (
+        (fleets, "FLEETS", brief), (fleets, "AT", (6,)), (changes, "MINUTES", 5), (changes, "CHANGE", 3),
+        (attacks, "BEGIN", 4), (attacks, "MINUTES", 6), (exact, "MINUTES", 5), (exact, "UNEXCITED", (3,)),
+        (attacks, "ENOUGH", 0),
+    ):  # fmt: skip
+        monkeypatch.setattr(module, name, value)
+
+
+@pytest.mark.usefixtures("small")
+def test_a_quick_campaign_writes_every_figure_with_its_bar_the_table_and_the_plots(tmp_path: Path) -> None:
+    assert main(["evaluate", "--out", str(tmp_path), "--quick", "--skip-whole-way"]) == 0
+    header, *rows = json.loads((tmp_path / "figures.json").read_text())
+    assert header["campaign"] == "fusion --quick"
+    found = {row["name"]: row for row in rows}
+    assert set(bars.BARS) <= set(found)
+    missing = {name for name in bars.BARS if found[name]["value"] is None}
+    assert missing >= {"fusion.whole_way.coverage90", "fusion.whole_way.rmse"}
+    assert all(
+        name.startswith(("fusion.whole_way", "fusion.false", "fusion.missed", "fusion.clean")) for name in missing
+    )
+    assert not any(found[name]["holds"] for name in missing)
+    assert found["fusion.replay.max_difference"]["holds"]
+    assert "DOES NOT HOLD" in (tmp_path / "figures.md").read_text()
+    assert {path.name for path in tmp_path.glob("*.png")} == {
+        "reliability.png", "rmse.png", "delay.png", "misbehaving.png",
+    }  # fmt: skip
+
+
+def test_a_missing_figure_fails_the_campaign() -> None:
+    found = dict.fromkeys(bars.BARS, 0.0)
+    assert len(bars.judged(found)) == len(bars.BARS)
+    (one,) = (figure for figure in bars.judged({}) if figure.name == "fusion.clean.rmse")
+    assert math.isnan(one.value)
+    assert not campaign.holds(bars.judged({}))
+
+
+def test_a_single_visit_without_bias_is_calibrated() -> None:
+    rng = np.random.default_rng(1)
+    n = 4000
+    mu, who = rng.uniform(0.2, 1.0, n), np.zeros(n, np.int64)
+    exactly = agent.Errors(np.zeros(1), np.zeros(1), np.zeros(1))
+    along = np.tile(np.arange(4), n // 4)
+    told = agent.tell(rng, exactly, who, mu, np.zeros(n), agent.shares(rng, np.ones(n, bool)), agent.noise(rng, along))
+    belief = np.exp(told.log_likelihood - told.log_likelihood.max(axis=1, keepdims=True))
+    belief /= belief.sum(axis=1, keepdims=True)
+    assert coverage(of_beliefs(belief, mu, who + 1)) == pytest.approx(0.9, abs=0.015)
+    assert safe(of_beliefs(belief, mu, who + 1)) == pytest.approx(0.95, abs=0.015)
+
+
+def test_vehicles_of_one_place_share_an_error_and_more_of_them_do_not_average_it_out() -> None:
+    rng = np.random.default_rng(4)
+    common = np.concatenate([town.build(rng, 1, 0.0).common for _ in range(40)])
+    assert np.std(common) == pytest.approx(agent.COMMON, rel=0.15)
+    n, mu = 4000, 0.6
+    errors = agent.Errors(np.zeros(n), np.zeros(n), np.zeros(n))
+    readings = agent.tell(
+        rng, errors, np.arange(n), np.full(n, mu), np.full(n, 0.05), np.ones(n), rng.normal(size=n)
+    ).reading  # fmt: skip
+    assert readings.mean() - mu == pytest.approx(0.05 * mu, abs=0.005)
+
+
+def test_an_unexcited_visit_is_flat_above_the_grip_used_within_half_a_nat() -> None:
+    rng = np.random.default_rng(2)
+    n, who = 500, np.arange(500)
+    told = agent.tell(rng, agent.Errors.draw(rng, n), who, np.full(n, 0.8), np.zeros(n), np.full(n, 0.2), np.zeros(n))
+    above = told.log_likelihood[:, mugrid.CENTRES > 0.35]
+    assert np.ptp(above, axis=1).max() <= agent.SLOPE_NATS
+
+
+def test_what_is_delivered_twice_is_admitted_once() -> None:
+    rng = np.random.default_rng(3)
+    visits = town.drive(rng, town.build(rng, 5, 0.0), agent.Errors.draw(rng, 10), 5)
+    _, which = arrivals(rng, visits)
+    kept = which[novel(rows_of(visits), visits.vehicle, which)]
+    assert len(which) > len(visits)
+    np.testing.assert_array_equal(np.sort(kept), np.arange(len(visits)))
+
+
+def test_the_federated_reset_is_the_inverse_variance_of_readings_and_the_newest_report_the_last() -> None:
+    seconds, place = np.arange(3.0), np.zeros(3, np.int64)
+    reading, std = np.array([0.5, 0.7, np.nan]), np.array([0.1, 0.1, np.nan])
+    sent = np.array([[0.5, 0.01], [0.7, 0.01], [0.6, 0.05]])
+    found = rules.fuse(place, seconds, sent, reading, std, np.array([10.0]), 1)[0, :, 0]
+    federated, newest = (found[rules.RULES.index(name)] for name in ("federated reset", "newest report"))
+    information = 1 / rules.PRIOR_VAR + 2 / 0.01
+    expected = (rules.PRIOR_MEAN / rules.PRIOR_VAR + (0.5 + 0.7) / 0.01) / information
+    assert federated == pytest.approx([expected, 1 / information], rel=1e-3)
+    assert newest == pytest.approx([0.6, 0.05], rel=1e-3)

@@ -1,0 +1,74 @@
+"""The whole way's joint: what the vehicles' command writes is what the campaign reads and sets beside the truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from deploy.whole_way import main
+from fleet_service.fusion import Fusion
+from fleet_service.lab import whole_way
+from tests.fleet_service.examples import CELL, START, observations, value
+
+
+@pytest.mark.timeout(600)  # compiles the estimator where nobody did before
+def test_what_the_vehicles_write_is_joined_with_their_truth(tmp_path: Path) -> None:
+    def drive(folder: Path) -> None:
+        assert main(["--out", str(folder), "--vehicles", "4", "--duration", "20", "--seed", "3"]) == 0
+
+    figures = whole_way.measure(drive, tmp_path)
+    assert figures["fusion.whole_way.observations"] > 4
+    columns = whole_way.read(tmp_path / "whole_way" / whole_way.OBSERVATIONS)
+    truth = pq.read_table(tmp_path / "whole_way" / whole_way.TRUTH)
+    told = set(zip(columns["cell"].tolist(), columns["sector"].tolist(), strict=True))
+    true = set(zip(truth["cell"].to_pylist(), truth["sector"].to_pylist(), strict=True))
+    assert len(told & true) > 0.5 * len(told)
+    fusion = Fusion(120.0)
+    fusion.fold(whole_way.observations_of(columns))
+    slots, mu = whole_way.joined(fusion, truth)
+    assert 0 < len(slots) <= fusion.size
+    assert ((mu > 0.05) & (mu < 1.2)).all()
+
+
+def test_a_figure_of_nothing_is_not_a_number_and_holds_no_bar() -> None:
+    assert np.isnan(whole_way.mean(np.array([])))
+    assert whole_way.mean(np.array([True, False])) == 0.5
+
+
+def visits(*rows: tuple[int, float, float]) -> pa.Table:
+    """Cells beside CELL, seconds, and friction."""
+    cell, seconds, mu = np.array(rows).T
+    return pa.table({
+        "cell": CELL + cell.astype(np.int64), "sector": np.zeros(len(rows), np.int8),
+        "leave_time": pa.array(START + (seconds * 1e9).astype(np.int64), pa.timestamp("ns", "UTC")), "mu": mu,
+        "utilisation": np.where(mu > 0.5, 0.9, 0.1), "vehicle": [f"v{k % 2}" for k in range(len(rows))],
+    })  # fmt: skip
+
+
+def test_the_truth_of_a_cell_is_that_of_its_last_half_minute_and_of_all_visits_where_there_was_none() -> None:
+    fusion = Fusion(120.0)
+    fusion.fold(observations([1.0, 1.0], [1, 2], value([0.5, 0.5]), cell=[CELL, CELL + 1]))
+    slots, mu = whole_way.joined(
+        fusion, visits((0, 10.0, 0.9), (0, 80.0, 0.2), (0, 99.0, 0.4), (1, 5.0, 0.8), (1, 6.0, 0.6), (7, 99.0, 0.1))
+    )
+    found = dict(zip(fusion.cell[slots].tolist(), mu.tolist(), strict=True))
+    assert found == {CELL: pytest.approx(0.3), CELL + 1: pytest.approx(0.7)}
+
+
+def test_excited_vehicles_are_counted_once_per_cell() -> None:
+    fusion = Fusion(120.0)
+    fusion.fold(observations([1.0, 1.0], [1, 2], value([0.5, 0.5]), cell=[CELL, CELL + 1]))
+    rows = visits((0, 1.0, 0.9), (0, 2.0, 0.9), (0, 3.0, 0.9), (1, 4.0, 0.1), (1, 5.0, 0.9))
+    counts = whole_way.excited(fusion, rows)
+    assert counts[fusion.slots_of(np.array([CELL, CELL + 1]), np.zeros(2, np.int64))].tolist() == [2, 1]
+
+
+def test_a_cell_of_two_surfaces_is_told_apart() -> None:
+    fusion = Fusion(120.0)
+    fusion.fold(observations([1.0, 1.0], [1, 2], value([0.5, 0.5]), cell=[CELL, CELL + 1]))
+    same = whole_way.one_surface(fusion, visits((0, 1.0, 0.9), (0, 2.0, 0.8), (1, 4.0, 0.6), (1, 5.0, 0.61)))
+    assert same[fusion.slots_of(np.array([CELL, CELL + 1]), np.zeros(2, np.int64))].tolist() == [False, True]

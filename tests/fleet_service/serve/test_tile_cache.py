@@ -1,0 +1,118 @@
+"""A tile is shown again while it is good: a second at the most, and never without what was acknowledged or alerted."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+
+import numpy as np
+import pytest
+
+from fleet_service.fusion import Fusion
+from fleet_service.serve import tile_cache
+from fleet_service.serve.map_state import MapState
+from fleet_service.serve.query import answer
+from fleet_service.serve.tile_cache import Tiles
+from schemas import grid
+from schemas.query import MapQuery
+from schemas.wire.tile import decode_tile
+from tests.fleet_service.examples import SECOND, START, TILE, observations, value
+
+NOW = START + 60 * SECOND
+
+
+def visit(state: MapState, vehicle: int, cell: int = TILE << 14) -> None:
+    """One visit, noted as the engine does."""
+    state.changed(state.fusion.fold(observations([1.0], [vehicle], value([0.5]), cell)).slots)
+
+
+@pytest.fixture
+def state() -> MapState:
+    made = MapState(Fusion(120.0))
+    visit(made, 1)
+    return made
+
+
+def vehicles(made: Tiles, now: int, tile: int = TILE) -> list[int]:
+    return [int(n) for n in made.shown(tile, now).columns["vehicles"]]
+
+
+def test_an_unchanged_tile_is_shown_again_for_a_second_and_then_made_anew(state: MapState) -> None:
+    made = Tiles(state, nullcontext(), 1)
+    first = made.shown(TILE, NOW)
+    assert made.shown(TILE, NOW + tile_cache.SHOWN_NS) is first
+    later = made.shown(TILE, NOW + tile_cache.SHOWN_NS + 1)
+    assert later.cells["age_s"][0].as_py() > first.cells["age_s"][0].as_py()
+    assert made.shown(TILE, NOW - 1) is not later  # the clock jumped back
+
+
+def test_a_change_is_seen_at_once_when_it_was_acknowledged_and_within_a_second_anyway(state: MapState) -> None:
+    made = Tiles(state, nullcontext(), 1)
+    assert vehicles(made, NOW) == [1]
+    visit(state, 2)
+    assert vehicles(made, NOW + 1) == [1]  # nobody was promised the second
+    assert vehicles(made, NOW + tile_cache.SHOWN_NS + 1) == [2]
+    visit(state, 3)
+    made.settle()
+    assert vehicles(made, NOW + tile_cache.SHOWN_NS + 1) == [3]
+
+
+def test_a_promise_about_another_tile_does_not_make_this_one_anew(state: MapState) -> None:
+    made = Tiles(state, nullcontext(), 1)
+    first = made.shown(TILE, NOW)
+    visit(state, 2, (TILE + 1) << 14)
+    made.settle()
+    assert made.shown(TILE, NOW) is first
+    assert vehicles(made, NOW, TILE + 1) == [1]
+
+
+def test_cells_of_too_few_vehicles_are_not_in_a_tile(state: MapState) -> None:
+    made = Tiles(state, nullcontext(), 2)
+    assert vehicles(made, NOW) == []
+    visit(state, 2)
+    made.settle()
+    assert vehicles(made, NOW) == [2]
+
+
+def test_tiles_are_kept_up_to_a_bound_the_youngest_of_them(state: MapState, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = Tiles(state, nullcontext(), 1)
+    one = len(made.shown(TILE, NOW).payload)
+    monkeypatch.setattr(tile_cache, "KEPT_BYTES", 2 * one)
+    for tile in (TILE + 1, TILE + 2):
+        visit(state, 1, tile << 14)
+        made.shown(tile, NOW)
+    young = made.shown(TILE + 2, NOW)
+    assert made.shown(TILE + 2, NOW) is young
+    assert made.shown(TILE, NOW) is not made.shown(TILE + 1, NOW)
+    assert made.shown(TILE + 2, NOW) is not young  # the two above came after it
+
+
+def test_what_is_shown_is_a_copy_that_later_visits_do_not_change(state: MapState) -> None:
+    made = Tiles(state, nullcontext(), 1).shown(TILE, NOW)
+    before = np.array(made.columns["vehicles"])
+    visit(state, 2)
+    assert (made.columns["vehicles"] == before).all()
+
+
+def test_a_box_gets_exactly_the_cells_that_it_touches_wherever_its_borders_lie() -> None:
+    state, rng = MapState(Fusion(120.0)), np.random.default_rng(0)
+    for vehicle in (1, 2):
+        for cell in (TILE << 14) + rng.choice(1 << 14, 60, replace=False):
+            visit(state, vehicle, int(cell))
+    made = Tiles(state, nullcontext(), 1)
+    cells = made.shown(TILE, NOW).cells.to_pylist()
+    west, south, east, north = (float(border) for border in grid.bounds(TILE, grid.TILE_ZOOM))
+    lengths = set()
+    for _ in range(200):
+        x, y = np.sort(rng.uniform(west - 0.02, east + 0.02, 2)), np.sort(rng.uniform(south - 0.01, north + 0.01, 2))
+        query = MapQuery(bbox=(x[0], y[0], x[1], y[1]), min_vehicles=int(rng.integers(1, 3)))
+        wanted = {
+            cell["cell"] for cell in cells
+            if cell["east"] > x[0] and cell["west"] < x[1] and cell["north"] > y[0] and cell["south"] < y[1]
+            and cell["vehicles"] >= query.min_vehicles
+        }  # fmt: skip
+        replies = dict(answer(made, query, lambda tile: tile == TILE, NOW, TILE))
+        told = decode_tile(replies[TILE])["cell"].to_pylist() if replies else []
+        assert set(told) == wanted
+        assert len(told) == len(wanted)
+        lengths.add(len(wanted))
+    assert {0, len(cells)} < lengths
