@@ -10,7 +10,8 @@ from pathlib import Path
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--vehicles", type=int, default=36, help="how many (default 36)")
-    parser.add_argument("--scenario", default="demo", help="where they drive (default demo)")
+    parser.add_argument("--scenario", default="demo", help="where they drive: demo, hills, test (default demo)")
+    parser.add_argument("--rough", type=float, default=0.0, help="share of them as real cars are (default 0)")
     parser.add_argument("--estimator", help="estimator by name (default: the configuration's)")
     parser.add_argument("--config", type=Path, help="agent configuration (JSON)")
     parser.add_argument("--truth", type=Path, help="what they truly drove over, one row per cell visit (Parquet)")
@@ -29,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     from schemas.config import AgentConfig, load
 
     config = load(args.config, AgentConfig)
-    fleet = SimulatedFleet(args.scenario, args.vehicles, args.seed, args.rate)
+    fleet = SimulatedFleet(args.scenario, args.vehicles, args.seed, args.rate, rough=args.rough)
     recorder = TruthRecorder(tuple(fleet.names)) if args.truth and writable("truth", args.truth) else None
     source = blocks(fleet, args.rate, recorder)
     told = partial(recorder.write, args.truth) if recorder is not None else lambda: None

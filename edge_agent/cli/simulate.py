@@ -5,6 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+SENSORS = ("ideal", "mems", "mems-leak", "mems-patchy", "rough", "rough-coarse", "rough-late")
+ROADS = ("level", "rolling", "stepped", "banked", "hilly")
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
@@ -15,7 +18,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--duration", type=float, help="[s]; else the manoeuvre's own")
     parser.add_argument("--rate", type=float, default=100.0, help="samples per second (default 100)")
     parser.add_argument("--seed", type=int, default=0, help="of the sensor errors (default 0)")
-    parser.add_argument("--sensors", choices=("mems", "ideal"), default="mems", help="quality (default mems)")
+    parser.add_argument("--sensors", choices=SENSORS, default="mems", help="quality (default mems); rough: real cars'")
+    parser.add_argument("--no-torque", action="store_true", help="no wheel torque is recorded, as by most cars")
+    parser.add_argument("--road", choices=ROADS, default="level", help="relief, drawn by the seed (default level)")
+    parser.add_argument("--slope", type=float, default=0.0, help="metres up per metre ahead, added to it (default 0)")
     parser.add_argument("--out", type=Path, help="signal log to write (Parquet)")
     parser.add_argument("--vehicle-out", type=Path, help="vehicle file to write (JSON)")
 
@@ -25,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     import pyarrow.parquet as pq
 
     from edge_agent.app.estimates_file import writable
-    from edge_agent.lab.simulation import MANOEUVRES, simulate_manoeuvre
+    from edge_agent.lab.simulation import MANOEUVRES, Fault, simulate_manoeuvre
     from schemas.errors import InputError
 
     if args.list:
@@ -44,6 +50,9 @@ def run(args: argparse.Namespace) -> int:
         rate_hz=args.rate,
         duration_s=args.duration,
         sensors=args.sensors,
+        faults=(Fault("missing", "torque"),) if args.no_torque else (),
+        road=args.road,
+        slope=args.slope,
     )
     pq.write_table(log, writable("out", args.out))
     if args.vehicle_out is not None:

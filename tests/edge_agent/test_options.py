@@ -34,8 +34,9 @@ SIMULATE = {
     "manoeuvre": ["sine", *SIMULATED[1:]],
     **{name: [*SIMULATED, name, value] for name, value in (
         ("--mu", "0.2"), ("--speed", "11"), ("--duration", "3"), ("--rate", "100"), ("--seed", "2"),
-        ("--sensors", "ideal"),
+        ("--sensors", "ideal"), ("--road", "hilly"), ("--slope", "0.03"),
     )},
+    "--no-torque": [*SIMULATED, "--no-torque"],
 }  # fmt: skip
 LIVE, REPLAYED = "test_seed_rate_and_scenario_of_a_live_drive", "test_log_vehicle_estimator_and_configuration"
 # what the other options of the commands do is told by the tests named here
@@ -50,7 +51,7 @@ ELSEWHERE = {
             "--scenario": LIVE, "--rate": LIVE, "--seed": LIVE, "--duration": "test_fleet_gives"},
     "fleet": {"--vehicles": "test_fleet_gives", "--config": "test_fleet_gives", "--truth": "test_fleet_gives",
               "--duration": "test_fleet_gives", "--estimator": REPLAYED, "--scenario": LIVE, "--rate": LIVE,
-              "--seed": LIVE},
+              "--seed": LIVE, "--rough": "test_half_a_fleet_is_rough"},
     "tune": {"--seed": "test_options_out_of_range", "--ants": "test_options_out_of_range",
              "--iterations": "test_options_out_of_range", "--objective": "test_quick_tuning_writes",
              "--out": "test_quick_tuning_writes", "--quick": "test_quick_tuning_writes",

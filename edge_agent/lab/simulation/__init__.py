@@ -4,6 +4,7 @@ from edge_agent.lab.simulation.faults import FAULTS, Fault
 from edge_agent.lab.simulation.fleet import SimulatedFleet, Truth
 from edge_agent.lab.simulation.manoeuvres import MANOEUVRES, jump, split
 from edge_agent.lab.simulation.presets import PRESETS
+from edge_agent.lab.simulation.relief import ROADS, Relief, Wave
 from edge_agent.lab.simulation.scenarios import SCENARIOS, Scenario
 from edge_agent.lab.simulation.sensors import SENSORS
 from edge_agent.lab.simulation.simulate import simulate_manoeuvre
@@ -12,12 +13,15 @@ __all__ = [
     "FAULTS",
     "MANOEUVRES",
     "PRESETS",
+    "ROADS",
     "SCENARIOS",
     "SENSORS",
     "Fault",
+    "Relief",
     "Scenario",
     "SimulatedFleet",
     "Truth",
+    "Wave",
     "jump",
     "simulate_manoeuvre",
     "split",

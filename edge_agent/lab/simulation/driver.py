@@ -40,6 +40,7 @@ class D(IntEnum):
     CRUISE = 5  # [m/s] on a dry open road
     WOBBLE = 6  # [m] amplitude of his wandering in the lane
     SHORT = 7  # [m] left to the next point of the lane
+    STOPS = 8  # share of the ALERT_S in which he comes to a stop and waits; 0: nobody stops
 
 
 class G(IntEnum):
@@ -59,12 +60,15 @@ BETTER_S: Final = 2.5
 ALARM_S: Final = 0.7  # e-folding of his belief while wheels slide
 SLIDING: Final = 3.5  # normalised slip that he feels as sliding: well past the peak
 LEAST_BELIEF: Final = 0.12
-SLOWEST: Final = 3.0  # [m/s] nobody stops: standing vehicles tell nothing of the road
+SLOWEST: Final = 3.0  # [m/s] he creeps on, unless he stops
 LARGEST_STEER: Final = 0.55  # [rad]
 LARGEST_SLIP_ANGLE: Final = 0.09  # [rad] of the front wheels; more steering than that only scrubs
 ALERT_S: Final = 7.0  # once in this time somebody ahead may make him brake,
 ALERT_SHARE: Final = 0.45  # with this probability,
 ALERT_LENGTH_S: Final = 1.5  # for this long
+STOP_LENGTH_S: Final = 5.0  # braking and waiting, within an ALERT_S
+STOPPING: Final = 0.6  # share of his budget that he stops with
+RESTING: Final = 0.3  # [m/s] slower than this he stands on the brake, whatever the slope
 LEAST_BRAKING: Final = 0.35  # share of the budget that is left for the brakes in the tightest bend
 FRIGHT: Final = 2.5  # [m/s^2] asked of the brakes at least, whatever the road, by who is much too fast:
 TOO_FAST: Final = 1.4  # this many times the square of the speed he aims at
@@ -72,6 +76,7 @@ PULL: Final = 0.85  # share of the grip of the driven wheels that he dares to us
 WOBBLE_HZ: Final = 0.11
 ROUTE_STREAM: Final = 10
 ALERT_STREAM: Final = 11
+STOP_DRAW: Final = 1 << 32  # counters from here on, in the stream of alerts, say in which ALERT_S he stops
 
 
 @compiled
@@ -156,6 +161,13 @@ def alerted(t: float, key: Key) -> float:
 
 
 @compiled
+def stops(t: float, share: float, key: Key) -> bool:
+    """Whether he is stopping or waiting now; he does so in this share of the ALERT_S."""
+    window = int(t / ALERT_S)
+    return bool(share > 0.0 and t - window * ALERT_S < STOP_LENGTH_S and uniform(key, STOP_DRAW + window) < share)
+
+
+@compiled
 def wished_acceleration(
     x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float, key: Key
 ) -> float:
@@ -179,8 +191,18 @@ def wished_acceleration(
     alarm = alerted(t, key)
     if alarm > 0.0 and vx > SLOWEST + 1.0:
         wish = min(wish, -alarm * q)
+    if stops(t, d[D.STOPS], key):
+        wish = -STOPPING * q
     hardest = max(q, FRIGHT) if vx * vx > TOO_FAST * aim else q
     return float(min(max(wish, -max(room, LEAST_BRAKING) * hardest), room * gas))
+
+
+@compiled
+def wished_force(p: FloatArray, d: FloatArray, vx: float, acceleration: float, along: float) -> float:
+    """Force [N] that he gives for an acceleration while gravity pulls with `along` [m/s^2]: as tyres and engine can."""
+    driven = max(p[P.DRIVE_FRONT], 1.0 - p[P.DRIVE_FRONT])
+    most = min(PULL * d[D.BELIEF] * GRAVITY * min(1.0, 0.5 / driven), strongest_pull(p, vx) / p[P.MASS])
+    return float(p[P.MASS] * min(acceleration - along, max(most, acceleration)))
 
 
 @compiled
@@ -204,17 +226,24 @@ def wished_steer(x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: Flo
 
 @compiled
 def drive(
-    x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, w: FloatArray, friction: FloatArray,
-    t: float, dt: float, keys: tuple[Key, Key],
+    x: FloatArray, driver: tuple[FloatArray, IntArray], world: tuple[Lanes, FloatArray], p: FloatArray,
+    w: FloatArray, now: tuple[float, float, float], keys: tuple[Key, Key],
 ) -> None:  # fmt: skip
-    """Move driver `d` and route `g` on by one sample: afterwards d[STEER], d[FORCE] are what arms and foot do.
+    """Move a driver (d, g) and his route on by one sample: afterwards d[STEER], d[FORCE] are what arms and foot do.
 
-    `w` is what the wheels did at the last sample; keys are those of his route and of his alerts.
+    world: lanes and friction; `w` is what the wheels did at the last sample; now: time [s], length of the sample [s]
+    and how much gravity accelerates him [m/s^2]; keys are those of his route and of his alerts.
     """
+    d, g = driver
+    lanes, friction = world
+    t, dt, along = now
     d[D.SHORT] = follow(x, g, lanes, keys[0])
     number, _ = ahead(d, g, lanes, max(LOOKING_S * x[X.VX], 0.0))
     point = lanes[0][number]
     believe(d, look_up(friction, F.LOOKS, t, point[L.X], point[L.Y]), w, dt)
-    force = p[P.MASS] * wished_acceleration(x, d, g, lanes, p, t, keys[1])
+    acceleration = wished_acceleration(x, d, g, lanes, p, t, keys[1])
+    force = wished_force(p, d, x[X.VX], acceleration, along)
+    if x[X.VX] < RESTING and stops(t, d[D.STOPS], keys[1]):
+        force = -p[P.MASS] * (STOPPING * budget(d) + abs(along))
     d[D.FORCE] += (force - d[D.FORCE]) * -math.expm1(-dt / FOOT_S)
     d[D.STEER] += (wished_steer(x, d, g, lanes, p, t) - d[D.STEER]) * -math.expm1(-dt / ARMS_S)

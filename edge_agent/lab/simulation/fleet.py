@@ -10,28 +10,34 @@ import numpy as np
 from edge_agent.lab.simulation.chance import checked_seed, key_of
 from edge_agent.lab.simulation.driver import ALERT_STREAM, ROUTE_STREAM, D, G, KeyArray, Lanes, drive
 from edge_agent.lab.simulation.friction import F, look_up
+from edge_agent.lab.simulation.misaligned import memory_of
 from edge_agent.lab.simulation.plant import (
+    INPUTS,
     RECORD,
     STATES,
     R,
     U,
     W,
+    X,
     advance,
     command,
+    gravity,
     observe,
     start_at,
     substeps_of,
     wheel_place,
 )
 from edge_agent.lab.simulation.presets import nominal, one_of_a_fleet
+from edge_agent.lab.simulation.relief import gradient, tilt
 from edge_agent.lab.simulation.roads import L, Network
 from edge_agent.lab.simulation.scenarios import Scenario, scenario_named
-from edge_agent.lab.simulation.sensors import Sensors, error_row, noise_keys, sense, sensors_named
+from edge_agent.lab.simulation.sensors import ROUGH_FLEET, E, Sensors, error_row, noise_keys, sense, sensors_named
 from schemas.errors import InputError
-from schemas.numeric import FloatArray, IntArray
+from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.jit import compiled
 
 VEHICLE_STREAM = 0
+STOPS = 0.3  # share of the 7 s in which a driver of a rough vehicle stops: two or three times a minute
 GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0  # multiples of it, modulo 1, are spread evenly however many there are
 
 
@@ -50,23 +56,30 @@ class Truth:
 
 @compiled
 def run(
-    states: tuple[FloatArray, FloatArray, IntArray, FloatArray], parameters: FloatArray, lanes: Lanes,
-    friction: FloatArray, keys: tuple[KeyArray, KeyArray], first: int, steps: int, timing: tuple[float, int],
+    states: tuple[FloatArray, FloatArray, IntArray, FloatArray], parameters: FloatArray,
+    ground: tuple[Lanes, FloatArray, FloatArray], keys: tuple[KeyArray, KeyArray], first: int, steps: int,
+    timing: tuple[float, int],
 ) -> FloatArray:  # fmt: skip
-    """Records (T, N, 30) of the next `steps` samples; the states are carried on in place.
+    """Records (T, N, 32) of the next `steps` samples; the states are carried on in place.
 
-    states: vehicles (N, 12), drivers (N, 7), routes (N, 4), wheels (N, 8, 4); keys: of routes and of alerts (N,);
+    states: vehicles (N, 12), drivers (N, 9), routes (N, 4), wheels (N, 8, 4); ground: lanes, tables
+    of friction and of relief; keys: of routes and of alerts (N,);
     timing: sample period [s] and plant steps in it; `first` is the number of the first sample.
     """
     vehicles, drivers, routes, wheels = states
+    lanes, friction, relief = ground
     period, substeps = timing
     records = np.empty((steps, vehicles.shape[0], RECORD))
-    u = np.empty((4, 4))
+    u = np.zeros((INPUTS, 4))
     for n in range(vehicles.shape[0]):
         x, d, g, w, p = vehicles[n], drivers[n], routes[n], wheels[n], parameters[n]
         for k in range(steps):
             t = (first + k) * period
-            drive(x, d, g, lanes, p, w, friction, t, period, (keys[0][n], keys[1][n]))
+            lane = lanes[0][lanes[1][g[G.LANE]] + g[G.POINT]]
+            east, north = gradient(relief, (x[X.X], x[X.Y]), (lane[L.COS], lane[L.SIN]), lane[L.CURVATURE])
+            u[U.TILT, 0], u[U.TILT, 1] = tilt(east, north, x[X.YAW])
+            now = (t, period, gravity(u)[0])
+            drive(x, (d, g), (lanes, friction), p, w, now, (keys[0][n], keys[1][n]))
             command(p, u, d[D.STEER], d[D.FORCE])
             for i in range(4):
                 px, py = wheel_place(x, p, i)
@@ -85,18 +98,22 @@ class SimulatedFleet:
         seed: non-negative.
         rate_hz: of the samples.
         sensors: a key of SENSORS.
+        rough: share of the vehicles that are as real cars are: ROUGH_FLEET sensors, and drivers who stop now and then.
 
     Raises:
         InputError: an argument is out of range or unknown.
     """
 
     def __init__(
-        self, scenario: str | Scenario, vehicles: int, seed: int, rate_hz: float, sensors: str | Sensors = "mems-patchy"
-    ) -> None:
+        self, scenario: str | Scenario, vehicles: int, seed: int, rate_hz: float,
+        sensors: str | Sensors = "mems-patchy", rough: float = 0.0,
+    ) -> None:  # fmt: skip
         if vehicles < 1:
             raise InputError("vehicles", f"{vehicles} vehicles cannot drive", "give a positive number")
         if not (math.isfinite(rate_hz) and rate_hz > 0.0):
             raise InputError("rate_hz", f"{rate_hz} is not possible", "give a positive number")
+        if not 0.0 <= rough <= 1.0:
+            raise InputError("rough", f"{rough} is not a share", "give a number from 0 to 1")
         seed = checked_seed(seed)
         self.scenario = scenario_named(scenario)
         self.rate_hz = rate_hz
@@ -105,9 +122,11 @@ class SimulatedFleet:
         truths = [one_of_a_fleet(k, name, rng) for k, (name, rng) in enumerate(zip(self.names, rngs, strict=True))]
         self.vehicles = [nominal(truth, rng) for truth, rng in zip(truths, rngs, strict=True)]
         self._parameters = np.stack([truth.row() for truth in truths])
-        self._errors = np.stack(
-            [error_row(sensors_named(sensors), self.scenario.origin, seed, k) for k in range(vehicles)]
-        )
+        self.rough = rough_ones(vehicles, rough)
+        ordinary, origin = sensors_named(sensors), self.scenario.origin
+        self._errors = np.stack([
+            error_row(ROUGH_FLEET if self.rough[k] else ordinary, origin, seed, k) for k in range(vehicles)
+        ])  # fmt: skip
         noise = [noise_keys(seed, k) for k in range(vehicles)]
         self._noise = (np.array([white for white, _ in noise]), np.array([silence for _, silence in noise]))
         self._keys = (
@@ -115,7 +134,10 @@ class SimulatedFleet:
             np.array([key_of(seed, k, ALERT_STREAM) for k in range(vehicles)]),
         )
         self._states = _start(self.scenario.network, self._parameters, rngs)
+        self._states[1][:, D.STOPS] = np.where(self.rough, STOPS, 0.0)
+        self._before = np.empty((0, vehicles, RECORD))  # what late clocks may still speak of
         self._wander = np.zeros((vehicles, 3))
+        self._relief = self.scenario.relief.table
         self._next = 0
         self.truth = _truth(np.empty((0, vehicles, RECORD)))
 
@@ -126,13 +148,24 @@ class SimulatedFleet:
         network, origin = self.scenario.network, self.scenario.origin
         lanes = (network.points, network.first, network.size, network.spacing, network.ways)
         timing = (1.0 / self.rate_hz, substeps_of(self.rate_hz))
-        records = run(self._states, self._parameters, lanes, self.scenario.table, self._keys, self._next, steps, timing)
+        ground = (lanes, self.scenario.table, self._relief)
+        records = run(self._states, self._parameters, ground, self._keys, self._next, steps, timing)
         place = np.array([origin.latitude, origin.longitude, *origin.per_metre])
-        signals = sense(records, self._errors, self._wander, place, self._noise, self._next, self.rate_hz)
+        known, lead = np.concatenate([self._before, records]), len(self._before)
+        clock = (self._next, self.rate_hz, lead)
+        signals = sense(known, self._errors, self._wander, place, self._noise, clock)
+        memory = memory_of(self._errors[:, E.MOUNTED :], self.rate_hz)
+        self._before = known[len(known) - min(memory, len(known)) :]
         t = np.repeat((np.arange(self._next, self._next + steps) / self.rate_hz)[:, None], len(self.names), axis=1)
         self._next += steps
         self.truth = _truth(records)
         return t, signals
+
+
+def rough_ones(vehicles: int, share: float) -> BoolArray:
+    """Which vehicles are rough, (N,): evenly spread, and vehicle k is or is not however many there are."""
+    number = np.arange(vehicles)
+    return np.asarray(np.floor((number + 1) * share) > np.floor(number * share))
 
 
 def _truth(records: FloatArray) -> Truth:

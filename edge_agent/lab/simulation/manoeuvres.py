@@ -187,6 +187,17 @@ def pulses(now: Moment) -> tuple[float, float]:
     return 0.03 * math.sin(2.0 * now.t), wanted if 0.5 * now.speed < now.vx < 1.5 * now.speed else hold(now)
 
 
+def standing(_now: Moment) -> tuple[float, float]:
+    """At rest, the foot on the brake."""
+    return 0.0, -3.0
+
+
+def stop_and_go(now: Moment) -> tuple[float, float]:
+    """Straight on for eight seconds, to a stop with 2.5 m/s^2 and at rest for six, over and over: traffic lights."""
+    go = now.t % 14.0 < 8.0
+    return steer_to(now, now.x + preview(now), 0.0), min(hold(now), 2.0) if go else -2.5
+
+
 def kmh(speed: float) -> float:
     """[m/s] of a speed in km/h."""
     return speed / 3.6
@@ -212,5 +223,7 @@ MANOEUVRES: Final = {
     "firm-acceleration": Manoeuvre(firm_acceleration, kmh(20), 5.0, 0.85, "0.6 g: paper 003"),
     "brisk-acceleration": Manoeuvre(brisk_acceleration, kmh(20), 6.0, jump(0.85, 0.50, 30.0), "0.45 g onto wet"),
     "moderate-braking": Manoeuvre(moderate_braking, kmh(80), 6.0, jump(0.85, 0.30, 60.0), "0.28 g from dry onto snow"),
+    "standing": Manoeuvre(standing, 0.0, 60.0, 0.85, "at rest, the foot on the brake: level or on a slope"),
+    "stop-and-go": Manoeuvre(stop_and_go, kmh(40), 56.0, 0.85, "traffic lights: stop, stand, start again"),
     "pulses": Manoeuvre(pulses, kmh(50), 30.0, 0.60, "throttle and brakes in turn while weaving"),
 }

@@ -3,13 +3,18 @@
 It shares its equations with `edge_agent.dynamics` but is not the estimator's model: its tyres have another shape, their
 stiffness grows less than the load, its loads follow the accelerations with a lag, it rolls, drags and resists rolling.
 
-    m (dv_x/dt − r v_y) = ΣX − D v_x|v_x|        v_x, v_y  speed of the centre of gravity in the body [m/s]
-    m (dv_y/dt + r v_x) = ΣY                     r         yaw rate [rad/s]
+    m (dv_x/dt − r v_y) = ΣX − D v_x|v_x| + m g_x    v_x, v_y  speed of the centre of gravity in the body [m/s]
+    m (dv_y/dt + r v_x) = ΣY + m g_y             r         yaw rate [rad/s]
     I_z dr/dt = Σ (x_i Y_i − y_i X_i)            X, Y      wheel forces in the body's axes [N]
     J dω/dt = T − R F_x − k_r R F_z              ω, T      wheel speed [rad/s], torque at the wheel [N·m]
 
     θ = K s / (μ F_z),  F = μ F_z f(|θ|) θ/|θ|   s         slip (longitudinal, lateral), K its stiffness
     K = κ F_z (1 − ε (F_z/F_0 − 1))              F_0       static load, ε how degressive the tyre is
+
+    g_x, g_y = −g (h_x, h_y)/√(1 + h_x² + h_y²)  h_x, h_y  rise of the road per metre ahead and to the left
+
+An accelerometer feels all forces but gravity: (dv_x/dt − r v_y − g_x), so g sin(slope) where the vehicle stands. The
+load that is transferred goes by what is felt, and the loads add up to the weight's part that is normal to the road.
 
 K does not know μ, unless the tyre softens: friction acts by similarity (Pacejka, Tyre and Vehicle Dynamics, 3rd ed.,
 §4.2), and |F| ≤ μ F_z.
@@ -28,7 +33,7 @@ from typing import Final
 
 from edge_agent.dynamics.body import accelerations
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import P, body
+from edge_agent.dynamics.parameters import GRAVITY, P, body
 from edge_agent.dynamics.slip import SLOWEST_M_S, slips, wheel_position, wheel_velocity
 from edge_agent.dynamics.tyres import TINY, brush, magic_formula
 from schemas.numeric import FloatArray
@@ -38,7 +43,9 @@ LONGEST_SUBSTEP: Final = 1e-3  # [s]; lateral dynamics at 1 m/s have poles near 
 SOFTEST: Final = 0.3  # stiffness never degrades below this share of proportional, however overloaded the wheel
 REAR_LIMIT: Final = 0.5  # slip control lets go of the rear wheels at this share of the limit, so that they still guide
 FIRM: Final = 1.0  # friction at which a softening tyre has its full stiffness
-STANDING: Final = 1.0  # [rad/s] below it a brake fades, so that it holds a wheel and does not turn it backwards
+STANDING: Final = 1.0  # [rad/s] below it rolling resistance fades
+BRAKED: Final = 0.1  # [rad/s] below it a brake does, so that it holds a wheel and does not turn it backwards
+STILL: Final = 0.02  # [m/s, rad/s] slower than this in every direction, brakes hold the vehicle where it is
 
 
 class X(IntEnum):
@@ -81,12 +88,16 @@ PARAMETERS: Final = len(P) + len(Q)
 
 
 class U(IntEnum):
-    """Rows of what is done to the four wheels, shape (4, 4)."""
+    """Rows of what is done to the four wheels, and of the road under the vehicle, shape (5, 4)."""
 
     STEER = 0  # [rad at the road wheel]
     DRIVE = 1  # [N·m] asked for; slip control may allow less
     BRAKE = 2  # [N·m], positive, asked for
     MU = 3  # friction under the wheel
+    TILT = 4  # rise of the road per metre ahead of the vehicle, and to its left; two numbers are of no use
+
+
+INPUTS: Final = len(U)
 
 
 class W(IntEnum):
@@ -100,6 +111,14 @@ class W(IntEnum):
     THETA = 5  # normalised slip; beyond about 2 the wheel slides
     SLOPE = 6  # dF_x/dω along the secant [N·s/rad]
     TORQUE = 7  # [N·m] that acts, driving positive
+
+
+@compiled
+def gravity(u: FloatArray) -> tuple[float, float, float]:
+    """(g_x, g_y) in the body's axes [m/s^2], and the share of gravity that presses on the road."""
+    ahead, left = u[U.TILT, 0], u[U.TILT, 1]
+    share = 1.0 / math.sqrt(1.0 + ahead * ahead + left * left)
+    return -GRAVITY * ahead * share, -GRAVITY * left * share, share
 
 
 @compiled
@@ -122,11 +141,12 @@ def slip_limit(p: FloatArray, i: int) -> float:
 
 @compiled
 def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> None:
-    """Fill `w` (8, 4) for the state `x` (12,), parameters `p` (25,) and inputs `u` (4, 4)."""
+    """Fill `w` (8, 4) for the state `x` (12,), parameters `p` (26,) and inputs `u` (5, 4)."""
     loads = wheel_loads(body(p), x[X.AX_LAGGED], x[X.AY_LAGGED])
     at_rest = wheel_loads(body(p), 0.0, 0.0)
+    _, _, share = gravity(u)
     for i in range(4):
-        load, omega = loads[i], x[X.OMEGA + i]
+        load, omega = share * loads[i], x[X.OMEGA + i]
         along, across = wheel_velocity(p, i, x[X.VX], x[X.VY], x[X.YAW_RATE], u[U.STEER, i])
         slip_x, slip_y = slips(p[P.RADIUS], omega, along, across)
         slope_x = stiffness_per_load(p[P.SLOPE_X], p[Q.DEGRESSION], load, at_rest[i])
@@ -147,12 +167,15 @@ def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> 
         w[W.FX, i], w[W.FY, i], w[W.FZ, i] = pull * theta_x, pull * theta_y, load
         w[W.SPEED, i], w[W.SLIP, i], w[W.THETA, i] = along, slip_x, theta
         w[W.SLOPE, i] = secant * slope_x * load * p[P.RADIUS] / max(abs(along), SLOWEST_M_S)
-        w[W.TORQUE, i] = drive - brake * omega / max(abs(omega), STANDING)
+        w[W.TORQUE, i] = drive - brake * omega / max(abs(omega), BRAKED)
 
 
 @compiled
 def body_accelerations(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> tuple[float, float, float]:
-    """(a_x, a_y) of the centre of gravity [m/s^2] and the yaw acceleration [rad/s^2], from the filled `w`."""
+    """(a_x, a_y) that an accelerometer at the centre of gravity feels [m/s^2], and the yaw acceleration [rad/s^2].
+
+    `w` is filled.
+    """
     ax, ay, yaw_acceleration = accelerations(p, w[W.FX], w[W.FY], u[U.STEER])
     return ax - p[Q.DRAG] * x[X.VX] * abs(x[X.VX]) / p[P.MASS], ay, yaw_acceleration
 
@@ -176,25 +199,55 @@ def turn_wheels(
         if slip_limit(p, i) < slip < 2.0 * slip_limit(p, i):
             asked = u[U.DRIVE, i] if w[W.SLIP, i] > 0.0 else u[U.BRAKE, i]
             damping += asked * radius / (max(abs(w[W.SPEED, i]), SLOWEST_M_S) * slip_limit(p, i))
-        if abs(omega) < STANDING:
-            damping += u[U.BRAKE, i] / STANDING
+        if abs(omega) < BRAKED:
+            damping += u[U.BRAKE, i] / BRAKED
         x[X.OMEGA + i] = omega + dt * excess / (p[P.WHEEL_INERTIA] + dt * damping)
+
+
+@compiled
+def held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
+    """Whether the brakes hold a vehicle that stands: they are stronger than engine and slope, and so are the tyres."""
+    if abs(x[X.VX]) > STILL or abs(x[X.VY]) > STILL or abs(x[X.YAW_RATE]) > STILL:
+        return False
+    along, across, share = gravity(u)
+    brake = pull = grip = 0.0
+    for i in range(4):
+        brake += u[U.BRAKE, i] / p[P.RADIUS]
+        pull += u[U.DRIVE, i] / p[P.RADIUS]
+        grip += 0.25 * u[U.MU, i] * p[P.MASS] * GRAVITY * share
+    pull += p[P.MASS] * along
+    return bool(brake > 0.0 and abs(pull) <= brake and math.hypot(pull, p[P.MASS] * across) <= grip)
+
+
+@compiled
+def stand(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
+    """One step of a vehicle that is `held`: only the suspension still moves, to where the slope wants it."""
+    along, across, _ = gravity(u)
+    x[X.VX] = x[X.VY] = x[X.YAW_RATE] = 0.0
+    x[X.OMEGA : X.OMEGA + 4] = 0.0
+    follow = min(dt / p[Q.LAG], 1.0)
+    x[X.AX_LAGGED] += follow * (-along - x[X.AX_LAGGED])
+    x[X.AY_LAGGED] += follow * (-across - x[X.AY_LAGGED])
 
 
 @compiled
 def advance(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float, substeps: int) -> None:
     """Move the state `x` on by `substeps` steps of `dt` [s] with the inputs `u` held; `w` is scratch."""
+    along, across, _ = gravity(u)
     for _ in range(substeps):
+        if held(x, p, u):
+            stand(x, p, u, dt)
+            continue
         wheel_forces(x, p, u, w)
         ax, ay, yaw_acceleration = body_accelerations(x, p, u, w)
         vx, vy, r = x[X.VX], x[X.VY], x[X.YAW_RATE]
-        turn_wheels(x, p, u, w, dt, ax + r * vy, yaw_acceleration)
+        turn_wheels(x, p, u, w, dt, ax + r * vy + along, yaw_acceleration)
         c, s = math.cos(x[X.YAW] + 0.5 * dt * r), math.sin(x[X.YAW] + 0.5 * dt * r)
         x[X.X] += dt * (c * vx - s * vy)
         x[X.Y] += dt * (s * vx + c * vy)
         x[X.YAW] += dt * r
-        x[X.VX] += dt * (ax + r * vy)
-        x[X.VY] += dt * (ay - r * vx)
+        x[X.VX] += dt * (ax + r * vy + along)
+        x[X.VY] += dt * (ay - r * vx + across)
         x[X.YAW_RATE] += dt * yaw_acceleration
         follow = min(dt / p[Q.LAG], 1.0)
         x[X.AX_LAGGED] += follow * (ax - x[X.AX_LAGGED])
@@ -224,7 +277,7 @@ def command(p: FloatArray, u: FloatArray, steer: float, force: float) -> None:
 class R(IntEnum):
     """Columns of a record: the truth of one sample of one vehicle."""
 
-    AX = 0  # [m/s^2] of the centre of gravity, level
+    AX = 0  # [m/s^2] that an accelerometer at the centre of gravity feels, as the road lies
     AY = 1
     AX_FELT = 2  # [m/s^2] by an accelerometer fixed to the rolling and pitching body
     AY_FELT = 3
@@ -239,14 +292,16 @@ class R(IntEnum):
     VY = 21
     MU = 22
     UTILISATION = 26  # |F| / (μ F_z)
+    SLOPE = 30  # rise of the road per metre ahead
+    BANK = 31  # and to the left
 
 
-RECORD: Final = 30
+RECORD: Final = 32
 
 
 @compiled
 def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: FloatArray) -> None:
-    """Fill `record` (30,) with what is true at this instant under the inputs `u`; fills `w` too."""
+    """Fill `record` (32,) with what is true at this instant under the inputs `u`; fills `w` too."""
     wheel_forces(x, p, u, w)
     ax, ay, _ = body_accelerations(x, p, u, w)
     record[R.AX], record[R.AY] = ax, ay
@@ -258,6 +313,24 @@ def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: 
         record[R.DELTA + i], record[R.OMEGA + i], record[R.TORQUE + i] = u[U.STEER, i], x[X.OMEGA + i], w[W.TORQUE, i]
         record[R.MU + i] = u[U.MU, i]
         record[R.UTILISATION + i] = math.hypot(w[W.FX, i], w[W.FY, i]) / (u[U.MU, i] * w[W.FZ, i])
+    record[R.SLOPE], record[R.BANK] = u[U.TILT, 0], u[U.TILT, 1]
+    if held(x, p, u):
+        _observe_held(x, p, u, record)
+
+
+@compiled
+def _observe_held(x: FloatArray, p: FloatArray, u: FloatArray, record: FloatArray) -> None:
+    """What is true of a vehicle that is held: brakes and tyres give what the slope asks for."""
+    along, across, share = gravity(u)
+    record[R.AX], record[R.AY] = -along, -across
+    record[R.AX_FELT] = -along + p[Q.PITCH_LEAK] * x[X.AX_LAGGED]
+    record[R.AY_FELT] = -across + p[Q.ROLL_LEAK] * x[X.AY_LAGGED]
+    record[R.YAW_RATE] = record[R.VX] = record[R.VY] = 0.0
+    for i in range(4):
+        brake_share = p[Q.BRAKE_FRONT] if i < 2 else 1.0 - p[Q.BRAKE_FRONT]
+        record[R.OMEGA + i] = 0.0
+        record[R.TORQUE + i] = -0.5 * brake_share * p[P.MASS] * along * p[P.RADIUS]
+        record[R.UTILISATION + i] = math.hypot(along, across) / (u[U.MU, i] * GRAVITY * share)
 
 
 @compiled

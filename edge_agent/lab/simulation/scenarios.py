@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from edge_agent.lab.simulation.friction import DRY, ICE, SNOW, WET, F, Patch, friction_table, look_up_many
 from edge_agent.lab.simulation.place import GOTHENBURG, Origin
+from edge_agent.lab.simulation.relief import LEVEL, Relief, Wave
 from edge_agent.lab.simulation.roads import Network, Road, build_network
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
@@ -26,6 +27,7 @@ class Scenario:
     roads: tuple[Road, ...]
     background: float
     patches: tuple[Patch, ...]
+    relief: Relief = LEVEL
     origin: Origin = field(default=GOTHENBURG)
 
     @cached_property
@@ -89,6 +91,18 @@ def demo() -> Scenario:
     )  # fmt: skip
 
 
+def hills() -> Scenario:
+    """The demonstration's town on hills: one height over the plane, crossfall, and banked bends.
+
+    Slopes reach 8 %; where it is icy they are gentle, or nobody would come up again.
+    """
+    relief = Relief(
+        (Wave(0.05, 620.0, 0.6, 1.2), Wave(0.04, 290.0, 2.2, 0.4), Wave(0.03, 150.0, -0.5, 2.0)),
+        crossfall=0.025, banking=0.5,
+    )  # fmt: skip
+    return replace(demo(), name="hills", about="the demo's town on slopes to 8 %, with crossfall", relief=relief)
+
+
 def tiny() -> Scenario:
     """A triangle of three streets, half of it snow, an ice patch at 5 s: for tests."""
     return Scenario(
@@ -104,7 +118,7 @@ def tiny() -> Scenario:
     )
 
 
-SCENARIOS: Final = {scenario.name: scenario for scenario in (demo(), tiny())}
+SCENARIOS: Final = {scenario.name: scenario for scenario in (demo(), hills(), tiny())}
 
 
 def scenario_named(name: str | Scenario) -> Scenario:

@@ -1,5 +1,6 @@
 """What the sensors say of a true record: white noise, constant offsets, gains, a wandering position, missing readings.
 
+The sets that begin with "rough" are those of real cars: `misaligned.py` says what they have on top, and from where.
 Every random number is a hash of (vehicle key, sample number, channel), so a reading depends neither on how a drive is
 cut into blocks nor on the other vehicles. Only the satellite receiver's wander is carried from block to block.
 """
@@ -7,7 +8,7 @@ cut into blocks nor on the other vehicles. Only the satellite receiver's wander 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Final, TypeAlias
 
@@ -15,6 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_agent.lab.simulation.chance import key_of, normal, uniform
+from edge_agent.lab.simulation.misaligned import (
+    ALIGNED,
+    COLUMNS,
+    DEVICE_OF,
+    DEVICES,
+    MISALIGNED,
+    M,
+    Misalignment,
+    counted,
+    late,
+    misalign,
+    misalignment_row,
+)
 from edge_agent.lab.simulation.place import Origin
 from edge_agent.lab.simulation.plant import R
 from schemas.errors import InputError
@@ -38,9 +52,10 @@ class Sensors:
     yaw: tuple[float, float] = (0.0, 0.0)  # [rad] white, wandering
     leak: bool = False  # accelerometers fixed to the rolling body
     dropouts: float = 0.0  # share of the half seconds in which one group of channels is silent
+    mounted: Misalignment = ALIGNED  # how the devices sit in the car, and what their clocks say
 
 
-SENSORS: Final = {
+ORDINARY: Final = {
     "ideal": Sensors(),
     "mems": Sensors(
         acceleration=(0.05, 0.03), yaw_rate=(0.002, 0.001), steering=(0.001, 0.0005), wheel_speed=0.03,
@@ -55,6 +70,14 @@ SENSORS: Final = {
         torque=(2.0, 0.03), position=(0.3, 1.5), yaw=(0.01, 0.01), leak=True, dropouts=0.002,
     ),
 }  # fmt: skip
+SENSORS: Final = ORDINARY | {
+    name: replace(ORDINARY["mems-leak"], yaw_rate=(0.002, 0.003), mounted=mounted)
+    for name, mounted in MISALIGNED.items()
+}
+# of a live fleet: torque is recorded by half of the cars, and now and then a channel is silent
+ROUGH_FLEET: Final = replace(
+    SENSORS["rough"], dropouts=0.002, mounted=replace(SENSORS["rough"].mounted, torqueless=0.5)
+)
 
 FIX_S: Final = 0.1  # a receiver gives ten positions a second; the samples between have none
 WANDER_S: Final = 60.0  # correlation time of its slow error
@@ -81,9 +104,10 @@ class E(IntEnum):
     WANDER = 3 * len(CHANNELS)  # std of the three wandering errors: latitude, longitude, yaw
     LEAK = 3 * len(CHANNELS) + 3
     DROPOUTS = 3 * len(CHANNELS) + 4
+    MOUNTED = 3 * len(CHANNELS) + 5  # from here on, columns M of `misaligned.py`
 
 
-ERRORS: Final = 3 * len(CHANNELS) + 5
+ERRORS: Final = int(E.MOUNTED) + COLUMNS
 
 
 def sensors_named(name: str | Sensors) -> Sensors:
@@ -116,7 +140,8 @@ def error_row(sensors: Sensors, origin: Origin, seed: int, index: int) -> FloatA
     offset *= rng.standard_normal(len(CHANNELS))
     offset[S.DELTA : S.DELTA + 4] = offset[S.DELTA]  # one steering sensor feeds the four angles
     wander = (sensors.position[1] * north, sensors.position[1] * east, sensors.yaw[1])
-    return np.array([*white, *offset, *gain, *wander, float(sensors.leak), sensors.dropouts])
+    mounted = misalignment_row(sensors.mounted, seed, index)
+    return np.array([*white, *offset, *gain, *wander, float(sensors.leak), sensors.dropouts, *mounted])
 
 
 def noise_keys(seed: int, index: int) -> tuple[np.uint64, np.uint64]:
@@ -141,6 +166,21 @@ def read_out(record: FloatArray, error: FloatArray, place: FloatArray, signals: 
 
 
 @compiled
+def read_late(
+    records: FloatArray, lead: int, error: FloatArray, place: FloatArray, rate_hz: float, signals: FloatArray
+) -> None:
+    """Fill `signals` (18,) with what each device says of its own past; records (T, 32), of which row `lead` is now."""
+    record, told = np.empty(records.shape[1]), np.empty(signals.size)
+    for device in range(DEVICES):
+        late(records, lead, error[E.MOUNTED + M.LAG + device] * rate_hz, record)
+        read_out(record, error, place, told)
+        for c in range(signals.size):
+            if DEVICE_OF[c] == device:
+                signals[c] = told[c]
+    misalign(error[E.MOUNTED :], signals)
+
+
+@compiled
 def wander_on(error: FloatArray, wander: FloatArray, key: np.uint64, sample: int) -> None:
     """Move the receiver's slow errors `wander` (3,) on to the next fix; the first has their long-run spread."""
     keep = 0.0 if sample == 0 else math.exp(-FIX_S / WANDER_S)
@@ -152,14 +192,16 @@ def wander_on(error: FloatArray, wander: FloatArray, key: np.uint64, sample: int
 @compiled
 def sense(
     records: FloatArray, errors: FloatArray, wander: FloatArray, place: FloatArray, keys: tuple[KeyArray, KeyArray],
-    first: int, rate_hz: float,
+    clock: tuple[int, float, int],
 ) -> FloatArray:  # fmt: skip
-    """Signals (T, N, 18) of the records (T, N, 30); `wander` (N, 3) is carried on; `first` numbers the first sample.
+    """Signals (T, N, 18) of the records (lead + T, N, 32), of which the first `lead` were read before.
 
-    keys: two uint64 arrays (N,), of the noise and of the dropouts.
+    `wander` (N, 3) is carried on; keys: two uint64 arrays (N,), of the noise and of the dropouts; clock: number of the
+    first sample that is read, rate [Hz] and `lead`.
     """
     white, silence = keys
-    steps, vehicles = records.shape[0], records.shape[1]
+    first, rate_hz, lead = clock
+    steps, vehicles = records.shape[0] - lead, records.shape[1]
     signals = np.empty((steps, vehicles, len(CHANNELS)))
     per_fix = max(1, round(rate_hz * FIX_S))
     per_silence = max(1, round(rate_hz * SILENCE_S))
@@ -168,7 +210,11 @@ def sense(
         for k in range(steps):
             sample = first + k
             row = signals[k, n]
-            read_out(records[k, n], error, place, row)
+            rough = error[E.MOUNTED + M.ROUGH] > 0.0
+            if rough:
+                read_late(records[:, n], lead + k, error, place, rate_hz, row)
+            else:
+                read_out(records[k + lead, n], error, place, row)
             fix = sample % per_fix == 0
             if fix:
                 wander_on(error, wander[n], white[n], sample)
@@ -181,6 +227,8 @@ def sense(
                     row[c] += error[E.WHITE + c] * normal(white[n], sample * DRAWS + c)
                 if c >= S.LATITUDE:
                     row[c] += wander[n, c - S.LATITUDE]
+            if rough:
+                counted(records[lead + k, n], error[E.MOUNTED :], row)
             if error[E.DROPOUTS] > 0.0:
                 window = sample // per_silence
                 for c in range(len(CHANNELS)):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -23,6 +23,7 @@ from edge_agent.lab.simulation.plant import (
     X,
     advance,
     command,
+    gravity,
     observe,
     start_at,
     strongest_pull,
@@ -30,6 +31,7 @@ from edge_agent.lab.simulation.plant import (
     wheel_place,
 )
 from edge_agent.lab.simulation.presets import TrueVehicle, nominal, true_vehicle
+from edge_agent.lab.simulation.relief import Relief, gradient, road_named, tilt
 from edge_agent.lab.simulation.sensors import SENSORS, Sensors, error_row, noise_keys, sense, sensors_named
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
@@ -41,6 +43,7 @@ TRUTH: Final = (
     ("true_yaw", R.YAW), ("true_ax", R.AX), ("true_ay", R.AY),
     *((name, R.MU + i) for i, name in enumerate(per_wheel("true_mu"))),
     *((name, R.UTILISATION + i) for i, name in enumerate(per_wheel("true_utilisation"))),
+    ("true_slope", R.SLOPE), ("true_bank", R.BANK),
 )  # fmt: skip
 STEERING_LAG_S: Final = 0.1  # from the wish to the road wheel
 PEDAL_LAG_S: Final = 0.15
@@ -49,7 +52,7 @@ PEDAL_LAG_S: Final = 0.15
 def simulate_manoeuvre(
     name: str, *, mu: Friction | None = None, speed: float | None = None, seed: int = 0, rate_hz: float = 100.0,
     duration_s: float | None = None, vehicle: str | Vehicle | TrueVehicle = "sedan", sensors: str | Sensors = "mems",
-    faults: tuple[Fault, ...] = (), origin: Origin = GOTHENBURG,
+    faults: tuple[Fault, ...] = (), road: str | Relief = "level", slope: float = 0.0, origin: Origin = GOTHENBURG,
 ) -> tuple[pa.Table, Vehicle]:  # fmt: skip
     """Drive a manoeuvre and return (log, vehicle file).
 
@@ -63,6 +66,8 @@ def simulate_manoeuvre(
         speed: [m/s], likewise.
         duration_s: [s], likewise.
         vehicle: a key of PRESETS, or the true vehicle itself.
+        road: a key of ROADS, drawn by the seed, or a relief.
+        slope: rise per metre along the track [1] that is added to it.
 
     Raises:
         InputError: an argument is out of range or unknown.
@@ -70,12 +75,12 @@ def simulate_manoeuvre(
     manoeuvre = _named(name)
     told = sensors_named(sensors)
     truth = true_vehicle(vehicle)
+    seed = checked_seed(seed)
+    _check(speed=speed, rate_hz=rate_hz, duration_s=duration_s)
     speed = manoeuvre.speed if speed is None else speed
     duration = manoeuvre.duration if duration_s is None else duration_s
-    seed = checked_seed(seed)
-    _check(speed=speed, rate_hz=rate_hz, duration_s=duration)
-    friction = _friction(manoeuvre.friction if mu is None else mu)
-    records = _drive(manoeuvre, truth, friction, speed, rate_hz, max(1, round(duration * rate_hz)))
+    world = World(_friction(manoeuvre.friction if mu is None else mu), road_named(road, seed, slope).table)
+    records = _drive(manoeuvre, truth, world, speed, rate_hz, max(1, round(duration * rate_hz)))
     signals = _sensed(records, told, origin, seed, rate_hz)
     t = np.arange(len(records)) / rate_hz
     signals = apply_faults(t, signals, faults)
@@ -89,9 +94,9 @@ def _named(name: str) -> Manoeuvre:
     return MANOEUVRES[name]
 
 
-def _check(**positive: float) -> None:
+def _check(**positive: float | None) -> None:
     for name, value in positive.items():
-        if not (math.isfinite(value) and value > 0.0):
+        if value is not None and not (math.isfinite(value) and value > 0.0):
             raise InputError(name, f"{value} is not possible", "give a positive number")
 
 
@@ -103,24 +108,35 @@ def _friction(mu: Friction) -> Callable[[float, float], float]:
     return lambda _x, _y: mu
 
 
+class World(NamedTuple):
+    """The test track: friction at (x, y) [m], and the table of its relief."""
+
+    friction: Callable[[float, float], float]
+    relief: FloatArray
+
+
 def _drive(
-    manoeuvre: Manoeuvre, truth: TrueVehicle, friction: Callable[[float, float], float], speed: float,
-    rate_hz: float, samples: int,
-) -> FloatArray:  # fmt: skip
-    """True records (T, 30) of the drive."""
+    manoeuvre: Manoeuvre, truth: TrueVehicle, world: World, speed: float, rate_hz: float, samples: int
+) -> FloatArray:
+    """True records (T, 32) of the drive; the driver gives as much more gas as a slope takes."""
     p, x, u, w = truth.row(), np.zeros(STATES), np.zeros((len(U), 4)), np.zeros((len(W), 4))
     records = np.empty((samples, RECORD))
     substeps, dt = substeps_of(rate_hz), 1.0 / rate_hz
     start_at(x, p, (0.0, 0.0, 0.0), speed)
     steer = force = 0.0
     for k in range(samples):
+        east, north = gradient(world.relief, (x[X.X], x[X.Y]), (1.0, 0.0), 0.0)
+        u[U.TILT, :2] = tilt(east, north, x[X.YAW])
         wish, acceleration = manoeuvre.control(_moment(k * dt, x, speed))
+        acceleration -= gravity(u)[0]
+        if k == 0 and speed == 0.0:
+            force = float(p[P.MASS]) * acceleration  # who stands has had his foot down before
         steer += (wish - steer) * -math.expm1(-dt / STEERING_LAG_S)
         force += (float(p[P.MASS]) * acceleration - force) * -math.expm1(-dt / PEDAL_LAG_S)
         force = min(force, strongest_pull(p, float(x[X.VX])))
         command(p, u, steer, force)
         for i in range(4):
-            u[U.MU, i] = friction(*wheel_place(x, p, i))
+            u[U.MU, i] = world.friction(*wheel_place(x, p, i))
         observe(x, p, u, w, records[k])
         advance(x, p, u, w, dt / substeps, substeps)
     return records
@@ -135,7 +151,7 @@ def _sensed(records: FloatArray, sensors: Sensors, origin: Origin, seed: int, ra
     errors = error_row(sensors, origin, seed, 0)[None]
     place = np.array([origin.latitude, origin.longitude, *origin.per_metre])
     keys = tuple(np.array([key]) for key in noise_keys(seed, 0))
-    return sense(records[:, None], errors, np.zeros((1, 3)), place, (keys[0], keys[1]), 0, rate_hz)[:, 0]
+    return sense(records[:, None], errors, np.zeros((1, 3)), place, (keys[0], keys[1]), (0, rate_hz, 0))[:, 0]
 
 
 def _table(t: FloatArray, signals: FloatArray, records: FloatArray) -> pa.Table:

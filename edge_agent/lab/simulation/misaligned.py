@@ -1,0 +1,131 @@
+"""How devices sit in real cars: tilted mounts, steering off its zero, unlike wheels, coarse counters, clocks apart.
+
+Legend (drawn once per vehicle, each number a hash of (seed, vehicle, its place), so that none moves another)
+    θ, φ, ψ  pitch, roll and yaw of the inertial unit's mount [rad], to first order:
+             a_x' = a_x + g θ + ψ a_y,  a_y' = a_y + g φ − ψ a_x
+    δ        front wheel's angle: δ' = δ_0 + δ (1 + γ + β |δ|/WIDE), offset, gain, and a map that depends on angle
+    ε        of each wheel: ω' = ω (1 + ε), as of a radius smaller by ε
+    Δω       wheel speeds come in steps of it; a wheel that stands reads zero, since teeth are counted
+    τ        each device tells of the moment τ ago
+
+Sizes are those met in eleven public logs of real cars: offsets of a_x .22 to .96 and of a_y .07 to .54 m/s^2, steering
+1 to 17 mrad, gains of steering off by 3 % at speed and 5 to 15 % at .3 to .5 rad, radii .15 to 1.6 % apart, wheel
+speeds in steps of up to 1 km/h, clocks .02 to .4 s apart, and torque in hardly any.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import Final
+
+import numpy as np
+
+from edge_agent.dynamics.parameters import GRAVITY
+from edge_agent.lab.simulation.chance import key_of, normal, uniform
+from edge_agent.lab.simulation.plant import R
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+from schemas.signals import S
+
+WIDE: Final = 0.4  # [rad] of a wheel turned far in, where the steering's map is most wrong
+KMH: Final = 1.0 / 3.6 / 0.33  # [rad/s] that a wheel of .33 m turns faster at one km/h more
+MOUNT_STREAM: Final = 4
+
+DEVICES: Final = 5  # inertial unit, steering, wheels, torque, receiver
+DEVICE_OF: Final = np.array([0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3, 4, 4, 4])
+
+
+@dataclass(frozen=True)
+class Misalignment:
+    """Standard deviations, except where a largest size is said."""
+
+    tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [rad] θ, φ, ψ
+    steering: tuple[float, float, float] = (0.0, 0.0, 0.0)  # δ_0 [rad], γ, β
+    radius: float = 0.0  # ε
+    step: float = 0.0  # [rad/s] largest Δω, drawn evenly
+    lag_s: float = 0.0  # [s] largest τ, drawn evenly
+    torqueless: float = 0.0  # share of the vehicles without wheel torque
+
+
+ALIGNED: Final = Misalignment()
+ROUGH: Final = Misalignment(tilt=(0.035, 0.015, 0.01), steering=(0.003, 0.03, 0.05), radius=0.004, step=0.1, lag_s=0.06)
+MISALIGNED: Final = {
+    "rough": ROUGH, "rough-coarse": replace(ROUGH, step=KMH), "rough-late": replace(ROUGH, lag_s=0.4),
+}  # fmt: skip
+
+
+class M(IntEnum):
+    """Columns of a vehicle's misalignment."""
+
+    ROUGH = 0  # whether there is any
+    AX = 1  # [m/s^2] g θ
+    AY = 2
+    TURN = 3  # [rad] ψ
+    ZERO = 4  # [rad] δ_0
+    GAIN = 5  # γ
+    BEND = 6  # β
+    RADIUS = 7  # ε of four wheels
+    STEP = 11  # [rad/s] Δω
+    LAG = 12  # [s] τ of the DEVICES
+    TORQUELESS = 17
+
+
+def misalignment_row(size: Misalignment, seed: int, index: int) -> FloatArray:
+    """Misalignment of vehicle `index`, shape (COLUMNS,), columns M."""
+    key, row = key_of(seed, index, MOUNT_STREAM), np.zeros(COLUMNS)
+    row[M.ROUGH] = float(size != ALIGNED)
+    stds = (*(GRAVITY * tilt for tilt in size.tilt[:2]), size.tilt[2], *size.steering, *[size.radius] * 4)
+    for k, std in enumerate(stds):
+        row[M.AX + k] = std * normal(key, k)
+    row[M.STEP] = size.step * uniform(key, 100)
+    for device in range(DEVICES):
+        row[M.LAG + device] = size.lag_s * uniform(key, 101 + device)
+    row[M.TORQUELESS] = float(uniform(key, 110) < size.torqueless)
+    return row
+
+
+COLUMNS: Final = int(M.TORQUELESS) + 1
+
+
+def memory_of(rows: FloatArray, rate_hz: float) -> int:
+    """How many samples back the latest clock of the rows (N, COLUMNS) speaks of, and one more."""
+    lag = float(rows[:, M.LAG : M.LAG + DEVICES].max())
+    return math.ceil(lag * rate_hz) + 1 if lag > 0.0 else 0
+
+
+@compiled
+def late(records: FloatArray, now: int, samples: float, record: FloatArray) -> None:
+    """Fill `record` from the records (T, 32) `samples` before row `now`, linear between them, the first before all."""
+    whole = math.floor(samples)
+    share = samples - whole
+    near, far = max(now - whole, 0), max(now - whole - 1, 0)
+    for c in range(record.size):
+        record[c] = (1.0 - share) * records[near, c] + share * records[far, c]
+
+
+@compiled
+def misalign(mounted: FloatArray, signals: FloatArray) -> None:
+    """Turn true readings (18,) into those of misaligned devices, in place."""
+    ax, ay = signals[S.AX], signals[S.AY]
+    signals[S.AX] = ax + mounted[M.AX] + mounted[M.TURN] * ay
+    signals[S.AY] = ay + mounted[M.AY] - mounted[M.TURN] * ax
+    for i in range(2):
+        angle = signals[S.DELTA + i]
+        signals[S.DELTA + i] = mounted[M.ZERO] + angle * (1.0 + mounted[M.GAIN] + mounted[M.BEND] * abs(angle) / WIDE)
+    for i in range(4):
+        signals[S.OMEGA + i] *= 1.0 + mounted[M.RADIUS + i]
+
+
+@compiled
+def counted(record: FloatArray, mounted: FloatArray, signals: FloatArray) -> None:
+    """Wheel speeds in steps, none of a wheel that stands; and no torque where there is none."""
+    step = mounted[M.STEP]
+    for i in range(4):
+        if record[R.OMEGA + i] == 0.0:
+            signals[S.OMEGA + i] = 0.0
+        elif step > 0.0:
+            signals[S.OMEGA + i] = math.floor(signals[S.OMEGA + i] / step + 0.5) * step
+        if mounted[M.TORQUELESS] > 0.0:
+            signals[S.TORQUE + i] = math.nan

@@ -1,0 +1,293 @@
+"""Slopes, banks, standing vehicles and misaligned devices: mechanics first, then what the sensors make of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from edge_agent.dynamics.parameters import GRAVITY, P
+from edge_agent.lab.simulation import (
+    PRESETS,
+    ROADS,
+    SCENARIOS,
+    SENSORS,
+    Relief,
+    SimulatedFleet,
+    Wave,
+    simulate_manoeuvre,
+)
+from edge_agent.lab.simulation.misaligned import DEVICE_OF, DEVICES, WIDE, M, Misalignment, misalignment_row
+from edge_agent.lab.simulation.plant import INPUTS, STATES, U, W, X, advance, command, held, start_at, wheel_forces
+from edge_agent.lab.simulation.relief import STEEPEST, gradient, tilt
+from edge_agent.lab.simulation.roads import L
+from edge_agent.lab.simulation.sensors import ROUGH_FLEET, Sensors
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+from schemas.signals import CHANNELS, S, per_wheel
+
+SLOPES = (-0.08, -0.03, 0.02, 0.05, 0.08)
+
+
+def column(log: pa.Table, name: str) -> FloatArray:
+    return np.asarray(log[name].to_numpy(zero_copy_only=False), dtype=np.float64)
+
+
+def sine(slope: float) -> float:
+    """Of the angle whose tangent is the slope."""
+    return slope / float(np.hypot(1.0, slope))
+
+
+def still(slope: float, bank: float = 0.0, mu: float = 0.85) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """State, parameters, inputs and wheels of a standing sedan."""
+    p, x = PRESETS["sedan"].row(), np.zeros(STATES)
+    u, w = np.zeros((INPUTS, 4)), np.zeros((len(W), 4))
+    start_at(x, p, (0.0, 0.0, 0.0), 0.0)
+    u[U.MU], u[U.TILT, 0], u[U.TILT, 1] = mu, slope, bank
+    return x, p, u, w
+
+
+@pytest.mark.parametrize("slope", SLOPES)
+def test_a_standing_car_feels_the_sine_of_the_slope_and_stays_where_it_is(slope: float) -> None:
+    log, _ = simulate_manoeuvre("standing", sensors="ideal", slope=slope)
+    np.testing.assert_allclose(column(log, "ax"), GRAVITY * sine(slope), rtol=1e-12)
+    for name in ("true_vx", "true_vy", "true_x", "true_y", "true_yaw", *per_wheel("omega")):
+        assert not column(log, name).any(), name
+    torque = sum(column(log, name)[-1] for name in per_wheel("torque"))
+    vehicle = PRESETS["sedan"].vehicle
+    assert torque == pytest.approx(vehicle.mass * GRAVITY * sine(slope) * vehicle.wheel_radius, rel=1e-9)
+    used = np.mean([column(log, name)[-1] for name in per_wheel("true_utilisation")])
+    assert used == pytest.approx(abs(slope) / 0.85, rel=1e-9)  # tangent over friction
+
+
+@pytest.mark.parametrize("slope", SLOPES)
+def test_climbing_at_constant_speed_takes_the_torque_that_the_slope_asks_for(slope: float) -> None:
+    light = replace(PRESETS["sedan"], drag=0.0, rolling=0.0)
+    log, _ = simulate_manoeuvre("straight", sensors="ideal", slope=slope, vehicle=light)
+    vehicle = light.vehicle
+    torque = sum(column(log, name)[-500:].mean() for name in per_wheel("torque"))
+    assert torque == pytest.approx(vehicle.mass * GRAVITY * sine(slope) * vehicle.wheel_radius, rel=2e-3)
+    assert column(log, "ax")[-500:].mean() == pytest.approx(GRAVITY * sine(slope), rel=2e-3)
+    assert column(log, "true_vx")[-1] == pytest.approx(column(log, "true_vx")[0], abs=0.1)
+
+
+@pytest.mark.parametrize("bank", [-0.06, 0.04])
+def test_straight_driving_on_a_bank_feels_its_sine(bank: float) -> None:
+    log, _ = simulate_manoeuvre("straight", sensors="ideal", road=Relief(crossfall=bank))
+    assert column(log, "ay")[-500:].mean() == pytest.approx(GRAVITY * sine(bank), rel=0.01)
+    assert column(log, "true_bank")[-1] == pytest.approx(bank, rel=1e-3)
+    assert abs(column(log, "true_vy")[-1]) > 0.01  # the tyres hold against it with a slip angle
+
+
+@pytest.mark.parametrize("slope", [-0.06, 0.03])
+def test_a_coasting_vehicle_gains_what_it_falls_and_no_more(slope: float) -> None:
+    p = replace(PRESETS["sedan"], drag=0.0, rolling=0.0).row()
+    x, u, w = np.zeros(STATES), np.zeros((INPUTS, 4)), np.zeros((len(W), 4))
+    start_at(x, p, (0.0, 0.0, 0.0), 15.0)
+    u[U.MU], u[U.TILT, 0] = 0.9, slope
+    command(p, u, 0.0, 0.0)
+
+    def energy() -> float:
+        turning = 0.5 * p[P.WHEEL_INERTIA] * (x[X.OMEGA : X.OMEGA + 4] ** 2).sum()
+        return float(0.5 * p[P.MASS] * x[X.VX] ** 2 + turning + p[P.MASS] * GRAVITY * sine(slope) * x[X.X])
+
+    before = energy()
+    for _ in range(50):
+        advance(x, p, u, w, 1e-3, 100)
+        assert before * (1 - 1e-3) < energy() <= before * (1 + 1e-5)
+    assert (x[X.VX] - 15.0) * slope < 0.0
+
+
+def test_loads_add_up_to_the_weight_that_is_normal_to_the_road_and_move_downhill() -> None:
+    x, p, u, w = still(0.08, -0.05)
+    command(p, u, 0.0, -8000.0)
+    advance(x, p, u, w, 1e-3, 1000)
+    wheel_forces(x, p, u, w)
+    assert w[W.FZ].sum() == pytest.approx(p[P.MASS] * GRAVITY / np.sqrt(1 + 0.08**2 + 0.05**2), rel=1e-9)
+    level, *_ = still(0.0)
+    flat = np.zeros((len(W), 4))
+    wheel_forces(level, p, np.zeros((INPUTS, 4)) + 0.85 * (np.arange(INPUTS) == U.MU)[:, None], flat)
+    assert (w[W.FZ, 2:] > flat[W.FZ, 2:])[0]  # uphill the rear carries more, and here the left lies lower
+    assert w[W.FZ, 0] > w[W.FZ, 1]
+
+
+def test_brakes_hold_what_they_can_and_tyres_what_the_road_allows() -> None:
+    for force, mu, stays in ((-8000.0, 0.85, True), (-400.0, 0.85, False), (-8000.0, 0.05, False), (0.0, 0.85, False)):
+        x, p, u, w = still(0.08, mu=mu)
+        command(p, u, 0.0, force)
+        assert held(x, p, u) == stays
+        advance(x, p, u, w, 1e-3, 2000)
+        assert (x[X.VX] == 0.0) == stays
+        assert (x[X.X] < -0.1) == (not stays)
+
+
+@pytest.mark.parametrize("slope", [-0.08, 0.0, 0.08])
+def test_traffic_lights_stop_it_hold_it_and_let_it_go(slope: float) -> None:
+    log, _ = simulate_manoeuvre("stop-and-go", sensors="ideal", slope=slope)
+    speed = column(log, "true_vx")
+    stands = speed == 0.0
+    assert np.diff(stands.astype(int)).tolist().count(1) == 4
+    assert stands.mean() > 0.05
+    assert speed.max() > 9.0
+    assert speed.min() > -0.05  # between brake and gas it may roll back a little
+    for name in per_wheel("omega"):
+        assert not column(log, name)[stands].any()
+    held_fast = np.flatnonzero(stands[:-1] & stands[1:])  # the last sample of a stand is that of the foot coming off
+    np.testing.assert_allclose(column(log, "ax")[held_fast], GRAVITY * sine(slope), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ROADS)
+def test_every_road_is_the_gradient_of_a_height_and_public(name: str) -> None:
+    for seed in range(20):
+        table = ROADS[name](seed).table
+        slopes = np.array([gradient(table, (x, 0.0), (1.0, 0.0), 0.0) for x in np.linspace(0, 1000, 400)])
+        assert np.hypot(*slopes.T).max() <= STEEPEST * (1 + 1e-12)
+        assert slopes.any() == (name != "level")
+        east, north = slopes[7].tolist()
+        there, back = tilt(east, north, 0.3), tilt(east, north, 0.3 + np.pi)
+        np.testing.assert_allclose(there, np.negative(back), atol=1e-15)  # up one way is down the other
+
+
+def test_the_hills_lead_back_to_the_same_height_whatever_the_way() -> None:
+    table = replace(SCENARIOS["hills"].relief, crossfall=0.0, banking=0.0).table
+    ways = []
+    for corner in ((180.0, 0.0), (0.0, 120.0)):
+        climbed = 0.0
+        for start, end in (((0.0, 0.0), corner), (corner, (180.0, 120.0))):
+            line = np.linspace(start, end, 4001)
+            middle, step = 0.5 * (line[1:] + line[:-1]), (np.array(end) - start) / 4000
+            climbed += sum(float(np.dot(gradient(table, (x, y), (1.0, 0.0), 0.0), step)) for x, y in middle)
+        ways.append(climbed)
+    assert ways[0] == pytest.approx(ways[1], abs=0.05)
+    assert abs(ways[0]) > 0.5
+
+
+def test_lanes_fall_to_their_right_and_bends_to_their_inside() -> None:
+    table = Relief(crossfall=0.025, banking=0.5).table
+    for heading in np.linspace(0, 6, 9).tolist():
+        lane, falls = (float(np.cos(heading)), float(np.sin(heading))), []
+        for curvature in (0.0, 0.02, -0.02):
+            east, north = gradient(table, (0.0, 0.0), lane, curvature)
+            falls.append(tilt(east, north, heading))
+        np.testing.assert_allclose([left for _, left in falls], [0.025, 0.015, 0.035], atol=1e-12)
+        np.testing.assert_allclose([ahead for ahead, _ in falls], 0.0, atol=1e-12)
+
+
+def test_the_town_on_hills_reaches_eight_per_cent_and_is_gentle_where_it_is_icy() -> None:
+    scenario = SCENARIOS["hills"]
+    points, table = scenario.network.points, scenario.relief.table
+    along = []
+    for row in points:
+        east, north = gradient(table, (row[L.X], row[L.Y]), (row[L.COS], row[L.SIN]), row[L.CURVATURE])
+        along.append(east * row[L.COS] + north * row[L.SIN])
+    steep = np.abs(along)
+    assert 0.07 < steep.max() <= STEEPEST
+    assert 0.02 < np.std(along) < 0.045
+    icy = scenario.friction(100.0, points[:, L.X], points[:, L.Y]) < 0.2
+    assert icy.any()
+    assert steep[icy].max() < 0.055
+
+
+ONLY = {
+    "tilt": Misalignment(tilt=(0.035, 0.015, 0.01)),
+    "steering": Misalignment(steering=(0.003, 0.03, 0.05)),
+    "radius": Misalignment(radius=0.004),
+    "step": Misalignment(step=0.1),
+    "lag": Misalignment(lag_s=0.06),
+    "torque": Misalignment(torqueless=1.0),
+}
+
+
+def two(manoeuvre: str, mounted: Misalignment) -> tuple[dict[str, FloatArray], dict[str, FloatArray], FloatArray]:
+    """Channels of a drive with ideal sensors, of the same drive with misaligned ones, and their row."""
+    exact, _ = simulate_manoeuvre(manoeuvre, sensors="ideal")
+    told, _ = simulate_manoeuvre(manoeuvre, sensors=Sensors(mounted=mounted), seed=5)
+    named = [{name: column(log, name) for name in CHANNELS} for log in (exact, told)]
+    return named[0], named[1], misalignment_row(mounted, 5, 0)
+
+
+@pytest.mark.parametrize("name", ONLY)
+def test_a_misalignment_is_exactly_what_its_row_says_and_touches_nothing_else(name: str) -> None:
+    exact, told, row = two("sine", ONLY[name])
+    wanted = {key: value.copy() for key, value in exact.items()}
+    t = np.arange(len(exact["ax"])) / 100.0
+    if name == "tilt":
+        wanted["ax"] = exact["ax"] + row[M.AX] + row[M.TURN] * exact["ay"]
+        wanted["ay"] = exact["ay"] + row[M.AY] - row[M.TURN] * exact["ax"]
+    for i, wheel in enumerate(("fl", "fr", "rl", "rr")):
+        angle, speed = exact[f"delta_{wheel}"], exact[f"omega_{wheel}"]
+        if name == "steering" and i < 2:
+            bend = 1.0 + row[M.GAIN] + row[M.BEND] * np.abs(angle) / WIDE
+            wanted[f"delta_{wheel}"] = row[M.ZERO] + bend * angle
+        if name == "radius":
+            wanted[f"omega_{wheel}"] = speed * (1.0 + row[M.RADIUS + i])
+        if name == "step":
+            wanted[f"omega_{wheel}"] = np.floor(speed / row[M.STEP] + 0.5) * row[M.STEP]
+        if name == "torque":
+            wanted[f"torque_{wheel}"] = np.full_like(speed, np.nan)
+    if name == "lag":
+        for c, channel in enumerate(CHANNELS[: S.LATITUDE]):
+            wanted[channel] = np.interp(t - row[M.LAG + DEVICE_OF[c]], t, exact[channel])
+        assert np.ptp(row[M.LAG : M.LAG + DEVICES]) > 0.005
+    for channel in CHANNELS[: S.LATITUDE]:
+        np.testing.assert_allclose(told[channel], wanted[channel], rtol=1e-9, atol=1e-9, err_msg=channel)
+    assert any(not np.array_equal(told[c], exact[c], equal_nan=True) for c in CHANNELS)
+
+
+def test_one_misalignment_does_not_move_another_and_sizes_are_those_of_the_table() -> None:
+    whole = SENSORS["rough"].mounted
+    rows = np.array([misalignment_row(whole, 1, k) for k in range(400)])
+    alone = np.array([misalignment_row(ONLY["radius"], 1, k) for k in range(400)])
+    np.testing.assert_array_equal(rows[:, M.RADIUS : M.RADIUS + 4], alone[:, M.RADIUS : M.RADIUS + 4])
+    assert rows[:, M.AX].std() == pytest.approx(GRAVITY * whole.tilt[0], rel=0.1)
+    assert 0.25 < rows[:, M.AX].std() < 0.5
+    assert 0.12 < rows[:, M.AY].std() < 0.25
+    assert rows[:, M.ZERO].std() == pytest.approx(whole.steering[0], rel=0.1)
+    assert rows[:, M.STEP].max() <= whole.step
+    assert rows[:, M.LAG : M.LAG + DEVICES].max() <= whole.lag_s
+    assert rows[:, M.LAG : M.LAG + DEVICES].max() > 0.9 * whole.lag_s
+
+
+def test_a_wheel_that_stands_reads_zero_and_one_that_turns_reads_steps() -> None:
+    log, _ = simulate_manoeuvre("stop-and-go", sensors="rough-coarse", road="hilly", seed=3)
+    stands = column(log, "true_vx") == 0.0
+    step = misalignment_row(SENSORS["rough-coarse"].mounted, 3, 0)[M.STEP]
+    for name in per_wheel("omega"):
+        assert not column(log, name)[stands].any()
+        np.testing.assert_allclose(column(log, name) / step, np.round(column(log, name) / step), atol=1e-6)
+
+
+def test_half_a_fleet_is_rough_and_the_other_half_drives_as_it_always_did() -> None:
+    plain, mixed = SimulatedFleet("demo", 6, 5, 50.0), SimulatedFleet("demo", 6, 5, 50.0, rough=0.5)
+    assert mixed.rough.tolist() == [False, True, False, True, False, True]
+    (_, usual), (_, told) = plain.step(2000), mixed.step(2000)
+    np.testing.assert_array_equal(usual[:, ::2], told[:, ::2])
+    assert not np.array_equal(usual[:, 1], told[:, 1], equal_nan=True)
+    assert (mixed.truth.vx[:, 1::2] == 0.0).any()  # their drivers stop now and then
+    assert (mixed.truth.vx[:, ::2] > 0.0).all()
+
+
+def test_a_rough_fleet_on_hills_is_the_same_whatever_its_blocks_and_its_number() -> None:
+    whole, parts, one = (SimulatedFleet("hills", n, 5, 100.0, rough=1.0) for n in (4, 4, 1))
+    _, signals = whole.step(600)
+    pieces = [parts.step(n)[1] for n in (1, 7, 92, 300, 200)]
+    np.testing.assert_array_equal(np.concatenate(pieces), signals)
+    np.testing.assert_array_equal(one.step(600)[1][:, 0], signals[:, 0])
+
+
+def test_torque_is_missing_in_about_half_of_a_rough_fleet() -> None:
+    missing = [misalignment_row(ROUGH_FLEET.mounted, 2, k)[M.TORQUELESS] for k in range(300)]
+    assert 0.4 < np.mean(missing) < 0.6
+
+
+def test_unknown_roads_and_slopes_no_road_has_are_refused() -> None:
+    with pytest.raises(InputError, match="^road: .*hilly"):
+        simulate_manoeuvre("straight", road="moonscape")
+    with pytest.raises(InputError, match="^slope: "):
+        simulate_manoeuvre("straight", slope=0.3)
+    with pytest.raises(InputError, match="^slope: "):
+        Wave(0.05, length=0.0)
+    with pytest.raises(InputError, match="^rough: "):
+        SimulatedFleet("test", 1, 0, 100.0, rough=1.5)
