@@ -34,8 +34,8 @@ from edge_agent.dynamics.slip import wheel_velocity
 from edge_agent.estimators import flags
 from edge_agent.estimators.adaptive_federated_ckf import DRY
 from edge_agent.estimators.bank import EstimatorBank
+from edge_agent.estimators.common.readings import rolling_speed
 from edge_agent.estimators.estimates import Y
-from edge_agent.estimators.friction_mixture.sample import rolling_speed
 from edge_agent.estimators.gaussian.intake import BEGUN, STEPPED, Track, new_filters, take
 from edge_agent.estimators.gaussian.telling import (
     FIRST_V_STD,

@@ -12,20 +12,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Final
 
-import numpy as np
-
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.dynamics.parameters import parameter_table
 from edge_agent.estimators import adaptive_federated_ckf, compensated_wckf, federated_ckf, paper_aco_fckf, sr_ukf
 from edge_agent.estimators.bank import EstimatorBank
-from edge_agent.estimators.friction_mixture.advance import Design
 from edge_agent.estimators.friction_mixture.bank import mixture_bank
-from edge_agent.estimators.friction_mixture.constants import NODES, C, constant_row, nominal_states
-from edge_agent.estimators.friction_mixture.curve import curve_tables
-from edge_agent.estimators.friction_mixture.node import Nominal
-from edge_agent.estimators.friction_mixture.nodes import node_table, side_table
+from edge_agent.estimators.friction_mixture.design import design_of
 from schemas.errors import InputError
-from schemas.numeric import FloatArray
 from schemas.vehicle import Vehicle
 
 ESTIMATORS = {
@@ -48,24 +41,6 @@ PLAIN: Final[dict[str, Callable[[Sequence[Vehicle]], EstimatorBank]]] = {
     "compensated-wckf": compensated_wckf.bank,
     "sr-ukf": sr_ukf.bank,
 }
-
-
-def design_of(memberships: Memberships, *, adaptive: bool, constants: FloatArray | None = None) -> Design:
-    """The tables of a filter; `constants` (len(C),) replaces the table of constants in studies."""
-    mu, prior = node_table(NODES)
-    constants = constant_row() if constants is None else constants
-    return Design(
-        constants=constants,
-        mu=mu,
-        prior=prior,
-        sides=side_table(mu, prior, constants[C.UNLIKE]),
-        curve=curve_tables(constants[C.SHAPE], constants[C.CURVATURE]),
-        nominal=Nominal(*nominal_states(constants)),
-        inputs=np.array(memberships.inputs),
-        outputs=np.array(memberships.outputs),
-        scales=np.exp(np.array(memberships.ln_scales)),
-        adaptive=adaptive,
-    )
 
 
 def create(name: str, vehicles: Sequence[Vehicle], *, memberships: Memberships | None = None) -> EstimatorBank:

@@ -31,8 +31,8 @@ from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import GRAVITY, Four, P, body, four
 from edge_agent.estimators import flags
 from edge_agent.estimators.bank import EstimatorBank
+from edge_agent.estimators.common.readings import rolling_speed
 from edge_agent.estimators.estimates import FOUR_FRICTIONS, Y
-from edge_agent.estimators.friction_mixture.sample import rolling_speed
 from edge_agent.estimators.gaussian.intake import BEGUN, STEPPED, Track, new_filters, take, wheel_force
 from edge_agent.estimators.gaussian.pair import doubted, freed_speed, rolling
 from edge_agent.estimators.gaussian.road import FORGET_M, LOOK_S, PRIOR_ROOT, mean_friction, told_share

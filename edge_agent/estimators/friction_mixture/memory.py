@@ -2,95 +2,108 @@
 
 from __future__ import annotations
 
-from enum import IntEnum
 from typing import Annotated
 
 import numpy as np
 
 from edge_agent.dynamics.parameters import P
-from edge_agent.estimators.friction_mixture.constants import NODES, PAIRS, STATES
+from edge_agent.estimators.common.excitation import Excitation
+from edge_agent.estimators.common.readings import INPUTS
+from edge_agent.estimators.friction_mixture.constants import ALL_NODES, STATES
 from schemas.numeric import FloatArray, IntArray
 from schemas.runtime.records import RecordArray, records
 
-INPUTS = 15  # ax, ay, yaw rate, steering, wheel speed, torque: the channels before the position
-RING = 64  # blocks remembered for the grip used in the last second
+
+class PlanarVector:
+    """A vector in the plane of the road."""
+
+    x: float  # ahead
+    y: float  # left
 
 
-class H(IntEnum):
-    """Index of a scalar that is held between samples."""
+class VelocityGain:
+    """Velocity [m/s] gained since the block began, in the axes of now."""
 
-    TIME = 0  # of the last sample [s]
-    BLOCK_TIME = 1  # at which the block began [s]
-    ANGLE = 2  # turned since the block began [rad]
-    SUM_COS = 3  # of that angle, over the samples of the block
-    SUM_SIN = 4
-    SAMPLES = 5
-    YAW_RATE = 6  # scalar filter [rad/s]
-    YAW_RATE_VAR = 7
-    START_YAW_RATE = 8  # at the beginning of the block
-    AX = 9  # last input used [m/s^2]
-    AY = 10
-    POSITION_TIME = 11  # of the last position [s]
-    MISSING_AX = 12  # share of the block without it
-    MISSING_AY = 13
-    RING_NEXT = 14
-    HEALTH = 15
-    NIS = 16
-    MU = 17
-    MU_LOWER = 18
-    MU_UPPER = 19
-    LOG_LIKELIHOOD = 20
-    USED = 21
-    REAR_STEERING = 22  # 1 once a rear steering angle has been seen
-    UNLIKE = 23  # 1 while the nodes of unlike sides take part
-    LEFT = 24  # median, lower, upper friction under the left wheels
-    RIGHT = 27
-    INERTIAL_TIME = 30  # of the last sample with both accelerations [s]
-    TOLD_AX = 31  # last reading, used or refused [m/s^2]
-    TOLD_AY = 32
-    LENGTH = 33
+    measured: PlanarVector  # by the measured accelerations
+    leak_x: PlanarVector  # the part of it from a_x, which its leak scales
+    leak_y: PlanarVector  # the part of it from a_y
+    unit: PlanarVector  # by 1 m/s^2 ahead, per [m/s^2] of offset
 
 
-class G(IntEnum):
-    """Index of a velocity (x, y) [m/s] gained since the block began, in the axes of now."""
+class BlockSums:
+    """What a block has gathered since it began."""
 
-    INPUT = 0  # by the measured accelerations
-    LEAK_X = 1  # the part of it from a_x, which its leak scales
-    LEAK_Y = 2  # the part of it from a_y
-    UNIT = 3  # by 1 m/s^2 ahead, per [m/s^2] of offset
+    time: float  # at which it began [s]
+    samples: int
+    angle: float  # turned [rad]
+    cos_sum: float  # of that angle, over the samples
+    sin_sum: float
+    gain: VelocityGain
+    gain_sum: VelocityGain  # over the samples
+    sums: Annotated[FloatArray, INPUTS]  # of the valid samples
+    counts: Annotated[IntArray, INPUTS]
+    missing_x: float  # variance per second of v_x where a_x is missing [m^2/s^3]
+    missing_y: float
+    start_yaw_rate: float  # [rad/s]
+    start_omega: Annotated[FloatArray, 4]  # [rad/s]
 
 
-class Memory:
+class LastInputs:
+    """The newest of each input, where it is needed between samples."""
+
+    time: float  # of the last sample [s]
+    position_time: float  # of the last position [s]
+    inertial_time: float  # of the last sample with both accelerations [s]
+    ax: float  # last input used [m/s^2]
+    ay: float
+    read_ax: float  # last reading, used or refused [m/s^2]
+    read_ay: float
+    yaw_rate: float  # scalar filter [rad/s]
+    yaw_rate_var: float
+    omega: Annotated[FloatArray, 4]  # [rad/s]
+    delta: Annotated[FloatArray, 4]  # [rad]
+    rear_steering: bool  # whether a rear steering angle has been seen
+
+
+class Quantiles:
+    """A friction with its interval."""
+
+    median: float
+    lower: float  # 5 %
+    upper: float  # 95 %
+
+
+class MixtureMemory:
     """One filter."""
 
     row: Annotated[FloatArray, len(P)]  # parameters of the vehicle
     started: bool
-    held: Annotated[FloatArray, H.LENGTH]
-    gain: Annotated[FloatArray, 4, 2]  # indexed by G
-    gain_sum: Annotated[FloatArray, 4, 2]  # over the samples of the block
-    sums: Annotated[FloatArray, INPUTS]  # of the valid samples in the block
-    counts: Annotated[IntArray, INPUTS]
-    start_omega: Annotated[FloatArray, 4]  # at the beginning of the block [rad/s]
-    last_omega: Annotated[FloatArray, 4]  # [rad/s]
-    last_delta: Annotated[FloatArray, 4]  # [rad]
-    mean: Annotated[FloatArray, NODES + PAIRS, STATES]
-    covariance: Annotated[FloatArray, NODES + PAIRS, STATES, STATES]
-    weight: Annotated[FloatArray, NODES + PAIRS]
-    visit: Annotated[FloatArray, NODES + PAIRS]  # probabilities from the reference prior at the start of the visit
-    paid: Annotated[FloatArray, NODES + PAIRS]  # price of what a node believes of the vehicle [nat]
-    all_mean: Annotated[FloatArray, STATES]  # moments of the mixture
-    all_covariance: Annotated[FloatArray, STATES, STATES]
-    actual: Annotated[FloatArray, 2]  # windowed innovation variances
+    split: bool  # whether the split nodes take part
+    last: LastInputs
+    block: BlockSums
+    mean: Annotated[FloatArray, ALL_NODES, STATES]
+    covariance: Annotated[FloatArray, ALL_NODES, STATES, STATES]
+    weight: Annotated[FloatArray, ALL_NODES]
+    visit_weight: Annotated[FloatArray, ALL_NODES]  # probabilities from the reference prior at the visit's start
+    penalty: Annotated[FloatArray, ALL_NODES]  # ledger: charged so far for what a node believes of the vehicle [nat]
+    overall_mean: Annotated[FloatArray, STATES]  # moments of the mixture
+    overall_covariance: Annotated[FloatArray, STATES, STATES]
+    actual: Annotated[FloatArray, 2]  # windowed innovation variances: wheels, axles
     theoretical: Annotated[FloatArray, 2]
     factor: Annotated[FloatArray, 2]  # adapted over nominal R
-    side: Annotated[FloatArray, 2]  # SIDE of the axles in the block before [1]
-    usual: Annotated[FloatArray, 6]  # FORCE of the wheels and SIDE of the axles, smoothed [1]
-    ring_time: Annotated[FloatArray, RING]  # [s]
-    ring_used: Annotated[FloatArray, RING]
+    last_side: Annotated[FloatArray, 2]  # side force over load of the axles in the block before [1]
+    usual_force: Annotated[FloatArray, 6]  # force over load of wheels and axles, smoothed [1]
+    excitation: Excitation
+    friction: Quantiles
+    friction_left: Quantiles
+    friction_right: Quantiles
+    health: int  # of the last block
+    nis: float  # per row
+    log_likelihood: float  # of what was measured at the sample [nat]
 
 
 def new_filters(rows: FloatArray) -> RecordArray:
     """Filters of vehicles with parameters `rows` (N, 12) that have not seen a sample."""
-    filters = records(Memory, len(rows))
-    filters["row"], filters["factor"], filters["side"], filters["ring_time"] = rows, 1.0, np.nan, -np.inf
+    filters = records(MixtureMemory, len(rows))
+    filters["row"], filters["factor"], filters["last_side"] = rows, 1.0, np.nan
     return filters

@@ -9,37 +9,26 @@ Legend
     e           sign(e_b)*|e_a*e_b|/sqrt(e_a^2 + e_b^2): distance to the tyre curve [1]
 
 Rows: the four wheels along, then the two axles across. In the linear range e weighs slip and force alike; on the flat
-and beyond the peak it is the force that decides, so a sliding wheel says what its friction is (errata, what made the
-difference, 1). An axle takes one mean slip; its wheels share the side force by load.
+and beyond the peak it is the force that decides, so the row of a sliding wheel is what its friction is (errata, what
+made the difference, 1). An axle takes one mean slip; its wheels share the side force by load.
 What a node believes of the vehicle (leak, gain of torque, shape of the tyre) corrects the measured force.
 """
 
 from __future__ import annotations
 
 import math
-from enum import IntEnum
 
 from edge_agent.dynamics.parameters import P
 from edge_agent.dynamics.slip import SLOWEST_M_S, wheel_position
 from edge_agent.dynamics.tyres import TINY
-from edge_agent.estimators.friction_mixture.block import F
-from edge_agent.estimators.friction_mixture.constants import C, X
-from edge_agent.estimators.friction_mixture.curve import Curve, looked_up, ratio_at, theta_at
+from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
+from edge_agent.estimators.friction_mixture.memory import VelocityGain
+from edge_agent.estimators.friction_mixture.tyre_curve import TyreCurve, interpolated, ratio_at, theta_at
+from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, NodeWorkspace
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
-ROWS = 6
 FLATTEST = 0.03  # a sliding wheel's slip is not quite arbitrary: its inertia holds it for a block
-
-
-class L(IntEnum):
-    """Index in the slips of a node; of what every wheel or axle has, the index of its first."""
-
-    ALONG = 0  # g_x of the four wheels
-    ACROSS = 4  # g_y
-    SCALE_X = 8  # what a wheel's residual is multiplied by, per axle
-    SCALE_Y = 10
-    LENGTH = 12
 
 
 @compiled
@@ -52,117 +41,101 @@ def distance(along: float, across: float) -> float:
 
 
 @compiled
-def gained(gains: FloatArray, first: int, x: FloatArray, axis: int) -> float:
-    """Velocity gained [m/s] along `axis` (0 ahead, 1 left): gains of memory.G from index `first`, two axes each.
+def gained_velocity(gain: VelocityGain, x: FloatArray) -> tuple[float, float]:
+    """Velocity gained (ahead, left) [m/s] with the leaks and offsets of state x (n,).
 
     An offset of a_y gains what one of a_x does, turned by a quarter.
     """
-    ahead, left = gains[first + 6], gains[first + 7]
-    unit_x, unit_y = (ahead, -left) if axis == 0 else (left, ahead)
-    total = (
-        gains[first + axis]
-        - x[X.LEAK_X] * gains[first + 2 + axis]
-        - x[X.LEAK_Y] * gains[first + 4 + axis]
-        - x[X.BIAS_X] * unit_x
-        - x[X.BIAS_Y] * unit_y
+    leak_x, leak_y = x[NodeState.LEAK_X], x[NodeState.LEAK_Y]
+    bias_x, bias_y = x[NodeState.BIAS_X], x[NodeState.BIAS_Y]
+    measured, unit = gain.measured, gain.unit
+    return (
+        measured.x - leak_x * gain.leak_x.x - leak_y * gain.leak_y.x - bias_x * unit.x + bias_y * unit.y,
+        measured.y - leak_x * gain.leak_x.y - leak_y * gain.leak_y.y - bias_x * unit.y - bias_y * unit.x,
     )
-    return float(total)
 
 
 @compiled
-def steepness(curve: Curve, g_x: float, g_y: float, mu: float) -> float:
+def slope_along(curve: TyreCurve, g_x: float, g_y: float, mu: float) -> float:
     """Change of the force along by the linear force along, at least FLATTEST: 1 at small slip, 0 on the flat."""
     square = g_x * g_x + g_y * g_y
     if square < TINY:
         return 1.0
     theta = math.sqrt(square) / mu
     u = theta / (1.0 + theta)
-    return max((looked_up(curve.slope, u) * g_x * g_x + ratio_at(curve, theta) * g_y * g_y) / square, FLATTEST)
+    return max((interpolated(curve.slope, u) * g_x * g_x + ratio_at(curve, theta) * g_y * g_y) / square, FLATTEST)
 
 
 @compiled
-def slips(
-    row: FloatArray,
-    constants: FloatArray,
-    mean: FloatArray,
-    x: FloatArray,
-    gained_x: float,
-    gained_y: float,
-    features: FloatArray,
-    out: FloatArray,
+def find_slips(
+    row: FloatArray, constants: Constants, mean: FloatArray, features: BlockFeatures, node: NodeWorkspace
 ) -> None:
-    """out (12,) indexed by L: linear forces over load at state x of the beginning of the block.
+    """Fill node.slip at node.point, a state at the beginning of the block; mean (n,) is the node's.
 
     A log stiffness is drawn towards the node's mean where the force is too small to tell it from noise of the slip.
     """
-    cos, sin, rate = features[F.COS], features[F.SIN], features[F.YAW_RATE]
-    vx = cos * x[X.VX] + sin * x[X.VY] + gained_x
-    vy = cos * x[X.VY] - sin * x[X.VX] + gained_y
+    x, slip = node.point, node.slip
+    vx = features.cos * x[NodeState.VX] + features.sin * x[NodeState.VY] + node.gained.x
+    vy = features.cos * x[NodeState.VY] - features.sin * x[NodeState.VX] + node.gained.y
+    mean_kx, mean_ky = mean[NodeState.LN_KX], mean[NodeState.LN_KY]
     for axle in range(2):
-        offset = x[X.STEER] if axle == 0 else 0.0
-        blind = math.isnan(features[F.SIDE + axle])  # slip across is then guesswork, and must not bend the force along
-        ln_kx = mean[X.LN_KX] + features[F.TELL_X + axle] * (x[X.LN_KX] - mean[X.LN_KX])
-        ln_ky = mean[X.LN_KY] + features[F.TELL_Y + axle] * (x[X.LN_KY] - mean[X.LN_KY])
+        offset = x[NodeState.STEER] if axle == 0 else 0.0
+        blind = math.isnan(features.side[axle])  # slip across is then guesswork, and must not bend the force along
+        ln_kx = mean_kx + features.informs_x[axle] * (x[NodeState.LN_KX] - mean_kx)
+        ln_ky = mean_ky + features.informs_y[axle] * (x[NodeState.LN_KY] - mean_ky)
         slope_x, slope_y = row[P.SLOPE_X] * math.exp(ln_kx), row[P.SLOPE_Y] * math.exp(ln_ky)
-        out[L.SCALE_X + axle] = math.exp(-constants[C.STIFFNESS_SHARE_X] * ln_kx)
-        out[L.SCALE_Y + axle] = math.exp(-constants[C.STIFFNESS_SHARE_Y] * ln_ky)
+        slip.scale_x[axle] = math.exp(-constants.stiffness_power_x * ln_kx)
+        slip.scale_y[axle] = math.exp(-constants.stiffness_power_y * ln_ky)
         for wheel in range(2 * axle, 2 * axle + 2):
             px, py = wheel_position(row, wheel)
-            ahead, left = vx - py * rate, vy + px * rate
-            along = features[F.STEER_COS + wheel] * ahead + features[F.STEER_SIN + wheel] * left
-            across = features[F.STEER_COS + wheel] * left - features[F.STEER_SIN + wheel] * ahead
+            ahead, left = vx - py * features.yaw_rate, vy + px * features.yaw_rate
+            cos, sin = features.steer_cos[wheel], features.steer_sin[wheel]
+            along, across = cos * ahead + sin * left, cos * left - sin * ahead
             speed = max(abs(along), SLOWEST_M_S)
-            rolling = features[F.ROLL + wheel]
+            rolling = features.rolling[wheel]
             known = not math.isnan(rolling)
-            out[L.ALONG + wheel] = slope_x * (rolling - along) / speed if known else features[F.FORCE + wheel]
-            out[L.ACROSS + wheel] = 0.0 if blind else slope_y * (offset - across / speed)
+            slip.along[wheel] = slope_x * (rolling - along) / speed if known else features.force[wheel]
+            slip.across[wheel] = 0.0 if blind else slope_y * (offset - across / speed)
 
 
 @compiled
-def bends(curve: Curve, pair: FloatArray, slip: FloatArray, features: FloatArray, out: FloatArray) -> None:
-    """out (6,): force over load of the rows by which a tyre one spread sharper differs at these slips."""
+def find_shape_force(curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, node: NodeWorkspace) -> None:
+    """Fill node.shape_force at node.slip; side_mu (2,) is the friction under the left and right wheels."""
+    slip, out = node.slip, node.shape_force
     out[4] = out[5] = 0.0
     for wheel in range(4):
-        mu = pair[wheel % 2]
-        g_x, g_y = slip[L.ALONG + wheel], slip[L.ACROSS + wheel]
+        mu = side_mu[wheel % 2]
+        g_x, g_y = slip.along[wheel], slip.across[wheel]
         size = math.sqrt(g_x * g_x + g_y * g_y)
         theta = size / mu
-        bend = 0.0 if size < TINY else mu * looked_up(curve.bend, theta / (1.0 + theta)) / size
-        out[wheel] = bend * g_x
-        out[4 + wheel // 2] += features[F.LOAD + wheel] * bend * g_y
+        change = 0.0 if size < TINY else mu * interpolated(curve.shape, theta / (1.0 + theta)) / size
+        out[wheel] = change * g_x
+        out[4 + wheel // 2] += features.load_share[wheel] * change * g_y
 
 
 @compiled
-def forces(
-    curve: Curve,
-    pair: FloatArray,
-    leak: float,
-    bend: float,
-    gain: float,
-    features: FloatArray,
-    bent: FloatArray,
-    force: FloatArray,
-    at_force: FloatArray,
-) -> None:
-    """force (6,) over load as the node corrects it, at_force (6,) the linear force over load that gives it."""
+def correct_forces(curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, node: NodeWorkspace) -> None:
+    """Fill node.force and node.slip_at_force by what node.point believes of leak, gain of torque and shape."""
+    leak, shape, gain = node.point[NodeState.LEAK_Y], node.point[NodeState.SHAPE], node.point[NodeState.GAIN]
+    force, slip_at_force = node.force, node.slip_at_force
     for axle in range(2):
         left, right = 2 * axle, 2 * axle + 1
-        side = features[F.SIDE + axle] + leak * features[F.SIDE_LEAK + axle]
+        side = features.side[axle] + leak * features.side_leak[axle]
         across = 0.0 if math.isnan(side) else side
         mean_along = mean_mu = 0.0
         for wheel in range(left, right + 1):
-            mu, load = pair[wheel % 2], features[F.LOAD + wheel]
-            along = (1.0 + gain) * features[F.FORCE + wheel]
+            mu, load = side_mu[wheel % 2], features.load_share[wheel]
+            along = (1.0 + gain) * features.force[wheel]
             mean_along += load * along
             mean_mu += load * mu
-            force[wheel] = along - bend * bent[wheel]
-            at_force[wheel] = _at_force(curve, mu, force[wheel], across)
-        force[4 + axle] = side - bend * bent[4 + axle]
-        at_force[4 + axle] = _at_force(curve, mean_mu, force[4 + axle], mean_along)
+            force[wheel] = along - shape * node.shape_force[wheel]
+            slip_at_force[wheel] = _slip_at_force(curve, mu, force[wheel], across)
+        force[4 + axle] = side - shape * node.shape_force[4 + axle]
+        slip_at_force[4 + axle] = _slip_at_force(curve, mean_mu, force[4 + axle], mean_along)
 
 
 @compiled
-def _at_force(curve: Curve, mu: float, force: float, other: float) -> float:
+def _slip_at_force(curve: TyreCurve, mu: float, force: float, other: float) -> float:
     """Linear force over load along `force` where another component acts across it."""
     size = math.sqrt(force * force + other * other)
     if math.isnan(size) or size < TINY:
@@ -172,32 +145,28 @@ def _at_force(curve: Curve, mu: float, force: float, other: float) -> float:
 
 
 @compiled
-def residuals(
-    curve: Curve,
-    pair: FloatArray,
-    slip: FloatArray,
-    features: FloatArray,
-    force: FloatArray,
-    at_force: FloatArray,
-    out: FloatArray,
+def find_residuals(
+    curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, node: NodeWorkspace, out: FloatArray
 ) -> None:
-    """out (6,) = e of each row; NaN where its readings are missing."""
+    """out (6,) = e of each row at node.slip and node.force; NaN where its readings are missing."""
+    slip, force, slip_at_force = node.slip, node.force, node.slip_at_force
     for axle in range(2):
         side_model = side_slip = 0.0
         for wheel in range(2 * axle, 2 * axle + 2):
-            g_x, g_y = slip[L.ALONG + wheel], slip[L.ACROSS + wheel]
-            theta = math.sqrt(g_x * g_x + g_y * g_y) / pair[wheel % 2]
+            g_x, g_y = slip.along[wheel], slip.across[wheel]
+            theta = math.sqrt(g_x * g_x + g_y * g_y) / side_mu[wheel % 2]
             ratio = ratio_at(curve, theta)
-            share = features[F.LOAD + wheel]
+            share = features.load_share[wheel]
             side_model += share * ratio * g_y
             side_slip += share * g_y
             out[wheel] = (
                 math.nan
-                if math.isnan(features[F.ROLL + wheel])
-                else slip[L.SCALE_X + axle] * distance(at_force[wheel] - g_x, force[wheel] - ratio * g_x)
+                if math.isnan(features.rolling[wheel])
+                else slip.scale_x[axle] * distance(slip_at_force[wheel] - g_x, force[wheel] - ratio * g_x)
             )
-        out[4 + axle] = (
+        row = 4 + axle
+        out[row] = (
             math.nan
-            if math.isnan(force[4 + axle])
-            else slip[L.SCALE_Y + axle] * distance(at_force[4 + axle] - side_slip, force[4 + axle] - side_model)
+            if math.isnan(force[row])
+            else slip.scale_y[axle] * distance(slip_at_force[row] - side_slip, force[row] - side_model)
         )

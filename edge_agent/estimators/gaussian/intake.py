@@ -16,14 +16,13 @@ import numpy as np
 from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import GRAVITY, P, body, parameter_table
 from edge_agent.estimators import flags
-from edge_agent.estimators.friction_mixture.sample import GAP_S, LIMITS, POSITION_S, rolling_speed
+from edge_agent.estimators.common.readings import GAP_S, INPUTS, LIMITS, POSITION_S, rolling_speed
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.runtime.records import RecordArray, records
 from schemas.signals import S
 from schemas.vehicle import Vehicle
 
-INPUTS = 15  # channels before the position
 RING = 64  # grip used: so many slots of at least SLOT_S hold the last second
 SLOT_S = 0.02
 EXCITED_S = 1.0  # memory of the grip used, by contract

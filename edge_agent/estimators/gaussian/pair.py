@@ -20,7 +20,7 @@ import numpy as np
 from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import P, body
 from edge_agent.dynamics.slip import wheel_velocity
-from edge_agent.estimators.friction_mixture.sample import rolling_speed
+from edge_agent.estimators.common.readings import rolling_speed
 from edge_agent.estimators.gaussian.intake import Track, wheel_force
 from edge_agent.estimators.gaussian.planar import POINTS, carry
 from edge_agent.estimators.gaussian.telling import FIRST_V_STD, UNKNOWN_V_STD

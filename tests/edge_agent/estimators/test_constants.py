@@ -10,8 +10,8 @@ import pytest
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.dynamics.parameters import parameter_table
 from edge_agent.estimators.friction_mixture.bank import mixture_bank
-from edge_agent.estimators.friction_mixture.constants import C, constant_row
-from edge_agent.estimators.registry import design_of
+from edge_agent.estimators.friction_mixture.constants import Constants
+from edge_agent.estimators.friction_mixture.design import design_of
 from schemas.numeric import FloatArray
 from schemas.signals import S
 from schemas.vehicle import Vehicle
@@ -32,19 +32,19 @@ def drives() -> tuple[FloatArray, FloatArray, list[Vehicle]]:
 
 
 @cache
-def said(place: int | None) -> bytes:
-    """What the filter says of the drives, with the constant at `place` three times as large."""
+def estimates(name: str | None) -> bytes:
+    """What the filter reports of the drives, with constant `name` three times as large."""
     t, signals, vehicles = drives()
-    row = constant_row()
-    if place is not None:
-        row[place] = 3.0 * row[place] if row[place] != 0.0 else 0.1
-    bank = mixture_bank(parameter_table(vehicles), design_of(Memberships(), adaptive=True, constants=row))
-    told = bank.advance(t, signals)
+    constants = Constants()
+    if name is not None:
+        constants = constants._replace(**{name: 3.0 * getattr(constants, name)})
+    bank = mixture_bank(parameter_table(vehicles), design_of(Memberships(), adaptive=True, constants=constants))
+    found = bank.advance(t, signals)
     return b"".join(
-        array.tobytes() for array in (told.vx, told.vx_std, told.vy_std, told.mu, told.mu_lower, told.mu_upper)
+        array.tobytes() for array in (found.vx, found.vx_std, found.vy_std, found.mu, found.mu_lower, found.mu_upper)
     )
 
 
-@pytest.mark.parametrize("constant", list(C), ids=lambda constant: constant.name)
-def test_every_constant_changes_what_is_estimated(constant: C) -> None:
-    assert said(int(constant)) != said(None)
+@pytest.mark.parametrize("name", Constants._fields)
+def test_every_constant_changes_what_is_estimated(name: str) -> None:
+    assert estimates(name) != estimates(None)

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from edge_agent.dynamics.tyres import magic_formula
-from edge_agent.estimators.friction_mixture.constants import ACTIVE, NODES, STATES, C, constant_row
-from edge_agent.estimators.friction_mixture.curve import curve_tables, ratio_at, theta_at
-from edge_agent.estimators.friction_mixture.node import Room, factorize, take_rows, unfelt
-from edge_agent.estimators.friction_mixture.nodes import node_table, projected, side_table
-from edge_agent.estimators.friction_mixture.residuals import ROWS
+from edge_agent.estimators.friction_mixture.constants import ACTIVE, NODES, ROWS, STATES, Constants
+from edge_agent.estimators.friction_mixture.friction_grid import node_table
+from edge_agent.estimators.friction_mixture.node_filter import factorize, take_rows, unfelt
+from edge_agent.estimators.friction_mixture.split_sides import project, side_table
+from edge_agent.estimators.friction_mixture.tyre_curve import curve_tables, ratio_at, theta_at
+from edge_agent.estimators.friction_mixture.workspace import NodeWorkspace
 from schemas.runtime.records import records
 
 SEEDS = (0, 1, 2)
@@ -21,11 +22,6 @@ SEEDS = (0, 1, 2)
 def covariance(seed: int) -> np.ndarray:
     factor = np.random.default_rng(seed).normal(size=(STATES, STATES))
     return np.asarray(factor @ factor.T + 0.1 * np.eye(STATES))
-
-
-def new_room() -> Room:
-    """Scratch of one update."""
-    return Room(*records(Room, 1)[0])
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -40,18 +36,18 @@ def test_a_covariance_is_its_factor_times_itself_turned(seed: int) -> None:
 @pytest.mark.parametrize("seed", SEEDS)
 def test_rows_taken_in_one_by_one_are_the_textbook_s_update(seed: int, missing: tuple[int, ...]) -> None:
     rng = np.random.default_rng(seed)
-    before, mean, room = np.linalg.cholesky(covariance(seed)), rng.normal(size=STATES), new_room()
+    before, mean, node = np.linalg.cholesky(covariance(seed)), rng.normal(size=STATES), records(NodeWorkspace, 1)[0]
     # deviations that only the first ACTIVE axes of the factor see: rows = H*x with H = A*L^-1
-    room.deviation[:] = rng.normal(size=(ROWS, ACTIVE))
-    room.base[:], room.noise[:] = rng.normal(size=ROWS), rng.uniform(0.1, 1.0, ROWS)
-    a, v, r = (np.delete(value, missing, axis=0) for value in (room.deviation, room.base, room.noise))
-    room.base[list(missing)] = np.nan
+    node["deviation"] = rng.normal(size=(ROWS, ACTIVE))
+    node["residual"], node["inflated"] = rng.normal(size=ROWS), rng.uniform(0.1, 1.0, ROWS)
+    a, v, r = (np.delete(node[name], missing, axis=0) for name in ("deviation", "residual", "inflated"))
+    node["residual"][list(missing)] = np.nan
     spread = a @ a.T + np.diag(r)
     cross = before[:, :ACTIVE] @ a.T
     expected = mean + cross @ np.linalg.solve(spread, v)
     left = before @ before.T - cross @ np.linalg.solve(spread, cross.T)
     root = before.copy()
-    loss, used = take_rows(constant_row(axle_price=0.0), mean, root, room)
+    loss, used = take_rows(mean, root, node, 0.0)
     assert used == ROWS - len(missing)
     assert mean == pytest.approx(expected, abs=1e-9)
     assert root @ root.T == pytest.approx(left, abs=1e-9)
@@ -59,8 +55,7 @@ def test_rows_taken_in_one_by_one_are_the_textbook_s_update(seed: int, missing: 
 
 
 def test_the_tables_are_the_magic_formula_and_its_inverse() -> None:
-    row = constant_row()
-    c, e = float(row[C.SHAPE]), float(row[C.CURVATURE])
+    c, e = Constants().curve_c, Constants().curve_e
     curve = curve_tables(c, e)
     for theta in (0.01, 0.3, 1.0, 1.7, 4.0, 30.0, 900.0):
         assert ratio_at(curve, theta) * theta == pytest.approx(magic_formula(theta, c, e), abs=5e-4)
@@ -83,26 +78,26 @@ def test_noise_of_slip_and_force_about_a_line_is_what_a_residual_is_said_to_have
     assert distance.var() == pytest.approx(felt, rel=0.02)
 
 
-def test_the_hats_of_unlike_sides_overlap_so_a_friction_between_two_of_them_is_held_by_both() -> None:
+def test_the_densities_of_split_nodes_overlap_so_a_friction_between_two_of_them_is_held_by_both() -> None:
     mu, prior = node_table(NODES)
     sides = side_table(mu, prior, 0.05)
     for side in range(2):
-        middles = np.unique(sides.pair[NODES:, side])
+        middles = np.unique(sides.mu[NODES:, side])
         for one, next_one in pairwise(middles):
             between = np.searchsorted(mu, 0.5 * (one + next_one))
-            held = [sides.share[side][sides.pair[NODES:, side] == place][0][between] for place in (one, next_one)]
+            held = [sides.share[side][sides.mu[NODES:, side] == place][0][between] for place in (one, next_one)]
             assert min(held) > 0.0
 
 
-def test_unlike_sides_come_either_way_round_and_their_cells_share_out_all_they_have() -> None:
+def test_split_sides_come_either_way_round_and_their_cells_share_out_all_they_have() -> None:
     mu, prior = node_table(NODES)
     sides = side_table(mu, prior, 0.05)
     assert sides.prior.sum() == pytest.approx(1.0)
     assert sides.prior[NODES:].sum() == pytest.approx(0.05)
     assert sides.share.sum(axis=2) == pytest.approx(1.0)
-    pairs = {tuple(pair) for pair in sides.pair[NODES:].round(6)}
+    pairs = {tuple(pair) for pair in sides.mu[NODES:].round(6)}
     assert pairs == {(right, left) for left, right in pairs}
     out = np.empty(NODES)
     for share in sides.share:
-        projected(sides.prior, share, out)
+        project(sides.prior, share, out)
         assert out.sum() == pytest.approx(1.0)

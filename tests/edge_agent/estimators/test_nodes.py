@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+import inspect
+import re
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
-from edge_agent.estimators.friction_mixture.constants import CONSTANTS, NODES, C
-from edge_agent.estimators.friction_mixture.nodes import change_road, evidence, node_table, quantile, reweigh
+from edge_agent.estimators.friction_mixture.constants import NODES, Constants
+from edge_agent.estimators.friction_mixture.friction_grid import (
+    change_road,
+    node_table,
+    quantile,
+    reweigh,
+    visit_evidence,
+)
 from schemas.mugrid import CENTRES
 
 MU, PRIOR = node_table(NODES)
@@ -40,13 +50,16 @@ def test_evidence_is_the_likelihood_that_was_put_in() -> None:
     log_likelihood = -((MU - 0.6) ** 2) / 0.02
     reweigh(w, log_likelihood - log_likelihood.max())
     out = np.empty(len(CENTRES))
-    evidence(MU, PRIOR, w, CENTRES, out)
+    visit_evidence(MU, PRIOR, w, CENTRES, out)
     inner = (CENTRES > 0.3) & (CENTRES < 0.9)
     expected = -((CENTRES - 0.6) ** 2) / 0.02
     assert out.max() == 0.0
     assert np.abs((out - out[inner].max()) - (expected - expected[inner].max()))[inner].max() < 0.2
 
 
-def test_every_constant_stands_once_in_the_table_with_unit_and_reason() -> None:
-    assert [c.place for c in CONSTANTS] == list(C)
-    assert all(c.unit and c.reason for c in CONSTANTS)
+def test_every_constant_has_its_unit_and_its_reason_above_it() -> None:
+    lines = [line.strip() for line in inspect.getsource(Constants).splitlines()]
+    found = {line.split(":")[0]: above for above, line in pairwise(lines) if ": float = " in line}
+    assert tuple(found) == Constants._fields
+    for name, above in found.items():
+        assert re.fullmatch(r"# \[[^]]+\] \S.{5,}", above), name

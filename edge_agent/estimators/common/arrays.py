@@ -34,9 +34,3 @@ def clear_rows(target: FloatArray) -> None:
     for i in range(target.shape[0]):
         for j in range(target.shape[1]):
             target[i, j] = 0.0
-
-
-@compiled
-def put_pair(target: FloatArray, pair: tuple[float, float]) -> None:
-    """target (2,) = pair."""
-    target[0], target[1] = pair[0], pair[1]

@@ -5,24 +5,19 @@ Legend
     prior       mass of a uniform prior on [.05, 1.20] per node    (K,)
     w           probabilities of the nodes                        (K,)
     density     w/prior, the posterior over the uniform prior, linear between nodes
-    h           share of the mass that changes to anywhere, from the hazard per metre [1]
 """
 
 from __future__ import annotations
 
 import math
-from itertools import pairwise
-from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from edge_agent.estimators.friction_mixture.constants import NODES, PAIRS
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
-APART = 1.45  # how much more friction the higher side has, at least, to count as unlike
-SMALLEST = 1e-12  # a probability that the re-injection of road change will raise again
+SMALLEST = 1e-12  # a probability that mixing by road change will raise again
 
 
 def node_table(count: int) -> tuple[FloatArray, FloatArray]:
@@ -104,7 +99,7 @@ def _segment(mu: FloatArray, prior: FloatArray, w: FloatArray, j: int) -> float:
 
 
 @compiled
-def evidence(mu: FloatArray, prior: FloatArray, w: FloatArray, centres: FloatArray, out: FloatArray) -> None:
+def visit_evidence(mu: FloatArray, prior: FloatArray, w: FloatArray, centres: FloatArray, out: FloatArray) -> None:
     """out = log(w/prior) at the centres (32,), linear between nodes, maximum 0."""
     count = mu.shape[0]
     top = -math.inf
@@ -119,71 +114,3 @@ def evidence(mu: FloatArray, prior: FloatArray, w: FloatArray, centres: FloatArr
         top = max(top, out[i])
     for i in range(centres.shape[0]):
         out[i] -= top
-
-
-LOW = (0.05, 0.11, 0.17, 0.25, 0.36, 0.50, 0.66)  # edges of the cells of the lower side
-HIGH = (0.36, 0.55, 0.80, 1.20)  # and of the higher: often it is only known to be more
-
-
-class Sides(NamedTuple):
-    """Friction under the left and right wheels of all nodes: those of one friction first, then the pairs."""
-
-    pair: Annotated[FloatArray, NODES + PAIRS, 2]  # left, right
-    prior: Annotated[FloatArray, NODES + PAIRS]
-    # of a pair's left side, right side and mean in the cells of the K nodes
-    share: Annotated[FloatArray, 3, PAIRS, NODES]
-
-
-class Hat(NamedTuple):
-    """What a node stands for: a density that rises from its left neighbour to it and falls to its right neighbour."""
-
-    left: float
-    middle: float
-    right: float
-    width: float  # of its cell, the share of a uniform prior
-
-
-def hats(edges: tuple[float, ...]) -> list[Hat]:
-    """One per cell, about its middle; the outermost end at the outer edges."""
-    middles = [0.5 * (a + b) for a, b in pairwise(edges)]
-    lefts, rights = [edges[0], *middles[:-1]], [*middles[1:], edges[-1]]
-    widths = [b - a for a, b in pairwise(edges)]
-    return [Hat(*row) for row in zip(lefts, middles, rights, widths, strict=True)]
-
-
-def side_table(mu: FloatArray, prior: FloatArray, unlike: float) -> Sides:
-    """All nodes, where a share `unlike` of the roads has unlike sides; mu and prior (K,)."""
-    edges = np.linspace(math.sqrt(LOWER), math.sqrt(UPPER), len(mu) + 1) ** 2
-    pairs, mass, share = [], [], []
-    for low, high in ((a, b) for a in hats(LOW) for b in hats(HIGH) if b.middle > APART * a.middle):
-        mean = Hat._make(0.5 * (a + b) for a, b in zip(low, high, strict=True))
-        for left, right in ((low, high), (high, low)):
-            pairs.append((left.middle, right.middle))
-            mass.append(low.width * high.width)
-            share.append([_in_cells(edges, hat) for hat in (left, right, mean)])
-    return Sides(
-        np.vstack([np.column_stack([mu, mu]), pairs]),
-        np.concatenate([(1.0 - unlike) * prior, unlike * np.array(mass) / sum(mass)]),
-        np.ascontiguousarray(np.array(share).transpose(1, 0, 2)),
-    )
-
-
-def _in_cells(edges: FloatArray, hat: Hat) -> FloatArray:
-    """Share of a hat in each cell between the edges."""
-    rising = np.clip(edges - hat.left, 0.0, hat.middle - hat.left)
-    falling = np.clip(hat.right - edges, 0.0, hat.right - hat.middle)
-    whole = hat.right - hat.left
-    below = rising**2 / (hat.middle - hat.left) / whole
-    above = falling**2 / (hat.right - hat.middle) / whole
-    return np.diff(np.where(edges < hat.middle, below, 1.0 - above))
-
-
-@compiled
-def projected(w: FloatArray, share: FloatArray, out: FloatArray) -> None:
-    """out (K,) = probabilities of the cells of the K nodes, those of the pairs (PAIRS, K) shared out."""
-    chain = out.shape[0]
-    for j in range(chain):
-        out[j] = w[j]
-    for k in range(share.shape[0]):
-        for j in range(chain):
-            out[j] += w[chain + k] * share[k, j]

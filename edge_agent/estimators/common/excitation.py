@@ -1,0 +1,55 @@
+"""The largest share of grip used in the last second, from a ring of slots."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+
+SLOTS = 64
+SLOT_S = 0.02  # a slot is at least so long, so that the ring holds the last second at any rate of samples
+EXCITED_S = 1.0  # memory of the grip used, by contract
+
+
+class Excitation:
+    """Force over load [1] of the hardest-working wheel, slot by slot."""
+
+    time: Annotated[FloatArray, SLOTS]  # at which a slot began [s]
+    used: Annotated[FloatArray, SLOTS]
+    newest: int
+    largest: float  # within the last second
+    largest_time: float  # at which its slot began [s]
+
+
+@compiled
+def begin_excitation(ring: Excitation) -> None:
+    """Nothing has been used so far."""
+    ring.largest_time = -math.inf
+    for k in range(SLOTS):
+        ring.time[k] = -math.inf
+
+
+@compiled
+def note_excitation(ring: Excitation, time: float, used: float) -> None:
+    """Take in what is used at `time` [s] and renew `largest`."""
+    place = ring.newest
+    if not time - ring.time[place] < SLOT_S:
+        place = (place + 1) % SLOTS
+        ring.newest, ring.time[place], ring.used[place] = place, time, used
+    else:
+        ring.used[place] = max(ring.used[place], used)
+    if ring.used[place] >= ring.largest:
+        ring.largest, ring.largest_time = ring.used[place], ring.time[place]
+    elif not ring.largest_time > time - EXCITED_S:
+        _search(ring, time)
+
+
+@compiled
+def _search(ring: Excitation, time: float) -> None:
+    """Renew `largest` from all slots: the one it came from has grown old."""
+    ring.largest = 0.0
+    for k in range(SLOTS):
+        if ring.time[k] > time - EXCITED_S and ring.used[k] >= ring.largest:
+            ring.largest, ring.largest_time = ring.used[k], ring.time[k]

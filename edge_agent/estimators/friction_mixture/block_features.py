@@ -1,0 +1,209 @@
+"""From the sums of a block to the few numbers that the measurement equations need (`BlockFeatures`).
+
+Longitudinal force comes from torque, F_x = (T - J*omega')/R; where torque or speed is missing, from a_x shared out by
+guess with a spread to match. Lateral axle forces come from m*a_y and Iz*r' (paper 004, equation 2; errata 000 on signs
+and arms).
+"""
+
+from __future__ import annotations
+
+import math
+
+from edge_agent.dynamics.body import axle_lateral_forces
+from edge_agent.dynamics.loads import wheel_loads
+from edge_agent.dynamics.parameters import P, body
+from edge_agent.dynamics.slip import SLOWEST_M_S, wheel_position
+from edge_agent.dynamics.wheel import force_from_torque
+from edge_agent.estimators import flags
+from edge_agent.estimators.friction_mixture.constants import Constants
+from edge_agent.estimators.friction_mixture.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.memory import BlockSums, MixtureMemory
+from edge_agent.estimators.friction_mixture.workspace import BlockFeatures
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+from schemas.signals import S
+
+SLOWEST_COMPARED_M_S = 1.0  # slips of two wheels are compared at this speed at least: speeds differ by noise below
+CERTAIN = 4.0  # standard deviations of wheel-speed noise that a difference between the sides must exceed
+
+
+@compiled
+def block_features(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> int:
+    """Fill `features` but for duration and speed, which are given; returns health flags."""
+    row, last, block, constants = memory.row, memory.last, memory.block, design.constants
+    _kinematics(block, features)
+    features.yaw_rate = mean_or(block, S.YAW_RATE, last.yaw_rate)
+    ax, ay = mean_or(block, S.AX, 0.0), mean_or(block, S.AY, 0.0)
+    loads = features.loads
+    loads[0], loads[1], loads[2], loads[3] = wheel_loads(body(row), ax, ay)
+    for wheel in range(4):
+        features.steer_cos[wheel] = math.cos(last.delta[wheel])
+        features.steer_sin[wheel] = math.sin(last.delta[wheel])
+        features.rolling[wheel] = row[P.RADIUS] * mean_or(block, S.OMEGA + wheel, math.nan)
+        change = (last.omega[wheel] - block.start_omega[wheel]) / features.duration
+        features.spin[wheel] = 0.0 if math.isnan(change) else change
+    health = _forces(row, constants, block, features)
+    _sides(memory, features)
+    health |= _drop_unknown_sides(memory, features)
+    _noise(memory, design, features)
+    features.demand = demand(features)
+    _inform(constants, features)
+    features.asymmetry = asymmetry(row, constants, block, features)
+    return health
+
+
+@compiled
+def mean_or(block: BlockSums, channel: int, otherwise: float) -> float:
+    """Mean of the valid samples of a channel in the block, or `otherwise`."""
+    return block.sums[channel] / block.counts[channel] if block.counts[channel] > 0 else otherwise
+
+
+@compiled
+def _kinematics(block: BlockSums, features: BlockFeatures) -> None:
+    share = 1.0 / block.samples
+    features.cos = block.cos_sum * share
+    features.sin = block.sin_sum * share
+    mean, total = features.gain, block.gain_sum
+    mean.measured.x, mean.measured.y = total.measured.x * share, total.measured.y * share
+    mean.leak_x.x, mean.leak_x.y = total.leak_x.x * share, total.leak_x.y * share
+    mean.leak_y.x, mean.leak_y.y = total.leak_y.x * share, total.leak_y.y * share
+    mean.unit.x, mean.unit.y = total.unit.x * share, total.unit.y * share
+
+
+@compiled
+def _forces(row: FloatArray, constants: Constants, block: BlockSums, features: BlockFeatures) -> int:
+    """Force, and the part of noise_std that comes from it, of the four wheels; returns health flags."""
+    health, loads = 0, features.loads
+    ax = mean_or(block, S.AX, math.nan)
+    for wheel in range(4):
+        torque = mean_or(block, S.TORQUE + wheel, math.nan)
+        if not (math.isnan(torque) or math.isnan(features.rolling[wheel])):
+            force = force_from_torque(torque, features.spin[wheel], row[P.WHEEL_INERTIA], row[P.RADIUS])
+            spread = constants.force_share * abs(force)
+        else:
+            if math.isnan(torque):
+                health |= flags.NO_TORQUE
+            known = 0.0 if math.isnan(ax) else row[P.MASS] * ax
+            force = _wheel_share(row, constants, wheel, known) * known
+            spread = constants.no_torque_share * abs(known)
+            if math.isnan(ax):
+                spread = constants.no_torque_share * loads[wheel]
+        features.force[wheel] = force / loads[wheel]
+        features.noise_std[wheel] = spread / loads[wheel]
+    return health
+
+
+@compiled
+def _wheel_share(row: FloatArray, constants: Constants, wheel: int, force: float) -> float:
+    """Guess of a wheel's share of the total longitudinal force where torque is missing."""
+    split = row[P.DRIVE_FRONT]
+    front = constants.brake_front if force < 0.0 or math.isnan(split) else split
+    return 0.5 * front if wheel < 2 else 0.5 * (1.0 - front)
+
+
+@compiled
+def _sides(memory: MixtureMemory, features: BlockFeatures) -> None:
+    """side, side_leak and load_share of both axles; NaN without a_y."""
+    row, loads, delta = memory.row, features.loads, memory.last.delta
+    ay = mean_or(memory.block, S.AY, math.nan)
+    yaw_acceleration = (memory.last.yaw_rate - memory.block.start_yaw_rate) / features.duration
+    moment = 0.0
+    for wheel in range(4):
+        y = wheel_position(row, wheel)[1]
+        moment -= y * features.force[wheel] * loads[wheel] * features.steer_cos[wheel]
+    front, rear = axle_lateral_forces(row, ay, yaw_acceleration, moment)
+    leak_front, leak_rear = axle_lateral_forces(row, -ay, 0.0, 0.0)
+    for axle in range(2):
+        left, right = 2 * axle, 2 * axle + 1
+        load = loads[left] + loads[right]
+        along = features.force[left] * loads[left] + features.force[right] * loads[right]
+        angle = 0.5 * (delta[left] + delta[right])
+        cos = math.cos(angle)
+        side = (front if axle == 0 else rear) - along * math.sin(angle)
+        features.side[axle] = side / (cos * load)
+        features.side_leak[axle] = (leak_front if axle == 0 else leak_rear) / (cos * load)
+        features.load_share[left] = loads[left] / load
+        features.load_share[right] = loads[right] / load
+
+
+@compiled
+def _drop_unknown_sides(memory: MixtureMemory, features: BlockFeatures) -> int:
+    """Side forces whose slip or moment nobody has measured become NaN; returns health flags."""
+    health, counts = 0, memory.block.counts
+    if counts[S.DELTA] + counts[S.DELTA + 1] == 0:  # without steering the front axle's slip is unknown
+        features.side[0] = math.nan
+        health |= flags.NO_STEERING
+    if memory.last.rear_steering and counts[S.DELTA + 2] + counts[S.DELTA + 3] == 0:
+        features.side[1] = math.nan
+        health |= flags.NO_STEERING
+    if counts[S.YAW_RATE] == 0:  # axle forces need it twice
+        features.side[0] = features.side[1] = math.nan
+    return health
+
+
+@compiled
+def _noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> None:
+    """Slip noise and force noise meet under the total-least-squares residual with half the variance each."""
+    row, constants, before = memory.row, design.constants, memory.last_side
+    speed = max(features.speed, SLOWEST_M_S)
+    scale = design.scales[0] * memory.factor[0]
+    for wheel in range(4):
+        samples = max(memory.block.counts[S.OMEGA + wheel], 1)
+        slip = constants.omega_noise / math.sqrt(samples) * row[P.RADIUS] / speed
+        white = row[P.SLOPE_X] * slip
+        shape = constants.shape_share * features.force[wheel] ** 2
+        variance = 0.5 * white**2 + constants.floor_x**2 + features.noise_std[wheel] ** 2 + shape**2
+        features.noise_std[wheel] = math.sqrt(variance * scale)
+        features.slip_noise[wheel] = white**2 * scale
+    scale = design.scales[1] * memory.factor[1]
+    for axle in range(2):
+        side = features.side[axle]
+        turning = constants.gyro_std * (row[P.TO_FRONT] if axle == 0 else row[P.TO_REAR]) / speed
+        pointing = constants.angle_share * features.steer_sin[2 * axle]
+        angle = row[P.SLOPE_Y] * math.sqrt(constants.angle_std**2 + turning**2 + pointing**2)
+        share = constants.axle_share * side
+        shape = constants.shape_share * side * side
+        change = side - before[axle]
+        lag = 0.0 if math.isnan(change) else constants.lag * change / features.duration
+        before[axle] = side
+        variance = 0.5 * angle**2 + constants.floor_y**2 + share**2 + shape**2 + lag**2
+        features.noise_std[4 + axle] = math.sqrt(variance * scale)
+        features.slip_noise[4 + axle] = angle**2 * scale
+
+
+@compiled
+def _inform(constants: Constants, features: BlockFeatures) -> None:
+    """informs_x and informs_y: below some force it is noise of the slip that would say what stiffness is."""
+    for axle in range(2):
+        along = max(abs(features.force[2 * axle]), abs(features.force[2 * axle + 1]))
+        side = features.side[axle]
+        features.informs_x[axle] = along * along / (along * along + constants.informing_x**2)
+        features.informs_y[axle] = 0.0 if math.isnan(side) else side * side / (side * side + constants.informing_y**2)
+
+
+@compiled
+def asymmetry(row: FloatArray, constants: Constants, block: BlockSums, features: BlockFeatures) -> float:
+    """Largest difference between the sides of an axle of slip (as linear force over load) not asked for by force."""
+    most, speed = 0.0, max(features.speed, SLOWEST_COMPARED_M_S)
+    for axle in range(2):
+        left, right = 2 * axle, 2 * axle + 1
+        track = row[P.TRACK_FRONT] if axle == 0 else row[P.TRACK_REAR]
+        turning = track * features.yaw_rate * features.steer_cos[left]
+        slip = (features.rolling[right] - features.rolling[left] - turning) / speed
+        samples = max(min(block.counts[S.OMEGA + left], block.counts[S.OMEGA + right]), 1)
+        noise = constants.omega_noise * row[P.RADIUS] / speed * math.sqrt(2.0 / samples)
+        apart = abs(row[P.SLOPE_X] * slip - features.force[right] + features.force[left])
+        if not math.isnan(apart):
+            most = max(most, apart - CERTAIN * row[P.SLOPE_X] * noise)
+    return most
+
+
+@compiled
+def demand(features: BlockFeatures) -> float:
+    """Largest force over load of any wheel [1]; a missing lateral force counts as none."""
+    most = 0.0
+    for wheel in range(4):
+        side = features.side[wheel // 2]
+        across = 0.0 if math.isnan(side) else side
+        most = max(most, math.hypot(features.force[wheel], across))
+    return most

@@ -1,0 +1,75 @@
+"""What does not change while driving: the tables that the kernels read, made of the constants."""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+
+from edge_agent.adaptation.memberships import Memberships
+from edge_agent.estimators.friction_mixture.constants import NODES, STATES, Constants, NodeState
+from edge_agent.estimators.friction_mixture.friction_grid import node_table
+from edge_agent.estimators.friction_mixture.split_sides import Sides, side_table
+from edge_agent.estimators.friction_mixture.tyre_curve import TyreCurve, curve_tables
+from schemas.numeric import FloatArray
+
+
+class Nominal(NamedTuple):
+    """Prior of the states that are properties of vehicle or sensor; velocity has none."""
+
+    mean: Annotated[FloatArray, STATES]
+    std: Annotated[FloatArray, STATES]
+    time: Annotated[FloatArray, STATES]  # [s] of their return to it
+
+
+class MixtureDesign(NamedTuple):
+    """Tables of one filter family."""
+
+    constants: Constants
+    mu: Annotated[FloatArray, NODES]  # nodes of one friction
+    prior: Annotated[FloatArray, NODES]
+    sides: Sides  # all nodes
+    curve: TyreCurve
+    nominal: Nominal
+    fuzzy_inputs: Annotated[FloatArray, 5]  # sets of the adaptation of R
+    fuzzy_outputs: Annotated[FloatArray, 5]
+    scales: Annotated[FloatArray, 2]  # on nominal variances: wheels, axles
+    adaptive: bool
+
+
+def nominal_states(constants: Constants) -> Nominal:
+    """Prior of the states of a node."""
+    mean, std, time = np.zeros(STATES), np.ones(STATES), np.full(STATES, np.inf)
+    c, x = constants, NodeState
+    for state, spread, back in (
+        (x.LN_KX, c.stiffness_std, c.stiffness_time),
+        (x.LN_KY, c.stiffness_std, c.stiffness_time),
+        (x.LEAK_Y, c.leak_y_std, c.leak_time),
+        (x.STEER, c.steer_std, c.stiffness_time),
+        (x.SHAPE, c.shape_std, c.shape_time),
+        (x.GAIN, c.gain_std, c.stiffness_time),
+        (x.LEAK_X, c.leak_x_std, c.leak_time),
+        (x.BIAS_X, c.bias_std, c.bias_time),
+        (x.BIAS_Y, c.bias_std, c.bias_time),
+    ):
+        std[state], time[state] = spread, back
+    mean[x.LEAK_Y], mean[x.LEAK_X] = c.leak_y_mean, c.leak_x_mean
+    return Nominal(mean, std, time)
+
+
+def design_of(memberships: Memberships, *, adaptive: bool, constants: Constants | None = None) -> MixtureDesign:
+    """The tables of a filter; other `constants` are for studies."""
+    mu, prior = node_table(NODES)
+    constants = constants or Constants()
+    return MixtureDesign(
+        constants=constants,
+        mu=mu,
+        prior=prior,
+        sides=side_table(mu, prior, constants.split_prior),
+        curve=curve_tables(constants.curve_c, constants.curve_e),
+        nominal=nominal_states(constants),
+        fuzzy_inputs=np.array(memberships.inputs),
+        fuzzy_outputs=np.array(memberships.outputs),
+        scales=np.exp(np.array(memberships.ln_scales)),
+        adaptive=adaptive,
+    )

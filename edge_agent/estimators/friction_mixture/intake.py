@@ -1,0 +1,186 @@
+"""Taking a sample in: refusal of the impossible, the yaw-rate filter, the kinematics and sums of the block.
+
+Missing readings and what replaces them: a_x by zero and a_y by r*v_x, both with a random walk to match; yaw rate by the
+difference of the rear wheels; steering by its last value; the rest is left out of the sums.
+"""
+
+from __future__ import annotations
+
+import math
+
+from edge_agent.dynamics.body import advance_velocity
+from edge_agent.dynamics.parameters import P
+from edge_agent.estimators import flags
+from edge_agent.estimators.common.readings import GAP_S, INPUTS, LIMITS, POSITION_S, reading
+from edge_agent.estimators.friction_mixture.constants import NodeState
+from edge_agent.estimators.friction_mixture.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.memory import MixtureMemory, PlanarVector, VelocityGain
+from edge_agent.estimators.friction_mixture.restart import UNKNOWN_YAW_VAR, YAW_STD, bridge
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+from schemas.signals import S
+
+JUMP_M_S2 = 3.0  # of an accelerometer from one reading to the next; a real one is believed at the second
+HOLD_S = 0.025  # a shorter silence of an accelerometer is bridged by its last reading
+EARLY_S = 1e-6  # a block is whole although rounding made its last sample early
+YAW_WALK = 3.0  # [rad/s/s^.5] yaw acceleration of a lively car as a random walk
+REAR_STD = 0.03  # [rad/s] yaw rate from the rear wheels: noise and slip difference
+LOST_AX = 2.0  # [m/s/s^.5] random walk without a_x
+LOST_AY = 0.7  # [m/s/s^.5] random walk without a_y or yaw rate
+
+
+@compiled
+def take_sample(memory: MixtureMemory, design: MixtureDesign, time: float, sample: FloatArray) -> tuple[int, bool]:
+    """Add a sample to the block; returns its health flags and whether the block is whole."""
+    last = memory.last
+    dt = time - last.time
+    if not dt > 0.0:
+        return flags.TIME_GAP, False
+    health = _check(memory, time, sample)
+    if dt > GAP_S:
+        health |= flags.TIME_GAP | bridge(memory, design, dt, sample)
+        last.time = time
+        begin_block(memory)
+        return health, False
+    _filter_yaw_rate(memory, dt, sample)
+    ax = _believed(reading(sample, S.AX), last.ax, last.read_ax)
+    ay = _believed(reading(sample, S.AY), last.ay, last.read_ay)
+    last.read_ax, last.read_ay = reading(sample, S.AX), reading(sample, S.AY)
+    if math.isnan(ax + ay) and not math.isnan(last.read_ax + last.read_ay):
+        health |= flags.OUTLIER
+    _move(memory, time, dt, ax, ay, not math.isnan(reading(sample, S.YAW_RATE)))
+    _add(memory, ax, ay, sample)
+    last.time = time
+    return health, time - memory.block.time >= design.constants.block_time - EARLY_S
+
+
+@compiled
+def begin_block(memory: MixtureMemory) -> None:
+    """Empty the sums; the block begins at the last sample."""
+    last, block = memory.last, memory.block
+    block.time, block.samples = last.time, 0
+    block.angle = block.cos_sum = block.sin_sum = 0.0
+    _clear(block.gain)
+    _clear(block.gain_sum)
+    block.start_yaw_rate = last.yaw_rate
+    for channel in range(INPUTS):
+        block.sums[channel] = 0.0
+        block.counts[channel] = 0
+    for wheel in range(4):
+        block.start_omega[wheel] = last.omega[wheel]
+
+
+@compiled
+def _clear(gain: VelocityGain) -> None:
+    gain.measured.x = gain.measured.y = gain.leak_x.x = gain.leak_x.y = 0.0
+    gain.leak_y.x = gain.leak_y.y = gain.unit.x = gain.unit.y = 0.0
+
+
+@compiled
+def _check(memory: MixtureMemory, time: float, sample: FloatArray) -> int:
+    health = 0
+    for channel in range(INPUTS):
+        value = sample[channel]
+        if not math.isnan(value) and not abs(value) <= LIMITS[channel]:
+            health |= flags.OUTLIER
+    if math.isfinite(sample[S.LATITUDE]) and math.isfinite(sample[S.LONGITUDE]):
+        memory.last.position_time = time
+    if not time - memory.last.position_time <= POSITION_S:
+        health |= flags.NO_POSITION
+    if math.isnan(reading(sample, S.AX) + reading(sample, S.AY) + reading(sample, S.YAW_RATE)):
+        health |= flags.NO_INERTIAL
+    for wheel in range(4):
+        if math.isnan(reading(sample, S.OMEGA + wheel)):
+            health |= flags.NO_WHEEL_SPEED
+        if math.isnan(reading(sample, S.TORQUE + wheel)):
+            health |= flags.NO_TORQUE
+    return health
+
+
+@compiled
+def _filter_yaw_rate(memory: MixtureMemory, dt: float, sample: FloatArray) -> None:
+    """Scalar Kalman filter: random walk, gyroscope, and the rear wheels where it is missing."""
+    last, row = memory.last, memory.row
+    variance = last.yaw_rate_var + YAW_WALK**2 * dt
+    value, noise = reading(sample, S.YAW_RATE), YAW_STD
+    if math.isnan(value):
+        left, right = reading(sample, S.OMEGA + 2), reading(sample, S.OMEGA + 3)
+        value, noise = row[P.RADIUS] * (right - left) / row[P.TRACK_REAR], REAR_STD
+    if math.isnan(value):
+        last.yaw_rate_var = min(variance, UNKNOWN_YAW_VAR)
+        return
+    gain = variance / (variance + noise**2)
+    last.yaw_rate += gain * (value - last.yaw_rate)
+    last.yaw_rate_var = gain * noise**2
+
+
+@compiled
+def _believed(value: float, used: float, read: float) -> float:
+    """The accelerometer's reading; NaN where it is far from both the last one that was used and the last one read."""
+    jumps = abs(value - read) > JUMP_M_S2 and abs(value - used) > JUMP_M_S2
+    return math.nan if jumps else value
+
+
+@compiled
+def _move(memory: MixtureMemory, time: float, dt: float, ax: float, ay: float, turning: bool) -> None:
+    """Velocity gained since the block began, in the axes of now: the exact solution for inputs constant over dt.
+
+    ax, ay are NaN where they are missing; `turning` is whether the yaw rate is not.
+    """
+    last, block = memory.last, memory.block
+    rate = last.yaw_rate
+    if not math.isnan(ax + ay):
+        last.inertial_time = time
+    elif time - last.inertial_time < HOLD_S:
+        ax = last.ax if math.isnan(ax) else ax
+        ay = last.ay if math.isnan(ay) else ay
+    leak_x, leak_y = ax, ay
+    if math.isnan(ax):
+        ax = leak_x = 0.0
+        block.missing_x = LOST_AX**2
+    if math.isnan(ay) or not turning:
+        block.missing_y = LOST_AY**2
+    if math.isnan(ay):
+        ay, leak_y = rate * memory.overall_mean[NodeState.VX], 0.0
+    last.ax, last.ay = ax, ay
+    gain, total = block.gain, block.gain_sum
+    _advance(gain.measured, ax, ay, rate, dt)
+    _advance(gain.leak_x, leak_x, 0.0, rate, dt)
+    _advance(gain.leak_y, 0.0, leak_y, rate, dt)
+    _advance(gain.unit, 1.0, 0.0, rate, dt)
+    block.angle += rate * dt
+    block.cos_sum += math.cos(block.angle)
+    block.sin_sum += math.sin(block.angle)
+    _accumulate(total.measured, gain.measured)
+    _accumulate(total.leak_x, gain.leak_x)
+    _accumulate(total.leak_y, gain.leak_y)
+    _accumulate(total.unit, gain.unit)
+    block.samples += 1
+
+
+@compiled
+def _advance(gained: PlanarVector, ax: float, ay: float, rate: float, dt: float) -> None:
+    gained.x, gained.y = advance_velocity(gained.x, gained.y, ax, ay, rate, dt)
+
+
+@compiled
+def _accumulate(total: PlanarVector, part: PlanarVector) -> None:
+    total.x += part.x
+    total.y += part.y
+
+
+@compiled
+def _add(memory: MixtureMemory, ax: float, ay: float, sample: FloatArray) -> None:
+    last, block = memory.last, memory.block
+    for channel in range(INPUTS):
+        value = ax if channel == S.AX else ay if channel == S.AY else reading(sample, channel)
+        if not math.isnan(value):
+            block.sums[channel] += value
+            block.counts[channel] += 1
+    for wheel in range(4):
+        omega = reading(sample, S.OMEGA + wheel)
+        last.omega[wheel] = last.omega[wheel] if math.isnan(omega) else omega
+        if block.counts[S.DELTA + wheel] > 0:
+            last.delta[wheel] = block.sums[S.DELTA + wheel] / block.counts[S.DELTA + wheel]
+            if wheel >= 2:
+                last.rear_steering = True

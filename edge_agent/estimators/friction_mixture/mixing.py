@@ -1,0 +1,140 @@
+"""The nodes together: mixing after a road change, moment matching, and nodes that have diverged.
+
+Legend
+    m_j, P_j, w_j   mean (n,), covariance (n, n) and probability of node j
+    m, P            mean and covariance of the whole mixture
+    zeta            share of a node's predicted mass that came from anywhere by a road change [1]
+
+The state of a node after mixing is (1 - zeta)*N(m_j, P_j) + zeta*N(m, P), matched in its first two moments: an
+improbable node keeps the state of the vehicle and is ready to explain the next sample (interacting multiple models,
+Blom and Bar-Shalom 1988). Covariances are only ever added here.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from edge_agent.estimators.common.arrays import clear, clear_rows, put, put_square
+from edge_agent.estimators.friction_mixture.constants import ALL_NODES, NODES, Constants, NodeState
+from edge_agent.estimators.friction_mixture.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.friction_grid import SMALLEST, change_road
+from edge_agent.estimators.friction_mixture.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.restart import put_split_to_sleep
+from edge_agent.estimators.friction_mixture.workspace import Scratch
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+
+LEAST_MIXING = 1e-3  # a smaller share of foreign mass changes no digit that is read
+LEAST_WEIGHT = 1e-9  # nor does a node of less
+SLEEPING_SHARE = 0.5  # of the split nodes' prior: below, they sleep again; above, they would wake at the next sign
+LARGEST_DRIFT = 0.5  # of a node's mass in a block: more would overshoot the balance between neighbours
+
+
+@compiled
+def awake(memory: MixtureMemory) -> int:
+    """How many nodes take part."""
+    return ALL_NODES if memory.split else NODES
+
+
+@compiled
+def wake_or_sleep(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
+    """Split nodes take part from the first sign of such a road until they have become improbable."""
+    weight, visit, constants = memory.weight, memory.visit_weight, design.constants
+    sign = scratch.features.asymmetry > constants.split_asymmetry
+    if memory.split:
+        total = 0.0
+        for j in range(NODES, ALL_NODES):
+            total += weight[j]
+        if total < SLEEPING_SHARE * constants.split_prior and not sign:
+            put_split_to_sleep(memory)
+    elif sign:
+        memory.split = True
+        for j in range(NODES):
+            weight[j] *= 1.0 - constants.split_prior
+            visit[j] *= 1.0 - constants.split_prior
+        for j in range(NODES, ALL_NODES):
+            weight[j] = visit[j] = design.sides.prior[j]
+            memory.penalty[j] = 0.0
+            put(memory.mean[j], memory.overall_mean)
+            put_square(memory.covariance[j], memory.overall_covariance)
+
+
+@compiled
+def drive_on(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, metres: float) -> None:
+    """Road change over `metres`: probabilities flow, and each node is mixed with what came to it."""
+    count, constants = awake(memory), design.constants
+    prior = design.sides.prior[:count] if memory.split else design.prior[:count]
+    hazard = 1.0 - math.exp(-metres * constants.hazard)
+    leaving = 1.0 - math.exp(-metres * constants.split_hazard)
+    drift = min(metres * constants.diffusion * NODES, LARGEST_DRIFT)
+    predicted, weight, visit = scratch.predicted[:count], memory.weight[:count], memory.visit_weight[:count]
+    change_road(visit, prior, NODES, hazard, leaving, drift, predicted)
+    put(visit, predicted)
+    change_road(weight, prior, NODES, hazard, leaving, drift, predicted)
+    for j in range(count):
+        zeta = min(hazard * prior[j] / predicted[j], 1.0)
+        memory.penalty[j] *= 1.0 - zeta
+        mix(memory.mean[j], memory.covariance[j], zeta, memory.overall_mean, memory.overall_covariance)
+    put(weight, predicted)
+
+
+@compiled
+def mix(
+    mean: FloatArray, covariance: FloatArray, zeta: float, overall_mean: FloatArray, overall_covariance: FloatArray
+) -> None:
+    """Mix one node (mean (n,), covariance (n, n), changed in place) with the whole."""
+    if zeta < LEAST_MIXING:
+        return
+    n = mean.shape[0]
+    for i in range(n):
+        apart = zeta * (1.0 - zeta) * (overall_mean[i] - mean[i])
+        for j in range(i + 1):
+            foreign = zeta * (overall_covariance[i, j] - covariance[i, j])
+            covariance[i, j] += foreign + apart * (overall_mean[j] - mean[j])
+            covariance[j, i] = covariance[i, j]
+    for i in range(n):
+        mean[i] += zeta * (overall_mean[i] - mean[i])
+
+
+@compiled
+def match_moments(
+    mean: FloatArray,
+    covariance: FloatArray,
+    weight: FloatArray,
+    overall_mean: FloatArray,
+    overall_covariance: FloatArray,
+) -> None:
+    """Mean (n,) and covariance (n, n) of the mixture of the first K nodes, weight (K,)."""
+    count, n = weight.shape[0], mean.shape[1]
+    clear(overall_mean)
+    clear_rows(overall_covariance)
+    for k in range(count):
+        for i in range(n):
+            overall_mean[i] += weight[k] * mean[k, i]
+    for k in range(count):
+        if weight[k] < LEAST_WEIGHT:
+            continue
+        for i in range(n):
+            apart = mean[k, i] - overall_mean[i]
+            for j in range(i + 1):
+                overall_covariance[i, j] += weight[k] * (covariance[k, i, j] + apart * (mean[k, j] - overall_mean[j]))
+    for i in range(n):
+        for j in range(i):
+            overall_covariance[j, i] = overall_covariance[i, j]
+
+
+@compiled
+def reset_diverged(mean: FloatArray, root: FloatArray, weight: FloatArray, constants: Constants) -> None:
+    """Give nodes (K, n) whose motion has diverged the state of the most probable one, and no weight."""
+    best = int(np.argmax(weight))
+    for j in range(weight.shape[0]):
+        astray = max(
+            abs(mean[j, NodeState.VX] - mean[best, NodeState.VX]) / constants.diverged_x,
+            abs(mean[j, NodeState.VY] - mean[best, NodeState.VY]) / constants.diverged_y,
+        )
+        if astray > 1.0:
+            put(mean[j], mean[best])
+            put_square(root[j], root[best])
+            weight[j] = SMALLEST

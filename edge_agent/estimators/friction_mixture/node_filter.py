@@ -1,0 +1,297 @@
+"""One node of the mixture: the cubature filter of the vehicle, given the friction under its two sides.
+
+Legend
+    m, L        mean (n,) and square root of the covariance, L*L' = P          (n, n)
+    A           measurement deviations in the axes of L's columns              (6, ACTIVE)
+    f, a        row of A that is taken in, and its variance f'f + r^2
+    D           derivative of the rows by a state that they depend on linearly
+
+The rows are linear but for velocity and stiffness: the third-degree cubature rule is taken in those four dimensions,
+and leak, steering, shape and gain enter by D, exactly (a Rao-Blackwellised rule). Rows are taken in one after the other
+(Potter 1963): L <- L*(I - g*f*f'), with g such that no covariance is ever subtracted.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from edge_agent.estimators.friction_mixture.constants import ACTIVE, CURVED, ROWS, STATES, Constants, NodeState
+from edge_agent.estimators.friction_mixture.design import MixtureDesign, Nominal
+from edge_agent.estimators.friction_mixture.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.residuals import (
+    correct_forces,
+    find_residuals,
+    find_shape_force,
+    find_slips,
+    gained_velocity,
+    slope_along,
+)
+from edge_agent.estimators.friction_mixture.tyre_curve import TyreCurve
+from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, NodeWorkspace, Scratch
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+
+LEAST_VARIANCE = 1e-18
+
+
+class NodeUpdate(NamedTuple):
+    """What one node's update says of it."""
+
+    log_likelihood: float  # with the inflated R and the price of sliding [nat]
+    moved: float  # change of `belief_cost` [nat]
+    plain: float  # log-likelihood with the plain R, rows taken as independent [nat]
+    square: float  # normalised innovation squared with the plain R
+    rows: int
+
+
+@compiled
+def factorize(covariance: FloatArray, root: FloatArray) -> None:
+    """root (n, n) = lower-triangular Cholesky factor of covariance (n, n), of which the lower half is read."""
+    n = covariance.shape[0]
+    for j in range(n):
+        total = covariance[j, j]
+        for k in range(j):
+            total -= root[j, k] * root[j, k]
+        diagonal = math.sqrt(max(total, LEAST_VARIANCE))
+        root[j, j] = diagonal
+        share = 1.0 / diagonal
+        for i in range(j + 1, n):
+            total = covariance[i, j]
+            for k in range(j):
+                total -= root[i, k] * root[j, k]
+            root[i, j] = total * share
+            root[j, i] = 0.0
+
+
+@compiled
+def update_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int, inflation: float) -> NodeUpdate:
+    """Cubature update of node j with R times `inflation`: its mean and scratch.root[j] are changed.
+
+    Writes its innovation and its theoretical variance without the inflation.
+    """
+    constants, nominal, features, node = design.constants, design.nominal, scratch.features, scratch.node
+    mean, root, side_mu = memory.mean[j], scratch.root[j], design.sides.mu[j]
+    innovation, theoretical = scratch.innovation[j], scratch.theoretical[j]
+    node.gained.x, node.gained.y = gained_velocity(features.gain, mean)
+    price = linearize(memory.row, design, side_mu, mean, features, node)
+    spread(memory.row, design, side_mu, mean, root, features, node)
+    plain = square = 0.0
+    for r in range(ROWS):
+        innovation[r] = -node.residual[r]
+        noise = node.noise[r]
+        variance = node.nonlinearity[r]
+        for column in range(ACTIVE):
+            variance += node.deviation[r, column] ** 2
+        theoretical[r] = variance + noise
+        excess = node.residual[r] ** 2 / constants.huber**2 - variance
+        node.inflated[r] = max(noise * inflation, excess) + node.nonlinearity[r]
+        if not math.isnan(node.residual[r]):
+            ratio = node.residual[r] ** 2 / theoretical[r]
+            square += ratio
+            plain -= 0.5 * (ratio + math.log(2.0 * math.pi * theoretical[r]))
+    for r in range(ROWS):
+        node.residual[r] = innovation[r]
+    before = belief_cost(mean, nominal)
+    loss, used = take_rows(mean, root, node, constants.axle_penalty)
+    keep_within(mean, constants, nominal)
+    moved = belief_cost(mean, nominal) - before
+    return NodeUpdate(-loss - constants.sliding_penalty / inflation * price, moved, plain, square, used)
+
+
+@compiled
+def linearize(
+    row: FloatArray,
+    design: MixtureDesign,
+    side_mu: FloatArray,
+    mean: FloatArray,
+    features: BlockFeatures,
+    node: NodeWorkspace,
+) -> float:
+    """Fill node.derivative, leave node.force as at the mean, and return the price of sliding."""
+    constants, curve = design.constants, design.curve
+    price = 0.0
+    for i in range(STATES):
+        node.point[i] = mean[i]
+    for state in range(ACTIVE, CURVED - 1, -1):  # at the mean, then with each moved, STEER last
+        step = 0.0 if state == ACTIVE else 0.5 * design.nominal.std[state]
+        node.point[state] += step
+        if state == ACTIVE or state == NodeState.STEER:
+            find_slips(row, constants, mean, features, node)
+        if state == ACTIVE:
+            find_shape_force(curve, side_mu, features, node)
+            price = weigh_slopes(curve, side_mu, features, constants.sliding_slope, node)
+        correct_forces(curve, side_mu, features, node)
+        out = node.residual[:] if state == ACTIVE else node.derivative[state]
+        find_residuals(curve, side_mu, features, node, out)
+        node.point[state] -= step
+        if state < ACTIVE:
+            for r in range(ROWS):
+                out[r] = (out[r] - node.residual[r]) / step
+    return price
+
+
+@compiled
+def weigh_slopes(
+    curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, flat: float, node: NodeWorkspace
+) -> float:
+    """Fill node.noise with the variances of the rows' noise at node.slip, and return the price of sliding.
+
+    The price is what wheels on the flat of the curve cost: a sliding wheel may have any slip, so its density is spread
+    thin.
+    """
+    slip, price = node.slip, 0.0
+    for axle in range(2):
+        across = 0.0
+        for wheel in range(2 * axle, 2 * axle + 2):
+            mu, g_x, g_y = side_mu[wheel % 2], slip.along[wheel], slip.across[wheel]
+            along = slope_along(curve, g_x, g_y, mu)
+            across += features.load_share[wheel] * slope_along(curve, g_y, g_x, mu)
+            node.noise[wheel] = features.noise_std[wheel] ** 2 - unfelt(along) * features.slip_noise[wheel]
+            if not math.isnan(features.rolling[wheel]):
+                price -= min(math.log(along / flat), 0.0)
+        side = 4 + axle
+        node.noise[side] = features.noise_std[side] ** 2 - unfelt(across) * features.slip_noise[side]
+    return price
+
+
+@compiled
+def unfelt(slope: float) -> float:
+    """Share of slip noise that a residual on a curve of this slope does not feel, of the half it feels on slope 1.
+
+    Along the normal of a line of slope k, noise of the slip counts by k^2/(1 + k^2) (errors in variables). Taken for as
+    large on the flat as on the rise, it would favour nodes whose wheels slide: they do not feel it.
+    """
+    return 0.5 - slope * slope / (1.0 + slope * slope)
+
+
+@compiled
+def spread(
+    row: FloatArray,
+    design: MixtureDesign,
+    side_mu: FloatArray,
+    mean: FloatArray,
+    root: FloatArray,
+    features: BlockFeatures,
+    node: NodeWorkspace,
+) -> None:
+    """Fill node.deviation (A), node.residual with the predicted rows and node.nonlinearity with their bend."""
+    scale = math.sqrt(CURVED)
+    for r in range(ROWS):
+        node.residual[r] = node.nonlinearity[r] = 0.0
+    for column in range(CURVED):
+        for sign in range(2):
+            signed = scale if sign == 0 else -scale
+            out = node.ahead[:] if sign == 0 else node.behind[:]
+            for i in range(ACTIVE):
+                node.point[i] = mean[i] + signed * root[i, column]
+            node.point[NodeState.STEER] = mean[NodeState.STEER]
+            find_slips(row, design.constants, mean, features, node)
+            find_residuals(design.curve, side_mu, features, node, out)
+        for r in range(ROWS):
+            total = 0.5 * (node.ahead[r] - node.behind[r]) / scale
+            for state in range(CURVED, ACTIVE):
+                total += node.derivative[state, r] * root[state, column]
+            node.deviation[r, column] = total
+            node.middle[column, r] = 0.5 * (node.ahead[r] + node.behind[r])
+            node.residual[r] += node.middle[column, r] / CURVED
+    for r in range(ROWS):
+        for column in range(CURVED):
+            node.nonlinearity[r] += (node.middle[column, r] - node.residual[r]) ** 2 / CURVED
+        for column in range(CURVED, ACTIVE):
+            total = 0.0
+            for state in range(CURVED, ACTIVE):
+                total += node.derivative[state, r] * root[state, column]
+            node.deviation[r, column] = total
+
+
+@compiled
+def belief_cost(mean: FloatArray, nominal: Nominal) -> float:
+    """How far what a node believes of vehicle and sensors is from their prior [nat]; mean (n,)."""
+    total = 0.0
+    for i in range(NodeState.LN_KX, mean.shape[0]):
+        total += 0.5 * ((mean[i] - nominal.mean[i]) / nominal.std[i]) ** 2
+    return total
+
+
+@compiled
+def take_rows(mean: FloatArray, root: FloatArray, node: NodeWorkspace, axle_penalty: float) -> tuple[float, int]:
+    """Take in the innovations node.residual (6,) one by one: half the normalised square with its price, and rows.
+
+    What ln det S costs is weighed by axle_penalty for the axles and nothing for the wheels.
+    """
+    n, loss, used = mean.shape[0], 0.0, 0
+    for r in range(ROWS):
+        if math.isnan(node.residual[r]):
+            continue
+        used += 1
+        variance = node.inflated[r]
+        for c in range(ACTIVE):
+            node.column[c] = node.deviation[r, c]
+            variance += node.column[c] ** 2
+        share = 1.0 / variance
+        gain = share / (1.0 + math.sqrt(node.inflated[r] * share))
+        step = node.residual[r] * share
+        loss += 0.5 * node.residual[r] * step
+        if r >= 4:
+            loss += 0.5 * axle_penalty * math.log(variance)
+        for i in range(n):
+            along = 0.0
+            for c in range(ACTIVE):
+                along += root[i, c] * node.column[c]
+            mean[i] += along * step
+            along *= gain
+            for c in range(ACTIVE):
+                root[i, c] -= along * node.column[c]
+        for k in range(r + 1, ROWS):
+            along = 0.0
+            for c in range(ACTIVE):
+                along += node.deviation[k, c] * node.column[c]
+            node.residual[k] -= along * step
+            along *= gain
+            for c in range(ACTIVE):
+                node.deviation[k, c] -= along * node.column[c]
+    return loss, used
+
+
+@compiled
+def keep_within(mean: FloatArray, constants: Constants, nominal: Nominal) -> None:
+    """Keep what is a property of vehicle or sensor within what it can be; mean (n,)."""
+    far = constants.farthest
+    for i in range(NodeState.LN_KX, mean.shape[0]):
+        middle, reach = nominal.mean[i], far * nominal.std[i]
+        mean[i] = min(max(mean[i], middle - reach), middle + reach)
+
+
+@compiled
+def predict_node(
+    memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int, turn_cos: float, turn_sin: float
+) -> None:
+    """Advance node j over the block: exact rotation, gained velocity, process variances scratch.process.
+
+    The map is affine, and the cubature of an affine map is the map itself: covariance <- F*L*(F*L)' + diag(noise).
+    What is a property of vehicle or sensor returns to its prior by scratch.keep. scratch.root[j] is changed to F*L.
+    """
+    nominal, keep, noise, gain = design.nominal, scratch.keep, scratch.process, memory.block.gain
+    mean, root, covariance = memory.mean[j], scratch.root[j], memory.covariance[j]
+    n = mean.shape[0]
+    for k in range(n):
+        column = root[:, k]
+        vx, vy = column[NodeState.VX], column[NodeState.VY]
+        gained_x, gained_y = gained_velocity(gain, column)
+        column[NodeState.VX] = turn_cos * vx + turn_sin * vy + (gained_x - gain.measured.x)
+        column[NodeState.VY] = turn_cos * vy - turn_sin * vx + (gained_y - gain.measured.y)
+        for i in range(NodeState.LN_KX, n):
+            column[i] *= keep[i]
+    vx, vy = mean[NodeState.VX], mean[NodeState.VY]
+    gained_x, gained_y = gained_velocity(gain, mean)
+    mean[NodeState.VX] = turn_cos * vx + turn_sin * vy + gained_x
+    mean[NodeState.VY] = turn_cos * vy - turn_sin * vx + gained_y
+    for i in range(NodeState.LN_KX, n):
+        mean[i] = nominal.mean[i] + keep[i] * (mean[i] - nominal.mean[i])
+    for i in range(n):
+        for k in range(i + 1):
+            total = noise[i] if i == k else 0.0
+            for m in range(n):
+                total += root[i, m] * root[k, m]
+            covariance[i, k] = covariance[k, i] = total

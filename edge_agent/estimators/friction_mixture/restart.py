@@ -1,0 +1,160 @@
+"""Beginning, and beginning anew: the first sample, a silence, wheels that have long contradicted every node."""
+
+from __future__ import annotations
+
+import math
+
+from edge_agent.dynamics.parameters import P
+from edge_agent.estimators import flags
+from edge_agent.estimators.common.arrays import clear, put, put_square
+from edge_agent.estimators.common.excitation import begin_excitation
+from edge_agent.estimators.common.readings import reading, rolling_speed
+from edge_agent.estimators.friction_mixture.constants import ALL_NODES, NODES, NodeState
+from edge_agent.estimators.friction_mixture.design import MixtureDesign, Nominal
+from edge_agent.estimators.friction_mixture.friction_grid import quantile
+from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles
+from edge_agent.estimators.friction_mixture.workspace import BlockFeatures
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+from schemas.signals import S
+
+FIRST_VX_STD, FIRST_VY_STD = 0.3, 0.3  # [m/s]
+UNKNOWN_VX_STD = 15.0  # [m/s] without any wheel speed
+YAW_STD = 0.002  # [rad/s] white noise of a gyroscope sample
+UNKNOWN_YAW_VAR = 1.0  # [rad^2/s^2] without a gyroscope
+GAP_ACCELERATION = 2.0  # [m/s^2] that may have acted during a silence
+FREE_FORCE = 0.05  # along, over load, below which wheels that roll alike are taken for rolling freely
+ALIKE = 0.03  # relative difference of their speeds
+LOST_RATIO = 8.0  # of actual over nominal innovation variance in the window: no noise or curve does that
+LOST_SPREAD_M_S = 5.0
+SLOWEST_M_S = 1.5  # below this speed of vehicle and wheels slip has no meaning, and nothing is concluded
+
+
+@compiled
+def start(memory: MixtureMemory, design: MixtureDesign, time: float, sample: FloatArray) -> int:
+    """Begin the vehicle at its first sample with a finite time; all of its memory is zero."""
+    if not math.isfinite(time):
+        return flags.TIME_GAP
+    last, block = memory.last, memory.block
+    last.time = block.time = time
+    last.position_time = last.inertial_time = -math.inf
+    last.read_ax = last.read_ay = math.nan
+    rate = reading(sample, S.YAW_RATE)
+    last.yaw_rate = block.start_yaw_rate = 0.0 if math.isnan(rate) else rate
+    last.yaw_rate_var = UNKNOWN_YAW_VAR if math.isnan(rate) else YAW_STD**2
+    for wheel in range(4):
+        block.start_omega[wheel] = last.omega[wheel] = reading(sample, S.OMEGA + wheel)
+        angle = reading(sample, S.DELTA + wheel)
+        last.delta[wheel] = 0.0 if math.isnan(angle) else angle
+    speed = rolling_speed(memory.row, sample)
+    known = not math.isnan(speed)
+    memory.overall_mean[NodeState.VX] = speed if known else 0.0
+    forget_vehicle(memory, design.nominal)
+    covariance = memory.overall_covariance
+    covariance[NodeState.VX, NodeState.VX] = (FIRST_VX_STD if known else UNKNOWN_VX_STD) ** 2
+    covariance[NodeState.VY, NodeState.VY] = FIRST_VY_STD**2
+    for j in range(NODES):
+        memory.weight[j] = memory.visit_weight[j] = design.prior[j]
+        put(memory.mean[j], memory.overall_mean)
+        put_square(memory.covariance[j], covariance)
+    for friction in (memory.friction, memory.friction_left, memory.friction_right):
+        find_quantiles(design, design.prior, friction)
+    begin_excitation(memory.excitation)
+    memory.started = True
+    return flags.OK
+
+
+@compiled
+def find_quantiles(design: MixtureDesign, weight: FloatArray, friction: Quantiles) -> None:
+    """Median, 5 % and 95 % of the friction that the nodes of one friction have with weight (NODES,)."""
+    friction.median = quantile(design.mu, design.prior, weight, 0.5)
+    friction.lower = quantile(design.mu, design.prior, weight, 0.05)
+    friction.upper = quantile(design.mu, design.prior, weight, 0.95)
+
+
+@compiled
+def forget_vehicle(memory: MixtureMemory, nominal: Nominal) -> None:
+    """The overall moments of what is a property of vehicle or sensor become those of its prior."""
+    covariance = memory.overall_covariance
+    for i in range(NodeState.LN_KX, nominal.mean.shape[0]):
+        memory.overall_mean[i] = nominal.mean[i]
+        for j in range(i + 1):
+            covariance[i, j] = covariance[j, i] = 0.0
+        covariance[i, i] = nominal.std[i] ** 2
+    clear(memory.penalty)
+
+
+@compiled
+def put_split_to_sleep(memory: MixtureMemory) -> None:
+    """The split nodes take no part any more."""
+    if not memory.split:
+        return
+    memory.split = False
+    for weight in (memory.weight, memory.visit_weight):
+        total = 0.0
+        for j in range(NODES):
+            total += weight[j]
+        for j in range(ALL_NODES):
+            weight[j] = weight[j] / total if j < NODES else 0.0
+
+
+@compiled
+def restart_motion(memory: MixtureMemory, speed: float, spread: float) -> None:
+    """All nodes go on at `speed` [m/s], or, where that is NaN, at the speed they have within `spread`."""
+    if not math.isnan(speed):
+        memory.overall_mean[NodeState.VX], spread = speed, FIRST_VX_STD
+    memory.overall_mean[NodeState.VY] = 0.0
+    covariance = memory.overall_covariance
+    for i in range(covariance.shape[0]):
+        for axis in range(2):
+            covariance[i, axis] = covariance[axis, i] = 0.0
+    covariance[NodeState.VX, NodeState.VX], covariance[NodeState.VY, NodeState.VY] = spread**2, FIRST_VY_STD**2
+    for j in range(ALL_NODES):
+        put(memory.mean[j], memory.overall_mean)
+        put_square(memory.covariance[j], covariance)
+
+
+@compiled
+def bridge(memory: MixtureMemory, design: MixtureDesign, dt: float, sample: FloatArray) -> int:
+    """After a silence of dt [s]: friction is forgotten over the metres driven meanwhile, the motion starts anew."""
+    last, prior = memory.last, design.prior
+    hazard = 1.0 - math.exp(-abs(memory.overall_mean[NodeState.VX]) * dt * design.constants.hazard)
+    put_split_to_sleep(memory)
+    for j in range(NODES):
+        memory.weight[j] += hazard * (prior[j] - memory.weight[j])
+        memory.visit_weight[j] += hazard * (prior[j] - memory.visit_weight[j])
+    restart_motion(memory, rolling_speed(memory.row, sample), min(GAP_ACCELERATION * dt, UNKNOWN_VX_STD))
+    rate = reading(sample, S.YAW_RATE)
+    if not math.isnan(rate):
+        last.yaw_rate, last.yaw_rate_var = rate, YAW_STD**2
+    for wheel in range(4):
+        last.omega[wheel] = reading(sample, S.OMEGA + wheel)
+    return flags.RESET
+
+
+@compiled
+def recover(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> int:
+    """Begin the motion and the friction anew where freely rolling wheels have long contradicted them.
+
+    A wheel without force rolls: if all nodes call it sliding, none finds back by itself, for the curve is flat there.
+    """
+    if memory.actual[0] * memory.factor[0] < LOST_RATIO * memory.theoretical[0]:
+        return 0
+    least, most = math.inf, -math.inf
+    for wheel in range(4):
+        if abs(features.force[wheel]) > FREE_FORCE:
+            return 0
+        if not math.isnan(features.rolling[wheel]):
+            least, most = min(least, features.rolling[wheel]), max(most, features.rolling[wheel])
+    turning = abs(features.yaw_rate) * memory.row[P.TRACK_REAR]
+    if most - least > ALIKE * max(most, SLOWEST_M_S) + turning:
+        return 0
+    forget_vehicle(memory, design.nominal)  # what was learned while lost is as wrong as the motion was
+    restart_motion(memory, most if most >= 0.0 else math.nan, LOST_SPREAD_M_S)
+    for group in range(2):
+        memory.actual[group] = memory.theoretical[group]
+        memory.factor[group] = 1.0
+    put_split_to_sleep(memory)
+    for j in range(NODES):
+        memory.weight[j] = memory.visit_weight[j] = design.prior[j]
+    return flags.RESET

@@ -1,0 +1,88 @@
+"""Split roads: a low and a high friction under the two sides of the vehicle, either way round.
+
+The frictions of a side are cells of a coarse grid; a node stands for a triangular density about the middle of its cell
+that reaches to the neighbours' middles, so that a friction between two nodes is held by both.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import Annotated, NamedTuple
+
+import numpy as np
+
+from edge_agent.estimators.friction_mixture.constants import ALL_NODES, NODES, SPLIT_NODES
+from schemas.mugrid import LOWER, UPPER
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+
+LEAST_RATIO = 1.45  # of the higher side's friction to the lower one's, to count as split
+LOW = (0.05, 0.11, 0.17, 0.25, 0.36, 0.50, 0.66)  # edges of the cells of the lower side
+HIGH = (0.36, 0.55, 0.80, 1.20)  # and of the higher: often it is only known to be more
+LEFT, RIGHT, BOTH = range(3)  # whose friction a share of cells is of; BOTH is the mean of the two
+
+
+class Sides(NamedTuple):
+    """Friction under the left and right wheels of all nodes: those of one friction first, then the split ones."""
+
+    mu: Annotated[FloatArray, ALL_NODES, 2]  # left, right
+    prior: Annotated[FloatArray, ALL_NODES]
+    # of a split node's left side, right side and mean in the cells of the nodes of one friction
+    share: Annotated[FloatArray, 3, SPLIT_NODES, NODES]
+
+
+class Triangle(NamedTuple):
+    """A triangular density: it rises from the left end to the middle and falls to the right end."""
+
+    left: float
+    middle: float
+    right: float
+    width: float  # of the cell that it stands for, the share of a uniform prior
+
+
+def triangles(edges: tuple[float, ...]) -> list[Triangle]:
+    """One per cell, about its middle; the outermost end at the outer edges."""
+    middles = [0.5 * (a + b) for a, b in pairwise(edges)]
+    lefts, rights = [edges[0], *middles[:-1]], [*middles[1:], edges[-1]]
+    widths = [b - a for a, b in pairwise(edges)]
+    return [Triangle(*row) for row in zip(lefts, middles, rights, widths, strict=True)]
+
+
+def side_table(mu: FloatArray, prior: FloatArray, split_prior: float) -> Sides:
+    """All nodes, where a share `split_prior` of the roads has unlike sides; mu and prior (K,)."""
+    edges = np.linspace(math.sqrt(LOWER), math.sqrt(UPPER), len(mu) + 1) ** 2
+    pairs, mass, share = [], [], []
+    for low, high in ((a, b) for a in triangles(LOW) for b in triangles(HIGH) if b.middle > LEAST_RATIO * a.middle):
+        mean = Triangle._make(0.5 * (a + b) for a, b in zip(low, high, strict=True))
+        for left, right in ((low, high), (high, low)):
+            pairs.append((left.middle, right.middle))
+            mass.append(low.width * high.width)
+            share.append([_in_cells(edges, one) for one in (left, right, mean)])
+    return Sides(
+        np.vstack([np.column_stack([mu, mu]), pairs]),
+        np.concatenate([(1.0 - split_prior) * prior, split_prior * np.array(mass) / sum(mass)]),
+        np.ascontiguousarray(np.array(share).transpose(1, 0, 2)),
+    )
+
+
+def _in_cells(edges: FloatArray, triangle: Triangle) -> FloatArray:
+    """Share of a triangular density in each cell between the edges."""
+    left, middle, right, _ = triangle
+    rising = np.clip(edges - left, 0.0, middle - left)
+    falling = np.clip(right - edges, 0.0, right - middle)
+    whole = right - left
+    below = rising**2 / (middle - left) / whole
+    above = falling**2 / (right - middle) / whole
+    return np.diff(np.where(edges < middle, below, 1.0 - above))
+
+
+@compiled
+def project(w: FloatArray, share: FloatArray, out: FloatArray) -> None:
+    """out (K,) = probabilities of the cells of the K nodes, those of the split nodes (SPLIT_NODES, K) shared out."""
+    chain = out.shape[0]
+    for j in range(chain):
+        out[j] = w[j]
+    for k in range(share.shape[0]):
+        for j in range(chain):
+            out[j] += w[chain + k] * share[k, j]

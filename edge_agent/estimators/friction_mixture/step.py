@@ -1,0 +1,125 @@
+"""One sample of one vehicle: sums of the block, and at the block's end one step of the mixture.
+
+Order at the end of a block: road change per metre and mixing, measurement update of every node at the state of the
+block's beginning, reweighing with the evidence tempered by demand, adaptation of R, prediction to the block's end.
+Between ends of blocks the velocity is carried on by the same exact kinematics.
+"""
+
+from __future__ import annotations
+
+import math
+
+from edge_agent.dynamics.parameters import P
+from edge_agent.estimators import flags
+from edge_agent.estimators.common.excitation import note_excitation
+from edge_agent.estimators.friction_mixture.block_features import block_features
+from edge_agent.estimators.friction_mixture.constants import NodeState
+from edge_agent.estimators.friction_mixture.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.intake import begin_block, take_sample
+from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles
+from edge_agent.estimators.friction_mixture.mixing import awake, drive_on, match_moments, wake_or_sleep
+from edge_agent.estimators.friction_mixture.node_filter import predict_node
+from edge_agent.estimators.friction_mixture.residuals import gained_velocity
+from edge_agent.estimators.friction_mixture.restart import find_quantiles, recover, start
+from edge_agent.estimators.friction_mixture.split_sides import BOTH, LEFT, RIGHT, project
+from edge_agent.estimators.friction_mixture.weighing import measure
+from edge_agent.estimators.friction_mixture.workspace import Scratch
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+
+SLIDING_THETA = 3.0  # normalised slip beyond the peak of every passenger tyre's curve
+SLOWEST_SLIDING_M_S = 1.0  # slip of the health flag is taken against at least this speed
+
+
+@compiled
+def step(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, time: float, sample: FloatArray) -> int:
+    """Take one sample (18,); returns health flags of this sample alone."""
+    if not memory.started:
+        return start(memory, design, time, sample) | flags.RESET
+    health, whole = take_sample(memory, design, time, sample)
+    if whole:
+        finish_block(memory, design, scratch)
+    return health
+
+
+@compiled
+def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
+    """Close the block and begin the next at the same instant."""
+    features = scratch.features
+    features.duration = memory.last.time - memory.block.time
+    features.speed = abs(memory.overall_mean[NodeState.VX])
+    health = block_features(memory, design, features)
+    wake_or_sleep(memory, design, scratch)
+    drive_on(memory, design, scratch, features.speed * features.duration)
+    measure(memory, design, scratch)
+    predict(memory, design, scratch)
+    memory.health = health | recover(memory, design, features)
+    conclude(memory, design, scratch)
+    begin_block(memory)
+    memory.block.missing_x = memory.block.missing_y = 0.0
+
+
+@compiled
+def predict(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
+    """Predict all nodes to the end of the block, and renew the moments of the mixture."""
+    block, constants, nominal = memory.block, design.constants, design.nominal
+    duration, process, keep = scratch.features.duration, scratch.process, scratch.keep
+    leak = constants.leak_wander * abs(memory.last.ax)
+    gyro = constants.gyro_wander * scratch.features.speed
+    process[NodeState.VX] = (constants.drift_x**2 + leak**2 + block.missing_x) * duration
+    process[NodeState.VY] = (constants.drift_y**2 + gyro**2 + block.missing_y) * duration
+    for i in range(NodeState.LN_KX, nominal.mean.shape[0]):
+        keep[i] = math.exp(-duration / nominal.time[i])
+        process[i] = nominal.std[i] ** 2 * (1.0 - keep[i] ** 2)
+    cos, sin = math.cos(block.angle), math.sin(block.angle)
+    count = awake(memory)
+    for j in range(count):
+        predict_node(memory, design, scratch, j, cos, sin)
+    match_moments(memory.mean, memory.covariance, memory.weight[:count], memory.overall_mean, memory.overall_covariance)
+
+
+@compiled
+def conclude(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
+    """Friction with its interval, grip used in the last second, and whether wheels slide."""
+    _find_friction(memory, design, scratch)
+    note_excitation(memory.excitation, memory.last.time, scratch.features.demand)
+    vx = memory.overall_mean[NodeState.VX]
+    speed = max(abs(vx), SLOWEST_SLIDING_M_S)
+    for wheel in range(4):
+        along = scratch.features.rolling[wheel] - vx
+        if memory.row[P.SLOPE_X] * abs(along) / speed > SLIDING_THETA * memory.friction.median:
+            memory.health |= flags.SLIDING
+
+
+@compiled
+def _find_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
+    """Quantiles of the friction under the left wheels, under the right, and of their mean."""
+    if memory.split:
+        _find_side(memory, design, scratch, LEFT, memory.friction_left)
+        _find_side(memory, design, scratch, RIGHT, memory.friction_right)
+        _find_side(memory, design, scratch, BOTH, memory.friction)
+    else:
+        find_quantiles(design, memory.weight, memory.friction)
+        for side in (memory.friction_left, memory.friction_right):
+            both = memory.friction
+            side.median, side.lower, side.upper = both.median, both.lower, both.upper
+
+
+@compiled
+def _find_side(
+    memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, side: int, friction: Quantiles
+) -> None:  # fmt: skip
+    project(memory.weight, design.sides.share[side], scratch.projected)
+    find_quantiles(design, scratch.projected, friction)
+
+
+@compiled
+def velocity(memory: MixtureMemory) -> tuple[float, float]:
+    """(v_x, v_y) [m/s] of the mixture now."""
+    x, angle = memory.overall_mean, memory.block.angle
+    cos, sin = math.cos(angle), math.sin(angle)
+    gained_x, gained_y = gained_velocity(memory.block.gain, x)
+    return (
+        cos * x[NodeState.VX] + sin * x[NodeState.VY] + gained_x,
+        cos * x[NodeState.VY] - sin * x[NodeState.VX] + gained_y,
+    )

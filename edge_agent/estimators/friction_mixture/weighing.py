@@ -1,0 +1,136 @@
+"""What a block's update says of friction: likelihoods tempered by demand and novelty, and the adaptation of R."""
+
+from __future__ import annotations
+
+import math
+
+from edge_agent.adaptation.fuzzy import adapted
+from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
+from edge_agent.estimators.friction_mixture.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.friction_grid import reweigh
+from edge_agent.estimators.friction_mixture.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.mixing import awake, reset_diverged
+from edge_agent.estimators.friction_mixture.node_filter import factorize, update_node
+from edge_agent.estimators.friction_mixture.restart import SLOWEST_M_S
+from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, Scratch
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+from schemas.signals import S
+
+LEAST_DEMAND = 1e-3  # [1] below it no evidence is left
+
+
+@compiled
+def measure(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
+    """Update all nodes, reweigh them, and adapt R."""
+    update_all(memory, design, scratch)
+    temper(memory, design, scratch)
+    weight = memory.weight[: awake(memory)]
+    reset_diverged(memory.mean, scratch.root, weight, design.constants)
+    reweigh(weight, scratch.log_likelihood)
+    reweigh(memory.visit_weight[: awake(memory)], scratch.log_likelihood)
+    adapt(memory, design, scratch)
+
+
+@compiled
+def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
+    """Update every node that is awake; note NIS and the predictive log-likelihood of the mixture."""
+    inflation = max(design.constants.correlation_time / scratch.features.duration, 1.0)
+    count = awake(memory)
+    for group in range(2):
+        scratch.actual_sum[group] = scratch.theoretical_sum[group] = 0.0
+    top, nis, rows = -math.inf, 0.0, 0
+    for j in range(count):
+        factorize(memory.covariance[j], scratch.root[j])
+        found = update_node(memory, design, scratch, j, inflation)
+        scratch.log_likelihood[j], scratch.moved[j] = found.log_likelihood, found.moved
+        scratch.joint[j] = found.plain + math.log(memory.weight[j])
+        top, rows = max(top, scratch.joint[j]), found.rows
+        nis += memory.weight[j] * found.square
+        for r in range(6):
+            if not math.isnan(scratch.innovation[j, r]):
+                group = 0 if r < 4 else 1
+                scratch.actual_sum[group] += memory.weight[j] * scratch.innovation[j, r] ** 2
+                scratch.theoretical_sum[group] += memory.weight[j] * scratch.theoretical[j, r]
+    total = 0.0
+    for j in range(count):
+        total += math.exp(scratch.joint[j] - top)
+    memory.log_likelihood = top + math.log(total) if rows > 0 else 0.0
+    memory.nis = nis / rows if rows > 0 else 0.0
+
+
+@compiled
+def temper(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
+    """scratch.log_likelihood becomes what the block counts for each node [nat].
+
+    Without accelerations, yaw rate or steering, sliding cannot be told from rolling: nothing is concluded on friction.
+    """
+    constants, features = design.constants, scratch.features
+    count = awake(memory)
+    best = -math.inf
+    for j in range(count):
+        best = max(best, scratch.log_likelihood[j])
+    need = (constants.demand_half / max(features.demand, LEAST_DEMAND)) ** constants.demand_power
+    blind = memory.block.counts[S.AX] == 0 or math.isnan(features.side[0] + features.side[1])
+    share = novelty(memory.usual_force, features, constants) / (1.0 + need)
+    moving = slip_meaning(features, memory.overall_mean[NodeState.VX])
+    for j in range(count):
+        loss = scratch.log_likelihood[j] - best
+        beyond = min(loss + constants.plausible_loss, 0.0)
+        loss = max(loss, -constants.plausible_loss)
+        loss = max(moving * (share * loss + beyond), -constants.largest_loss)
+        if blind:
+            scratch.log_likelihood[j] = 0.0
+        else:
+            scratch.log_likelihood[j] = loss - charge(memory, j, need / (1.0 + need) * scratch.moved[j])
+
+
+@compiled
+def charge(memory: MixtureMemory, node: int, price: float) -> float:
+    """Price [nat] of what a node has come to believe of the vehicle; a refund is at most what has been charged.
+
+    Tempered evidence has charged it in part only, while its state has moved by all that was measured: on gentle drives
+    a low friction would else live on a stiffness or an offset three spreads from what is known, and hardly pay.
+    """
+    charged = max(price, -memory.penalty[node])
+    memory.penalty[node] += charged
+    return float(charged)
+
+
+@compiled
+def slip_meaning(features: BlockFeatures, vx: float) -> float:
+    """Share of the evidence that slip is worth at low speed: none when creeping, all from twice that speed on."""
+    fastest = abs(vx)
+    for wheel in range(4):
+        if not math.isnan(features.rolling[wheel]):
+            fastest = max(fastest, abs(features.rolling[wheel]))
+    return min(max(fastest / SLOWEST_M_S - 1.0, 0.0), 1.0)
+
+
+@compiled
+def novelty(usual: FloatArray, features: BlockFeatures, constants: Constants) -> float:
+    """Share of the evidence that is new: forces against their smoothed past `usual` (6,), moved on by a block."""
+    keep = math.exp(-features.duration / constants.steady_time)
+    most = 0.0
+    for r in range(6):
+        force = features.force[r] if r < 4 else features.side[r - 4]
+        if not math.isnan(force):
+            most = max(most, abs(force - usual[r]))
+            usual[r] = keep * usual[r] + (1.0 - keep) * force
+    least = constants.steady_share
+    return float(least + (1.0 - least) * most * most / (most * most + constants.steady_half**2))
+
+
+@compiled
+def adapt(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
+    """Innovation variances in their window, and the factors on R for the next block."""
+    keep = math.exp(-scratch.features.duration / design.constants.window)
+    for group in range(2):
+        if scratch.theoretical_sum[group] > 0.0:
+            memory.actual[group] = keep * memory.actual[group] + (1.0 - keep) * scratch.actual_sum[group]
+            memory.theoretical[group] = keep * memory.theoretical[group] + (1.0 - keep) * scratch.theoretical_sum[group]
+            if design.adaptive:
+                memory.factor[group] = adapted(
+                    memory.factor[group], memory.actual[group], memory.theoretical[group],
+                    design.fuzzy_inputs, design.fuzzy_outputs,
+                )  # fmt: skip

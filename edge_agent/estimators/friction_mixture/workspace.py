@@ -1,0 +1,97 @@
+"""Records that a step writes before it reads them: intermediate results of one block of one vehicle."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from edge_agent.estimators.friction_mixture.constants import ACTIVE, ALL_NODES, CURVED, NODES, ROWS, STATES
+from edge_agent.estimators.friction_mixture.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.memory import PlanarVector, VelocityGain
+from schemas.numeric import FloatArray
+
+
+class BlockFeatures:
+    """What the measurement equations need of a block.
+
+    The mean velocity of the block is rotation(cos, sin)*v + gains, v at the block's beginning. Wheels are in the order
+    fl, fr, rl, rr, axles front, rear; rows of measurement are the four wheels along, then the two axles across.
+    """
+
+    duration: float  # [s]
+    speed: float  # |v_x| at the beginning [m/s]
+    cos: float
+    sin: float
+    gain: VelocityGain  # mean over the block
+    yaw_rate: float  # mean [rad/s]
+    demand: float  # largest force over load of any wheel [1]
+    asymmetry: float  # slip left against right beyond force and noise, in force over load [1]
+    loads: Annotated[FloatArray, 4]  # [N]
+    spin: Annotated[FloatArray, 4]  # wheel acceleration [rad/s^2]
+    rolling: Annotated[FloatArray, 4]  # R*omega, mean [m/s]; NaN without a reading
+    force: Annotated[FloatArray, 4]  # F_x/F_z [1]
+    load_share: Annotated[FloatArray, 4]  # wheel load over axle load [1]
+    steer_cos: Annotated[FloatArray, 4]
+    steer_sin: Annotated[FloatArray, 4]
+    side: Annotated[FloatArray, 2]  # F_y/F_z of an axle in the wheel's frame [1]; NaN where unknown
+    side_leak: Annotated[FloatArray, 2]  # its derivative by the leak [1]
+    noise_std: Annotated[FloatArray, ROWS]  # nominal, of a residual where the curve rises [1]
+    slip_noise: Annotated[FloatArray, ROWS]  # variance of slip, as linear force over load; half of it is in noise_std
+    informs_x: Annotated[FloatArray, 2]  # what the force of an axle's wheels says of stiffness, from 0 to 1
+    informs_y: Annotated[FloatArray, 2]
+
+
+class NodeSlip:
+    """Slip of wheels and axles at a state of a node."""
+
+    along: Annotated[FloatArray, 4]  # g_x, linear force over load [1]
+    across: Annotated[FloatArray, 4]  # g_y
+    scale_x: Annotated[FloatArray, 2]  # what a wheel's residual is multiplied by, per axle
+    scale_y: Annotated[FloatArray, 2]  # the same for an axle's residual
+
+
+class NodeWorkspace:
+    """Arrays of one node's update."""
+
+    gained: PlanarVector  # mean velocity gained in the block, by the node's mean [m/s]
+    point: Annotated[FloatArray, STATES]
+    slip: NodeSlip
+    shape_force: Annotated[FloatArray, ROWS]  # force over load by which a tyre one spread sharper differs
+    force: Annotated[FloatArray, ROWS]  # force over load as the node corrects it
+    slip_at_force: Annotated[FloatArray, ROWS]  # linear force over load that gives it
+    residual: Annotated[FloatArray, ROWS]  # at the mean, then mean of the cubature points, then what is left of it
+    ahead: Annotated[FloatArray, ROWS]
+    behind: Annotated[FloatArray, ROWS]
+    nonlinearity: Annotated[FloatArray, ROWS]  # variance of the rows' bend
+    middle: Annotated[FloatArray, CURVED, ROWS]
+    derivative: Annotated[FloatArray, ACTIVE, ROWS]
+    deviation: Annotated[FloatArray, ROWS, ACTIVE]
+    noise: Annotated[FloatArray, ROWS]  # variance of the rows' noise
+    inflated: Annotated[FloatArray, ROWS]  # the same for correlation in time and for outliers
+    column: Annotated[FloatArray, ACTIVE]
+
+
+class Scratch:
+    """Arrays of one block."""
+
+    features: BlockFeatures
+    node: NodeWorkspace
+    innovation: Annotated[FloatArray, ALL_NODES, ROWS]
+    theoretical: Annotated[FloatArray, ALL_NODES, ROWS]  # variance of it
+    process: Annotated[FloatArray, STATES]  # variances
+    keep: Annotated[FloatArray, STATES]
+    log_likelihood: Annotated[FloatArray, ALL_NODES]
+    joint: Annotated[FloatArray, ALL_NODES]  # log of weight times likelihood with the nominal R
+    moved: Annotated[FloatArray, ALL_NODES]  # change of what the belief about the vehicle costs [nat]
+    predicted: Annotated[FloatArray, ALL_NODES]
+    actual_sum: Annotated[FloatArray, 2]
+    theoretical_sum: Annotated[FloatArray, 2]
+    root: Annotated[FloatArray, ALL_NODES, STATES, STATES]
+    projected: Annotated[FloatArray, NODES]
+    expected: Annotated[FloatArray, NODES]
+
+
+class MixtureContext:
+    """What the filters of a thread share."""
+
+    design: MixtureDesign
+    scratch: Scratch
