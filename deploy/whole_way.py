@@ -24,11 +24,12 @@ from edge_agent.lab.truth_file import TruthRecorder
 from edge_agent.observe.observation_builder import Records
 from edge_agent.observe.pipeline import Pipeline
 from schemas.config import AgentConfig
+from schemas.thresholds import NS
 from schemas.wire import Columns
 
 RATE_HZ = 100.0
 BLOCK = 50  # samples
-START_NS = 1_800_000_000 * 10**9
+START_NS = 1_800_000_000 * NS
 TELL_S = 30.0
 
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from schemas.errors import InputError
+from schemas.thresholds import SLIPPERY_MU
 
 NAME_PATTERN = r"^[a-z][a-z0-9-]{2,62}$"
 REGION_PATTERN = r"^([0-3]{4}|\*)/([0-3]{3}|\*)/([0-3]{3}|\*)$"
@@ -49,7 +50,7 @@ class AgentConfig(Watched):
     state_rate_hz: Positive = Field(default=2.0, le=10.0, description="state records per second")
     flush_s: Positive = Field(default=1.0, description="longest time a record waits for its batch")
     batch_rows: int = Field(default=50, ge=1, le=50, description="records per batch at the most")
-    slippery_mu: Positive = Field(default=0.4, description="a visit whose upper bound is below is sent at once")
+    slippery_mu: Positive = Field(default=SLIPPERY_MU, description="a visit whose upper bound is below is sent at once")
     position_std: Positive = Field(default=1.5, description="[m] of the satellite receiver")
     yaw_std: Positive = Field(default=0.02, description="[rad] of the satellite receiver")
     spool: Path = Field(default=Path("spool.sqlite"), description="what is not yet acknowledged")

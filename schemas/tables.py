@@ -8,6 +8,7 @@ import pyarrow as pa
 
 from schemas import mugrid
 from schemas.signals import UNITS, per_wheel
+from schemas.thresholds import SLIPPERY_MU
 
 
 class Field(NamedTuple):
@@ -110,7 +111,7 @@ MAP_CELL: Final = (
     Field("mu", F32, "-", "peak adhesion coefficient, median"),
     Field("mu_lower", F32, "-", "5 % quantile"),
     Field("mu_upper", F32, "-", "95 % quantile"),
-    Field("p_slippery", F32, "-", "P(mu < 0.4)"),
+    Field("p_slippery", F32, "-", f"P(mu < {SLIPPERY_MU})"),
     Field("basis", pa.string(), "measured | bound | borrowed", "what the value rests on; bound: only lower bounds"),
     Field("vehicles", I32, "-", "distinct vehicles"),
     Field("observations", I64, "-", "observations"),

@@ -22,6 +22,7 @@ from fleet_service.archive.compaction import compact
 from schemas.config import ZenohSettings
 from schemas.runtime import figures
 from schemas.runtime.zenoh_session import open_session
+from schemas.thresholds import NS
 
 FOLDER = Path(".demo")
 TELL_S = 5.0
@@ -73,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     with processes.system(FOLDER) as (endpoint, _):
         listener, counts = drive(FOLDER, endpoint, args)
         visits = pq.read_table(FOLDER / "truth.parquet")
-        changed_ns = compare.started(visits) + int(appears_s * 1e9)
+        changed_ns = compare.started(visits) + int(appears_s * NS)
         comparison = compare.compare(listener.whole_map(), visits, changed_ns)
         show(FOLDER, endpoint, comparison)
         listener.close()

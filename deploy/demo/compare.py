@@ -16,10 +16,8 @@ import pyarrow.compute as pc
 from fleet_service.archive import reading
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.figures import Figure
+from schemas.thresholds import EXCITED_SHARE, SLIPPERY_MU
 from schemas.wire import Alert, Kind
-
-EXCITED = 0.6
-SLIPPERY = 0.4
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,7 @@ def delay_passes(visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Ale
     if not heard:
         return float("inf")
     left: IntArray = visits["leave_time"].cast(pa.int64()).to_numpy()
-    excited = visits["utilisation"].to_numpy() >= EXCITED
+    excited = visits["utilisation"].to_numpy() >= EXCITED_SHARE
     rows = visits.filter(pa.array(patch & excited & (left <= min(heard))))
     return float(passes(rows))
 
@@ -102,7 +100,7 @@ def figures(
     """The demo's figures with their bars."""
     several, value = comparison.several, comparison.several & comparison.measured
     error = comparison.cells["mu"].to_numpy() - comparison.truth
-    patch = (visits["mu"].to_numpy() < SLIPPERY) & newly_slippery(visits, changed_ns)
+    patch = (visits["mu"].to_numpy() < SLIPPERY_MU) & newly_slippery(visits, changed_ns)
     rows, distinct, vehicles = archived(archive)
     return [
         Figure("demo.vehicles", vehicles, "", 30, "more"),
@@ -122,7 +120,7 @@ def newly_slippery(visits: pa.Table, changed_ns: int) -> BoolArray:
     """(visits,) whether the cell was not slippery before the road changed, and the visit came after."""
     enter = visits["enter_time"].cast(pa.int64()).to_numpy()
     cell, mu = visits["cell"].to_numpy(), visits["mu"].to_numpy()
-    before = np.unique(cell[(enter < changed_ns) & (mu < SLIPPERY)])
+    before = np.unique(cell[(enter < changed_ns) & (mu < SLIPPERY_MU)])
     return np.asarray((enter >= changed_ns) & ~np.isin(cell, before))
 
 

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from deploy.demo.compare import Comparison
 from schemas.numeric import FloatArray
+from schemas.thresholds import METRES_PER_DEGREE
 
 COLOURS = "RdYlGn"  # red is slippery, green is dry
 SURFACES = {0.18: "ice", 0.35: "snow", 0.60: "wet", 0.90: "dry"}
@@ -22,9 +23,9 @@ def quarters(comparison: Comparison) -> FloatArray:
     west, south, east, north = (
         comparison.cells[side].to_numpy() for side in ("west", "south", "east", "north")
     )  # fmt: skip
-    scale = 111_320.0 * np.cos(np.radians(south.mean()))
+    scale = METRES_PER_DEGREE * np.cos(np.radians(south.mean()))
     x0, x1 = (west - west.min()) * scale, (east - west.min()) * scale
-    y0, y1 = (south - south.min()) * 111_320.0, (north - south.min()) * 111_320.0
+    y0, y1 = (south - south.min()) * METRES_PER_DEGREE, (north - south.min()) * METRES_PER_DEGREE
     corners = np.stack(
         [np.stack([x0, y0], -1), np.stack([x1, y0], -1), np.stack([x1, y1], -1), np.stack([x0, y1], -1)], 1
     )

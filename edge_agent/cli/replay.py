@@ -10,6 +10,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from schemas.thresholds import NS
+
 if TYPE_CHECKING:
     from edge_agent.app.backfill import Outcome
     from edge_agent.app.estimates_file import EstimatesFile
@@ -18,7 +20,6 @@ if TYPE_CHECKING:
     from schemas.config import AgentConfig
 
 DRAIN_S = 30.0  # for a busy service; what is not settled by then stays in the spool
-NS = 1_000_000_000
 PROGRESS_S = 1.0
 
 

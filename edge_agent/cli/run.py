@@ -51,11 +51,12 @@ def _simulated(args: argparse.Namespace) -> tuple[Vehicle, str, Iterator[Block]]
 def _logged(args: argparse.Namespace) -> tuple[Vehicle, str, Iterator[Block]]:
     from edge_agent.inputs.signal_log import read_log
     from schemas.errors import InputError
+    from schemas.thresholds import NS
     from schemas.vehicle import load_vehicle
 
     if args.vehicle is None:
         raise InputError("vehicle", "is not given", "name the vehicle file of the log with --vehicle")
     vehicle = load_vehicle(args.vehicle)
     log = read_log(Path(args.source))
-    first_ns = time.time_ns() - round(float(log.t[0]) * 1e9)
+    first_ns = time.time_ns() - round(float(log.t[0]) * NS)
     return vehicle, args.name or vehicle.name, log.blocks(first_ns, LIVE_ROWS)

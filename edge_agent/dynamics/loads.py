@@ -7,8 +7,9 @@ ISO 8855 signs: accelerating loads the rear, a left turn (a_y > 0) loads the rig
 
 from __future__ import annotations
 
-from edge_agent.dynamics.parameters import GRAVITY, Body, Four
+from edge_agent.dynamics.parameters import Body, Four
 from schemas.runtime.jit import inlined
+from schemas.thresholds import GRAVITY
 
 LEAST_LOAD_SHARE = 0.02  # of a static wheel load: a lifted wheel keeps a trace of load, so that shares stay finite
 

@@ -13,9 +13,8 @@ import numpy as np
 
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import inlined
+from schemas.thresholds import GRAVITY
 from schemas.vehicle import Vehicle
-
-GRAVITY = 9.81  # [m/s^2]
 
 
 class P(IntEnum):

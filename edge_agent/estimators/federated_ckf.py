@@ -22,7 +22,7 @@ from typing import Annotated
 import numpy as np
 
 from edge_agent.dynamics.chassis import response, turned
-from edge_agent.dynamics.parameters import GRAVITY, P, body, four
+from edge_agent.dynamics.parameters import P, body, four
 from edge_agent.estimators import flags
 from edge_agent.estimators.bank import EstimatorBank
 from edge_agent.estimators.estimates import FOUR_FRICTIONS, Y
@@ -53,6 +53,7 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled, nogil
 from schemas.runtime.records import Nothing, Records, records
 from schemas.signals import S
+from schemas.thresholds import GRAVITY
 from schemas.vehicle import Vehicle
 
 WHEELS, ROWS = 4, 3

@@ -28,7 +28,7 @@ import numpy as np
 from edge_agent.dynamics.body import advance_velocity
 from edge_agent.dynamics.chassis import DUGOFF, response, turned, tyre_forces
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import GRAVITY, Four, P, body, four
+from edge_agent.dynamics.parameters import Four, P, body, four
 from edge_agent.estimators import flags
 from edge_agent.estimators.bank import EstimatorBank
 from edge_agent.estimators.common.readings import rolling_speed
@@ -60,6 +60,7 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled, nogil
 from schemas.runtime.records import Nothing, Records, records
 from schemas.signals import S
+from schemas.thresholds import GRAVITY
 from schemas.vehicle import Vehicle
 
 STATES, ROWS = 7, 7  # rows: speed of the wheels, r, a_y, four longitudinal forces

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.numeric import FloatArray, IntArray
-
-NS = 1_000_000_000
+from schemas.thresholds import NS
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from edge_agent.inputs.block import NS, Block, absolute
+from edge_agent.inputs.block import Block, absolute
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S, per_wheel
+from schemas.thresholds import NS
 
 NEEDED: Final = ("ax", "ay", "yaw_rate", *per_wheel("omega"))
 FRONT_STEERING: Final = per_wheel("delta")[:2]

@@ -17,12 +17,12 @@ from schemas import grid
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
+from schemas.thresholds import METRES_PER_DEGREE
 
 FIX_HELD_S: Final = 1.0  # a 10 Hz receiver that misses ten fixes is lost; at 15 m/s the next cell has been reached
 CELL_MARGIN: Final = 0.1  # of a cell's side, 1 to 2 m: three standard deviations of a receiver's white noise
 SECTOR_KEEP: Final = np.radians(5.0)  # beyond the sector's edge
 COURSE_BASE_M: Final = 3.0  # a course is taken between fixes this far apart: some 8 degrees of noise
-METRES_PER_DEGREE: Final = 111_320.0  # of latitude
 NOWHERE: Final = -1  # cell of a vehicle without position
 
 # columns of a Track's float state

@@ -18,15 +18,13 @@ from schemas import mugrid
 from schemas.config import AgentConfig
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.jit import compiled
+from schemas.thresholds import EXCITED_SHARE, NS, UTILISED_WINDOW_S
 from schemas.wire import Columns, Kind, column_types
 
 if TYPE_CHECKING:
     from edge_agent.estimators import Estimates
 
-UTILISED_WINDOW_S: Final = 1.0  # of Estimates.mu_utilised, by contract
-EXCITED: Final = 0.6  # share of mu that must be used for a value of mu to be more than a bound (contract)
 ABS_UNKNOWN: Final = -1  # no slip controller is read yet
-NS: Final = 1_000_000_000
 
 # columns of an open visit
 _ENTER, _LEAVE, _SAMPLES, _CELL, _SECTOR, _HEALTH = range(6)
@@ -152,7 +150,7 @@ def _observations(
         "abs_active": np.full(n, ABS_UNKNOWN),
     }
     limit = config.slippery_mu
-    urgent = (upper < limit) | ((mu < limit) & (used >= EXCITED * mu))
+    urgent = (upper < limit) | ((mu < limit) & (used >= EXCITED_SHARE * mu))
     return Records(Kind.OBSERVATION, _typed(Kind.OBSERVATION, columns), row[:, 1], urgent)
 
 

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from edge_agent.inputs.block import NS, Block
+from edge_agent.inputs.block import Block
 from edge_agent.observe.cell_tracker import Track, locate
 from edge_agent.observe.observation_builder import Open, Records, observe
 from edge_agent.observe.trip_privacy import TripEnds
+from schemas.thresholds import NS
 
 if TYPE_CHECKING:
     from edge_agent.estimators import Estimates, EstimatorBank

@@ -11,9 +11,9 @@ import numpy as np
 
 from edge_agent.observe.observation_builder import Records
 from schemas.numeric import FloatArray, IntArray
+from schemas.thresholds import NS
 from schemas.wire import Kind
 
-NS = 1_000_000_000
 _TIME = {Kind.OBSERVATION: "leave_time", Kind.STATE: "time"}
 
 

@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 from fleet_service.archive import layout, snapshots
 from fleet_service.archive.export import Part
 from schemas.errors import InputError
+from schemas.thresholds import EXCITED_SHARE, NS
 from schemas.wire import Kind
 
 try:
@@ -81,7 +82,7 @@ class Engine:
             raise InputError("archive", problem, "run fleet-service compact, or give other times")
         t = self._read("observations", paths, "leave_time", "time")
         t = t.mutate(day=t.date.cast("date"))
-        t = t.filter(t.time >= self.part.since // 10**9, t.time < -(-self.part.until // 10**9))
+        t = t.filter(t.time >= self.part.since // NS, t.time < -(-self.part.until // NS))
         if self.part.bbox is not None:
             west, south, east, north = self.part.bbox
             t = t.filter(t.longitude >= west, t.longitude < east, t.latitude >= south, t.latitude < north)
@@ -139,15 +140,13 @@ def _spark(progress: bool) -> Any:  # noqa: ANN401 a Spark session
 
 
 def value(t: Table) -> Any:  # noqa: ANN401 an Ibis boolean
-    """Whether rows told a value of mu and not only a bound: they used VALUE_UTILISATION of it (design of the wire).
+    """Whether rows told a value of mu and not only a bound: they used EXCITED_SHARE of it (design of the wire).
 
     NaN is larger than any number in both engines, so that it is asked for.
     """
-    share = ibis.literal(VALUE_UTILISATION - _NEARLY, "float64")
+    share = ibis.literal(EXCITED_SHARE - _NEARLY, "float64")
     enough = t.mu_utilised.cast("float64") >= share * t.mu.cast("float64")
     return ~t.mu.isnan() & ~t.mu_utilised.isnan() & enough
 
 
-VALUE_UTILISATION: Final = 0.6  # as in the fusion: with less, a posterior's median is mostly its prior
 _NEARLY: Final = 1e-6  # far below the steps of both, so that engines that round otherwise agree where they are equal
-SLIPPERY: Final = 0.4

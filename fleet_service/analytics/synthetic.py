@@ -16,9 +16,10 @@ import numpy as np
 from fleet_service.archive.segments import Rows, Writer, stepped
 from schemas import grid, mugrid
 from schemas.numeric import BoolArray, ByteArray, FloatArray, IntArray
+from schemas.thresholds import NS, Z_95
 from schemas.wire import Kind
 
-START_NS: Final = 1_769_472_000 * 10**9  # 2026-01-27 00:00 UTC
+START_NS: Final = 1_769_472_000 * NS  # 2026-01-27 00:00 UTC
 DAY_S: Final = 86_400
 LATITUDE, LONGITUDE = 57.70, 11.97
 CELL_S: Final = 0.7  # in a cell, at 15 m/s
@@ -77,13 +78,13 @@ def _chunk(world: World, rng: np.random.Generator, bias: FloatArray, since_s: in
     used = np.clip(truth * np.where(excited, rng.uniform(0.62, 1.0, rows), rng.uniform(0.05, 0.5, rows)), 0.02, 1.2)
     told = truth * (1.0 + bias[who[trip]]) + _STD * rng.normal(size=rows)
     mu = np.clip(np.where(excited, told, np.maximum(0.62, used + 0.2) + 0.03 * rng.normal(size=rows)), 0.06, 1.19)
-    half = np.where(excited, 1.645 * _STD, 0.35)
+    half = np.where(excited, Z_95 * _STD, 0.35)
     cell = grid.cell_of(latitude, longitude)
     zeros = np.zeros(rows, np.int64)
     names = np.array([blake2b(f"{world.seed}/{v}".encode(), digest_size=8).hexdigest() for v in range(world.vehicles)])
-    leave = START_NS + (seconds * 1e9).astype(np.int64)
+    leave = START_NS + (seconds * NS).astype(np.int64)
     found: Rows = {
-        "enter_time": leave - int(CELL_S * 1e9) - rng.integers(0, 10**7, rows), "leave_time": leave, "cell": cell,
+        "enter_time": leave - int(CELL_S * NS) - rng.integers(0, 10**7, rows), "leave_time": leave, "cell": cell,
         "sector": grid.sector_of(yaw), "latitude": latitude, "longitude": longitude,
         "position_std": np.full(rows, 1.5, np.float32), "yaw": yaw.astype(np.float32),
         "yaw_std": np.full(rows, 0.02, np.float32), "speed": (15 + rng.normal(0, 2, rows)).astype(np.float32),

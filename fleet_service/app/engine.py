@@ -43,6 +43,7 @@ from schemas.errors import InputError
 from schemas.numeric import IntArray
 from schemas.query import MapQuery
 from schemas.tables import MAP_SCHEMA
+from schemas.thresholds import NS
 from schemas.wire import Alert, Kind
 
 # Rows that wait for the disk at the most; beyond, nothing is taken from the queue until a segment is written.
@@ -155,7 +156,7 @@ class Engine:
 
     def take(self, messages: Sequence[Message], now: int, slack: int = 0) -> list[Alert]:
         """Admit and fuse; returns the alerts that this raises or clears. `slack`: the true time may be so far ahead."""
-        clock = Clock(now, int(self._config.clock_ahead_s * 1e9) + slack, int(self._config.oldest_s * 1e9))
+        clock = Clock(now, int(self._config.clock_ahead_s * NS) + slack, int(self._config.oldest_s * NS))
         out: list[Alert] = []
         self._heard = max(self._heard, now)
         for kind, admitted in self._intake.admit(messages, clock).items():
@@ -259,7 +260,7 @@ class Engine:
         query = query.model_copy(update={"min_vehicles": least})
         if query.at is None:
             return answer(self._tiles, query, wanted, now, only)
-        at = int(query.at.timestamp() * 1e9)
+        at = int(query.at.timestamp() * NS)
         if at > now:
             raise InputError("at", "lies in the future", "give a time that has been")
         past = Fusion(self._config.lateness_s)

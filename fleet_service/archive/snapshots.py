@@ -15,6 +15,7 @@ import pyarrow as pa
 from fleet_service.archive import geo, layout
 from fleet_service.archive.files import MAP, put_in_place
 from schemas import tables
+from schemas.thresholds import NS
 
 TABLE: Final = "map"
 _NAME: Final = "%Y%m%dT%H%M%SZ"
@@ -26,7 +27,7 @@ def write(root: Path, table: pa.Table, now: int) -> Path:
     Raises:
         OSError: it could not be written; nothing is left of it.
     """
-    moment = datetime.fromtimestamp(now // 10**9, UTC)
+    moment = datetime.fromtimestamp(now // NS, UTC)
     folder = root / TABLE / f"date={moment:%Y-%m-%d}"
     path = folder / f"{moment:{_NAME}}.parquet"
     time = pa.array(np.full(table.num_rows, now // tables.US_STEP)).cast(tables.US)
@@ -38,7 +39,7 @@ def write(root: Path, table: pa.Table, now: int) -> Path:
 
 def time_of(path: Path) -> int:
     """Moment [ns] of a snapshot."""
-    return int(datetime.strptime(path.stem, _NAME).replace(tzinfo=UTC).timestamp()) * 10**9
+    return int(datetime.strptime(path.stem, _NAME).replace(tzinfo=UTC).timestamp()) * NS
 
 
 def newest(root: Path, until: int) -> Path | None:

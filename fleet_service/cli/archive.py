@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from schemas.errors import InputError
+from schemas.thresholds import NS
 
 if TYPE_CHECKING:
     Commands = argparse._SubParsersAction[argparse.ArgumentParser]
@@ -51,7 +52,7 @@ def moment(text: str | None, field: str, otherwise: int) -> int:
         found = datetime.fromisoformat(text)
     except ValueError as error:
         raise InputError(field, f"{text!r} is no time", "give one like 2026-01-31T07:00:00Z") from error
-    return int((found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()) * 10**9
+    return int((found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()) * NS
 
 
 def _command(

@@ -15,10 +15,11 @@ from fleet_service.fusion.belief import FULL, PackedArray
 from schemas import mugrid
 from schemas.numeric import Float32Array, IntArray
 from schemas.runtime.jit import LINE, refcount_free, refcount_free_inlined
+from schemas.thresholds import NS
 
 NONE: Final = -1
 NOBODY: Final = -1
-SECOND: Final = 10**9  # ns
+SECOND: Final = NS
 Records = NDArray[np.void]
 Int32Array = NDArray[np.int32]
 UIntArray = NDArray[np.uint32]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from schemas import mugrid
+from schemas.thresholds import EXCITED_SHARE, SLIPPERY_MU
 
 BIN_WIDTH: Final = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS
 
@@ -81,13 +82,13 @@ SPREAD_CELLS: Final = 2  # to each side; who is further off has no position
 HERE_SHARE: Final = 0.5  # more probably here than elsewhere: counts as a visit, and is held against others'
 
 # A posterior (μ, interval) is a value only where this share of μ was used (contract), else a lower bound.
-VALUE_UTILISATION: Final = 0.6
+VALUE_UTILISATION: Final = EXCITED_SHARE
 UTILISED_STD: Final = 0.05  # error of the grip used: accelerometer and load transfer, about 5 % of g
 POSTERIOR_STD: Final = 0.15  # of a posterior without an interval: as wide as wet is from dry
 POSTERIOR_STD_LEAST: Final = 0.02  # half a bin: the grid cannot hold less
 
 # Slippery is μ below this (contract of p_slippery).
-SLIPPERY: Final = 0.4
+SLIPPERY: Final = SLIPPERY_MU
 
 # Trust: two values agree up to 2.5 standard deviations of their difference (bias included) and disagree from 4 on.
 # Honest vehicles then agree in 95 % of their meetings (fixes in the wrong cell, roads that change), whatever the road.
@@ -116,7 +117,7 @@ WITNESS_TRUST: Final = 0.5  # less trusted vehicles vote, but do not bear witnes
 WITNESS_SHARE: Final = 0.6  # P(slippery) from the vote alone, against the uniform prior, that makes a witness
 # A bound is a witness of grip from this much grip used on: only a dry road gives it. On the best roads values lie at
 # the grid's end and are bounds, and without them nobody would clear an alert there.
-WITNESS_USED: Final = 0.6
+WITNESS_USED: Final = EXCITED_SHARE
 
 # Trust acts from the next epoch on, so that it depends on the order of time and not of arrival.
 EPOCH_NS: Final = 60_000_000_000

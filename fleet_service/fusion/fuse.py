@@ -22,6 +22,7 @@ from fleet_service.fusion.window import absorb, settle
 from schemas import grid
 from schemas.numeric import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from schemas.runtime.jit import compiled
+from schemas.thresholds import NS
 
 SmallArray = NDArray[np.int8]
 _ANY = 1 << 62
@@ -83,7 +84,7 @@ class Fusion:
     """
 
     def __init__(self, lateness_s: float) -> None:
-        self._lateness_ns = int(lateness_s * 1e9)
+        self._lateness_ns = int(lateness_s * NS)
         self._kept_epochs = self._lateness_ns // c.EPOCH_NS + 2  # whose trust an observation in time may still need
         self._epoch: int | None = None
         self.stores = Stores()
@@ -273,7 +274,7 @@ def _beliefs(belief: PackedArray, cells: Records, weather: Weather, slots: IntAr
         slot = slots[k]
         unpack(belief, slot, p)
         seconds = max((now - cells[slot].time) * 1e-9, 0.0) + cells[slot].aged
-        drift, change, prior = aged(weather, cells[slot].key, now - int(seconds * 1e9), now)
+        drift, change, prior = aged(weather, cells[slot].key, now - int(seconds * NS), now)
         forget(p, drift, change, weather.prior[prior], scratch[PADDED])
         for i in range(belief.shape[1]):
             out[k, i] = p[i]

@@ -22,8 +22,7 @@ from fleet_service.fusion.shape import Told, unshaped
 from schemas import mugrid
 from schemas.numeric import BoolArray, ByteArray, FloatArray
 from schemas.runtime.jit import compiled
-
-_QUANTILE_95 = 1.6448536269514722  # of the standard normal: what lies between median and 95 %
+from schemas.thresholds import Z_95
 
 
 def evidence(columns: Mapping[str, NDArray[Any]], told: BoolArray) -> Told:
@@ -86,5 +85,5 @@ def posterior(mu: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArra
 
 
 def _std(to_bound: FloatArray) -> FloatArray:
-    std = np.nan_to_num(to_bound / _QUANTILE_95, nan=c.POSTERIOR_STD)
+    std = np.nan_to_num(to_bound / Z_95, nan=c.POSTERIOR_STD)
     return np.maximum(std, c.POSTERIOR_STD_LEAST)

@@ -12,6 +12,7 @@ A visit lies anywhere in its cell, so that π_k is a uniform of width w and a no
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -20,8 +21,9 @@ from fleet_service.fusion import constants as c
 from fleet_service.fusion.normal import distribution
 from schemas import grid
 from schemas.numeric import Float32Array, FloatArray, IntArray
+from schemas.thresholds import EARTH_RADIUS_M
 
-_EARTH_M: Final = 40_075_016.686  # circumference at the equator, WGS 84
+_EARTH_M: Final = 2.0 * math.pi * EARTH_RADIUS_M  # circumference at the equator
 _STEPS: Final = np.array([k for k in range(-c.SPREAD_CELLS, c.SPREAD_CELLS + 1) if k])
 
 

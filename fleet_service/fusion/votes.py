@@ -32,6 +32,7 @@ from fleet_service.fusion.weather import Weather, aged
 from schemas import mugrid
 from schemas.numeric import Float32Array
 from schemas.runtime.jit import refcount_free, refcount_free_inlined
+from schemas.thresholds import NS
 
 # Rows of scratch, (3, SCRATCH) single precision: the belief, what `forget` and `spread` need, and the likelihood.
 P, PADDED, LIKELIHOOD = 0, 1, 2
@@ -166,7 +167,7 @@ def fold(
     change, prior = 0.0, 0
     cells[row].aged = seconds
     if seconds >= c.FORGET_S:
-        drift, change, prior = aged(weather, key, time - int(seconds * 1e9), time)
+        drift, change, prior = aged(weather, key, time - int(seconds * NS), time)
         forget(p, drift, change, weather.prior[prior], scratch[PADDED])
         cells[row].aged = 0.0
     weight = float(entries[entry].weight)

@@ -19,8 +19,9 @@ import numpy as np
 from schemas import grid, mugrid
 from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray
 from schemas.runtime.jit import refcount_free
+from schemas.thresholds import NS
 
-VALID_NS: Final = 3 * 3600 * 10**9  # a service's forecasts and stations renew hourly; two may fail
+VALID_NS: Final = 3 * 3600 * NS  # a service's forecasts and stations renew hourly; two may fail
 WET_MM_H: Final = 0.1  # least that a gauge tells from nothing
 # Water on a road takes, and leaves, some tenths of an hour; a shower passes in as much (CHANGE_S / 4 is 45 minutes).
 WET_CHANGE: Final = 4.0

@@ -26,6 +26,7 @@ from fleet_service.ingest.validation import Clock, Refusal
 from schemas.grid import cell_of
 from schemas.numeric import BoolArray, IntArray
 from schemas.runtime.batch_decoder import decode_many
+from schemas.thresholds import NS
 from schemas.wire import Kind
 from schemas.wire.batches import Decoded, Head, Heads
 
@@ -39,8 +40,8 @@ TURN_BYTES: Final = 768 * 1024
 # interpreter is free for answers.
 GATHER_S: Final = 0.01
 GATHERED: Final = 64  # messages
-DAY_NS: Final = 86_400 * 10**9
-FORGET_NS: Final = 600 * 10**9  # between two looks for streams too old to matter
+DAY_NS: Final = 86_400 * NS
+FORGET_NS: Final = 600 * NS  # between two looks for streams too old to matter
 
 
 class Message(NamedTuple):

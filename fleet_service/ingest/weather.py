@@ -22,11 +22,12 @@ from fleet_service.fusion import Fusion
 from fleet_service.fusion.weather import VALID_NS, Reports
 from schemas import grid, keys, mugrid, tables, weather
 from schemas.errors import InputError
+from schemas.thresholds import NS
 from schemas.weather import Report
 
 FOLDER: Final = "weather"
 WAITING: Final = 10_000  # reports that wait at the most: a whole continent's regions; the oldest go first
-AHEAD_NS: Final = 86_400 * 10**9  # a forecast for tomorrow is weather, one for next year a wrong clock
+AHEAD_NS: Final = 86_400 * NS  # a forecast for tomorrow is weather, one for next year a wrong clock
 COLUMNS: Final = ("region", "time", *weather.RANGES, "prior")
 
 

@@ -10,7 +10,7 @@ Legend
     m, z   m = μ·(1 + b + k) + a, and the reading z = m + σ(m)·e                       (n,)
     e      a standard normal, correlated along a drive                                 (n,)
 
-An excited visit (s ≥ EXCITED) sends ln p(z | μ) = -(z - μ)² / 2σ(μ)² - ln σ(μ): apart from b, a and k it is calibrated,
+An excited visit (s ≥ .6) sends ln p(z | μ) = -(z - μ)² / 2σ(μ)² - ln σ(μ): apart from b, a and k it is calibrated,
 also where e is correlated with that of the visit before, since each visit's e alone is standard normal (a real agent
 tempers to get there). An unexcited one sends "at least what I used", with a slope above it that is the sender's own and
 stays within half a nat (contract of the log-likelihood). Both are rounded to the wire's bytes.
@@ -27,6 +27,7 @@ from scipy.special import log_ndtr
 
 from schemas import mugrid
 from schemas.numeric import BoolArray, FloatArray, IntArray
+from schemas.thresholds import EXCITED_SHARE
 
 BIAS_RELATIVE: Final = 0.05
 BIAS_ABSOLUTE: Final = 0.015
@@ -34,10 +35,9 @@ BIAS_ABSOLUTE: Final = 0.015
 # excited vehicles err about the mean of their surface by .059 dry, .046 wet and .044 snow (robust standard deviations;
 # plain ones are .088, .088 and .066).
 COMMON: Final = 0.05
-EXCITED: Final = 0.6  # share of the grip that must be used (contract)
 NOISE_ABSOLUTE: Final = 0.02
 NOISE_AT_LIMIT: Final = 0.05  # relative
-NOISE_PER_SHARE: Final = 0.10  # ... more for each share that was left: .09 at EXCITED
+NOISE_PER_SHARE: Final = 0.10  # ... more for each share that was left: .09 at EXCITED_SHARE
 CORRELATION: Final = 0.5  # of e between a vehicle's visits to neighbouring cells
 SLOPE_NATS: Final = 0.5
 USED_STD: Final = 0.02
@@ -75,7 +75,7 @@ class Told:
 
 def shares(rng: Generator, excited: BoolArray) -> FloatArray:
     """s of visits: the upper part of the range where excited, ordinary driving else; same shape."""
-    return np.where(excited, rng.uniform(EXCITED, 1.0, excited.shape), rng.uniform(0.05, 0.5, excited.shape))
+    return np.where(excited, rng.uniform(EXCITED_SHARE, 1.0, excited.shape), rng.uniform(0.05, 0.5, excited.shape))
 
 
 def noise(rng: Generator, along: IntArray) -> FloatArray:
@@ -92,7 +92,7 @@ def tell(
     e: FloatArray,
 ) -> Told:  # fmt: skip
     """What the vehicles (n,) say after using `share` of a grip `mu` with a `common` error and noise `e`; all (n,)."""
-    excited = share >= EXCITED
+    excited = share >= EXCITED_SHARE
     relative = NOISE_AT_LIMIT + NOISE_PER_SHARE * (1.0 - share)
     seen = np.maximum(mu * (1.0 + errors.relative[vehicle] + common) + errors.additive[vehicle], mugrid.LOWER)
     std = np.hypot(NOISE_ABSOLUTE, relative * seen)

@@ -9,9 +9,10 @@ import numpy as np
 
 from fleet_service.ingest.inbox import Message
 from fleet_service.lab.drive import rows_of
-from fleet_service.lab.town import NS, START, Visits
+from fleet_service.lab.town import START, Visits
 from schemas import grid, keys, wire
 from schemas.numeric import IntArray
+from schemas.thresholds import NS
 from schemas.wire import Batch, Kind, decode
 
 BATCH_ROWS = 12  # the cells of one road

@@ -22,6 +22,7 @@ from fleet_service.lab.town import CELLS, Town, Visits
 from schemas import mugrid
 from schemas.numeric import FloatArray, IntArray
 from schemas.runtime.jit import compiled
+from schemas.thresholds import Z_95
 
 RULES: Final = ("newest report", "inverse variance", "one per pass", "covariance intersection", "federated reset")
 SAMPLES: Final = 10  # posteriors that an agent at 10 Hz sends while it is in a cell
@@ -94,7 +95,7 @@ def scores(v: Visits, town: Town, at: tuple[int, ...], vehicles: int) -> list[Sc
     for k, minute in enumerate(at):
         n = excited_vehicles(v, town, minute, vehicles)
         for rule, per_rule in enumerate(out):
-            mean, half = found[k, rule, :, 0], 1.645 * np.sqrt(found[k, rule, :, 1])
+            mean, half = found[k, rule, :, 0], Z_95 * np.sqrt(found[k, rule, :, 1])
             lower, mid, upper = (np.clip(mean + sign * half, mugrid.LOWER, mugrid.UPPER) for sign in (-1.0, 0.0, 1.0))
             per_rule.append(of_intervals(lower, mid, upper, town.mu[minute], n, np.full(CELLS, np.nan)).taken(n >= 1))
     return [joined(per_rule) for per_rule in out]

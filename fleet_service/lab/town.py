@@ -17,8 +17,8 @@ from fleet_service.lab import agent
 from fleet_service.lab.agent import Errors, Told
 from schemas import grid
 from schemas.numeric import BoolArray, FloatArray, IntArray
+from schemas.thresholds import NS
 
-NS: Final = 1_000_000_000
 START: Final = 1_800_000_000 * NS
 ROADS, LENGTH = 10, 12  # cells of a road
 CELLS: Final = ROADS * LENGTH

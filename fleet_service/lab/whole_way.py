@@ -23,10 +23,10 @@ from fleet_service.serve.map_state import LOWER, UPPER, measured
 from schemas import grid, mugrid, wire
 from schemas.errors import InputError
 from schemas.numeric import FloatArray, IntArray
+from schemas.thresholds import EXCITED_SHARE, NS
 
 OBSERVATIONS, TRUTH = "observations.parquet", "truth.parquet"
 SEVERAL: Final = 2  # vehicles of a cell that counts: the bar is the map's, and one vehicle is no map
-EXCITED: Final = 0.6
 SAME: Final = 0.02  # of friction within a cell of one surface
 
 Drive = Callable[[Path], None]  # drives and writes both files into a folder
@@ -113,7 +113,7 @@ def joined(fusion: Fusion, visits: pa.Table) -> tuple[IntArray, FloatArray]:
     """Slots that a vehicle truly visited, and their friction at the last such visit's half minute."""
     cell, sector = visits["cell"].to_numpy(), visits["sector"].to_numpy()
     time = visits["leave_time"].cast(pa.int64()).to_numpy()
-    recent = time > time.max() - 30 * 10**9
+    recent = time > time.max() - 30 * NS
     slot = fusion.slots_of(cell, sector.astype(np.int64))
     total, count = np.zeros((2, fusion.size)), np.zeros((2, fusion.size))
     for row, rows in enumerate((slot >= 0, (slot >= 0) & recent)):
@@ -135,8 +135,8 @@ def one_surface(fusion: Fusion, visits: pa.Table) -> np.ndarray[Any, np.dtype[np
 
 
 def excited(fusion: Fusion, visits: pa.Table) -> IntArray:
-    """Distinct vehicles that used EXCITED of the grip in each slot, (slots,)."""
-    rows = visits["utilisation"].to_numpy() >= EXCITED
+    """Distinct vehicles that used EXCITED_SHARE of the grip in each slot, (slots,)."""
+    rows = visits["utilisation"].to_numpy() >= EXCITED_SHARE
     slot = fusion.slots_of(visits["cell"].to_numpy(), visits["sector"].to_numpy().astype(np.int64))
     _, who = np.unique(visits["vehicle"].to_numpy(zero_copy_only=False), return_inverse=True)
     pairs = np.unique(np.stack([slot, who])[:, rows & (slot >= 0)], axis=1)

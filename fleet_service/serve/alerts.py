@@ -12,6 +12,7 @@ from fleet_service.fusion.belief import SLIPPERY_SHARE, common_kernel
 from fleet_service.fusion.pools import GRIP, ICE, WITNESSES
 from schemas import grid, mugrid
 from schemas.numeric import BoolArray, FloatArray, IntArray
+from schemas.thresholds import NS, SLIPPERY_MU
 from schemas.wire import Alert
 
 RAISE_ABOVE: Final = 0.9  # P(slippery)
@@ -19,7 +20,7 @@ RAISE_ABOVE: Final = 0.9  # P(slippery)
 CLEAR_BELOW: Final = 0.05
 FADE_BELOW: Final = 0.5  # ... but when nobody confirms it, it ends as soon as it is less likely than not
 LEAST_WITNESSES: Final = 2  # distinct vehicles that said so themselves: one liar, or one bad sensor, moves nothing
-WITNESS_NS: Final = 3600 * 10**9  # ... within the hour; older ice belongs to an older road
+WITNESS_NS: Final = 3600 * NS  # ... within the hour; older ice belongs to an older road
 # Of a belief about what the fleet takes the road for: how much of the road it stands for is slippery, and is at all.
 _SLIPPERY_AND_WHOLE: Final = common_kernel().T @ np.stack([SLIPPERY_SHARE, np.ones_like(SLIPPERY_SHARE)], axis=1)
 
@@ -60,7 +61,9 @@ class Alerts:
         for k in np.flatnonzero((slippery > RAISE_ABOVE) & ~standing).tolist():
             slot, when = int(slots[k]), int(time[k])
             if self._spoken(slots[k : k + 1], ICE, GRIP, when)[0]:
-                self._standing[slot] = self._alert(slot, when, True, f"P(mu < 0.4) = {slippery[k]:.2f} > {RAISE_ABOVE}")
+                self._standing[slot] = self._alert(
+                    slot, when, True, f"P(mu < {SLIPPERY_MU}) = {slippery[k]:.2f} > {RAISE_ABOVE}"
+                )
                 out.append(self._standing[slot])
         gripping = np.flatnonzero((slippery < CLEAR_BELOW) & standing).tolist()
         return out + [

@@ -14,10 +14,10 @@ from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.fusion.stores import distinct
 from schemas import grid, mugrid, tables
 from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray
+from schemas.thresholds import GRAVITY
 
 CountArray = NDArray[np.integer[Any]]
 LOWER, UPPER = 0.05, 0.95  # of the interval
-GRAVITY: Final = 9.81  # [m/s²]
 PRIOR_UPPER: Final = float(mugrid.quantiles(mugrid.PRIOR, UPPER))
 PRIOR_WIDTH: Final = PRIOR_UPPER - float(mugrid.quantiles(mugrid.PRIOR, LOWER))
 # A cell is `measured` when a value brought its upper end down by more than numerics and forgetting move it, or halved

@@ -17,10 +17,10 @@ from schemas import grid
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, IntArray
 from schemas.query import Format, MapQuery
+from schemas.thresholds import METRES_PER_DEGREE
 
 ROUTE_STEP_M: Final = 4.0  # less than half a cell at 60° of latitude: no cell on the way is missed
 ROUTE_MOST_M: Final = 500_000.0
-_METRES_PER_DEGREE: Final = 111_195.0  # of a great circle on the mean earth
 
 
 def answer(
@@ -144,7 +144,7 @@ def along(query: MapQuery) -> tuple[IntArray, IntArray]:
     """
     points = np.array(query.route)
     scale = np.cos(np.radians(points[:-1, 1].mean()))
-    steps = np.diff(points, axis=0) * [_METRES_PER_DEGREE * scale, _METRES_PER_DEGREE]
+    steps = np.diff(points, axis=0) * [METRES_PER_DEGREE * scale, METRES_PER_DEGREE]
     lengths = np.hypot(*steps.T)
     if lengths.sum() > ROUTE_MOST_M:
         raise InputError(

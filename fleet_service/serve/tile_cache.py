@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from fleet_service.serve.map_state import MapState, arrow_stream, cells_at, map_batch
 from schemas import grid
 from schemas.numeric import IntArray
+from schemas.thresholds import NS
 
-SHOWN_NS: Final = 1_000_000_000  # as old as a tile that is put once a second may be
+SHOWN_NS: Final = NS  # as old as a tile that is put once a second may be
 KEPT_BYTES: Final = 32 << 20
 FILTERED: Final = ("vehicles", "west", "south", "east", "north")  # columns by which a question chooses cells
 

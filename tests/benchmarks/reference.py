@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge_agent.dynamics.parameters import GRAVITY, P
+from edge_agent.dynamics.parameters import P
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
+from schemas.thresholds import GRAVITY
 
 RATE, DELTA, OMEGA = 2, 3, 7
 

@@ -14,13 +14,14 @@ from typing import Annotated
 import numpy as np
 
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import GRAVITY, P, body, parameter_table
+from edge_agent.dynamics.parameters import P, body, parameter_table
 from edge_agent.estimators import flags
 from edge_agent.estimators.common.readings import GAP_S, INPUTS, LIMITS, POSITION_S, rolling_speed
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.runtime.records import RecordArray, records
 from schemas.signals import S
+from schemas.thresholds import GRAVITY
 from schemas.vehicle import Vehicle
 
 RING = 64  # grip used: so many slots of at least SLOT_S hold the last second

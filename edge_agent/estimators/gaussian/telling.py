@@ -18,11 +18,11 @@ from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
+from schemas.thresholds import Z_95
 
 # what is known of the friction of a road nobody has measured: moments of the uniform prior
 PRIOR_MU = 0.5 * (LOWER + UPPER)
 PRIOR_MU_STD = (UPPER - LOWER) / math.sqrt(12.0)
-QUANTILE_95 = 1.6448536269514722  # of the standard normal
 FIRST_V_STD = 0.3  # [m/s] of the speed from wheels, and of the lateral speed, at the first sample
 UNKNOWN_V_STD = 15.0  # [m/s] without any wheel speed
 SLIDING_THETA = 3.0  # normalised slip beyond the peak of every passenger tyre's curve
@@ -51,7 +51,7 @@ def tell_rest(told: FloatArray, utilised: float, nis: float, adaptation: float, 
 @compiled
 def interval(mu: float, std: float) -> tuple[float, float, float]:
     """(median, 5 %, 95 %) of friction, within its range."""
-    wide = QUANTILE_95 * std
+    wide = Z_95 * std
     return (
         min(max(mu, LOWER), UPPER), min(max(mu - wide, LOWER), UPPER), min(max(mu + wide, LOWER), UPPER),
     )  # fmt: skip

@@ -15,13 +15,14 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_agent.dynamics.parameters import GRAVITY, P
+from edge_agent.dynamics.parameters import P
 from edge_agent.lab.simulation.chance import uniform
 from edge_agent.lab.simulation.friction import F, look_up
 from edge_agent.lab.simulation.plant import W, X, strongest_pull
 from edge_agent.lab.simulation.roads import L
 from schemas.numeric import FloatArray, IntArray
 from schemas.runtime.jit import compiled
+from schemas.thresholds import GRAVITY
 
 Lanes: TypeAlias = tuple[FloatArray, IntArray, IntArray, FloatArray, IntArray]
 """The arrays of a `Network`: points, first, size, spacing, ways."""

@@ -11,9 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
+from schemas.thresholds import GRAVITY
+
 WHEELBASE: Final = 2.7  # [m] every driver knows his own near enough
 SPEED_GAIN: Final = 1.5  # [1/s] how fast a driver takes back an error of speed
-G: Final = 9.81  # [m/s^2]
 LARGEST_STEER: Final = 0.5  # [rad at the road wheel]
 
 
@@ -168,17 +169,19 @@ def low_turn(now: Moment) -> tuple[float, float]:
 
 def firm_acceleration(now: Moment) -> tuple[float, float]:
     """0.6 g after one second, kept straight."""
-    return steer_to(now, now.x + preview(now), 0.0), 0.6 * G if now.t >= 1.0 else hold(now)
+    return steer_to(now, now.x + preview(now), 0.0), 0.6 * GRAVITY if now.t >= 1.0 else hold(now)
 
 
 def brisk_acceleration(now: Moment) -> tuple[float, float]:
     """0.45 g after one second, kept straight."""
-    return steer_to(now, now.x + preview(now), 0.0), 0.45 * G if now.t >= 1.0 else hold(now)
+    return steer_to(now, now.x + preview(now), 0.0), 0.45 * GRAVITY if now.t >= 1.0 else hold(now)
 
 
 def moderate_braking(now: Moment) -> tuple[float, float]:
     """0.28 g after one second, down to walking pace."""
-    return steer_to(now, now.x + preview(now), 0.0), -0.28 * G if now.t >= 1.0 and now.vx > 2.0 else min(hold(now), 1.0)
+    return steer_to(now, now.x + preview(now), 0.0), -0.28 * GRAVITY if now.t >= 1.0 and now.vx > 2.0 else min(
+        hold(now), 1.0
+    )
 
 
 def pulses(now: Moment) -> tuple[float, float]:

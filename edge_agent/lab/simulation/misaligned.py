@@ -22,12 +22,12 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.dynamics.parameters import GRAVITY
 from edge_agent.lab.simulation.chance import key_of, normal, uniform
 from edge_agent.lab.simulation.plant import R
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
+from schemas.thresholds import GRAVITY
 
 WIDE: Final = 0.4  # [rad] of a wheel turned far in, where the steering's map is most wrong
 KMH: Final = 1.0 / 3.6 / 0.33  # [rad/s] that a wheel of .33 m turns faster at one km/h more

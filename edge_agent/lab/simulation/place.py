@@ -8,8 +8,7 @@ from typing import Final
 import numpy as np
 
 from schemas.numeric import FloatArray
-
-EARTH_RADIUS_M: Final = 6_378_137.0  # of the sphere that Web Mercator tiles are cut from
+from schemas.thresholds import EARTH_RADIUS_M
 
 
 @dataclass(frozen=True)

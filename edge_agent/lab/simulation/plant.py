@@ -33,11 +33,12 @@ from typing import Final
 
 from edge_agent.dynamics.body import accelerations
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import GRAVITY, P, body
+from edge_agent.dynamics.parameters import P, body
 from edge_agent.dynamics.slip import SLOWEST_M_S, slips, wheel_position, wheel_velocity
 from edge_agent.dynamics.tyres import TINY, brush, magic_formula
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
+from schemas.thresholds import GRAVITY
 
 LONGEST_SUBSTEP: Final = 1e-3  # [s]; lateral dynamics at 1 m/s have poles near 150/s
 SOFTEST: Final = 0.3  # stiffness never degrades below this share of proportional, however overloaded the wheel

@@ -7,9 +7,10 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.dynamics.parameters import GRAVITY, parameter_row
+from edge_agent.dynamics.parameters import parameter_row
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
+from schemas.thresholds import GRAVITY
 from schemas.vehicle import Vehicle
 
 

@@ -10,8 +10,6 @@ Legend
 
 from __future__ import annotations
 
-from typing import Final
-
 import ibis
 import numpy as np
 import pyarrow as pa
@@ -19,8 +17,7 @@ import pyarrow as pa
 from fleet_service.analytics.engines import Engine, Table, value
 from fleet_service.analytics.options import Options
 from schemas.errors import InputError
-
-_Z: Final = 1.645  # 5 % to each side
+from schemas.thresholds import NS, Z_95
 
 
 def expression(t: Table, at_s: int) -> Table:
@@ -59,13 +56,14 @@ def ask(engine: Engine, options: Options) -> pa.Table:
     """
     if options.at is None:
         raise InputError("at", "no moment of the treatment", "give one, e.g. --at 2026-01-31T07:00:00Z")
-    (row,) = engine.answer(expression(engine.observations(), options.at // 10**9)).to_pylist()
+    (row,) = engine.answer(expression(engine.observations(), options.at // NS)).to_pylist()
     if not row["cells"] or row["vehicles"] < 2:
         raise InputError("at", "no cell was measured in both periods by two vehicles", "give longer periods")
     difference = (row["later"] - row["before"]) / row["w"]
     std = float(np.sqrt(row["squares"] * row["vehicles"] / (row["vehicles"] - 1))) / row["w"]
     return pa.table({
         "period": ["before", "after"], "mu": [row["before"] / row["w"], row["later"] / row["w"]],
-        "difference": [0.0, difference], "lower": [0.0, difference - _Z * std], "upper": [0.0, difference + _Z * std],
+        "difference": [0.0, difference], "lower": [0.0, difference - Z_95 * std],
+        "upper": [0.0, difference + Z_95 * std],
         "cells": [row["cells"]] * 2, "vehicles": [row["vehicles"]] * 2, "values": [row["values"]] * 2,
     })  # fmt: skip

@@ -14,6 +14,7 @@ from fleet_service.fusion import Fusion
 from fleet_service.ingest.weather import archived
 from fleet_service.serve.map_state import cell_table
 from schemas import grid, tables
+from schemas.thresholds import NS
 
 TOLD_ROWS: Final = 1_000_000  # between two lines of progress
 
@@ -30,7 +31,7 @@ def ask(engine: Engine, options: Options) -> pa.Table:
             if rows // TOLD_ROWS > (rows - len(folded.late)) // TOLD_ROWS:
                 options.say(f"{rows:,} observations folded, {fusion.size:,} cells")
         return _frame(engine, fusion, at)
-    step, due, frames = int(options.step_s * 1e9), engine.part.since, []
+    step, due, frames = int(options.step_s * NS), engine.part.since, []
     for folded in replay(engine.root, fusion, Since(until=engine.part.until, box=engine.part.bbox)):
         now = int(fusion.live.time[folded.slots].max(initial=0))
         while due + step <= now:

@@ -1,6 +1,6 @@
 """`spells`: when cells became slippery, for how long, and how long an alert of two vehicles took.
 
-A spell is a run of values below SLIPPERY in one cell and sector, in order of time; it ends with the first value of
+A spell is a run of values below SLIPPERY_MU in one cell and sector, in order of time; it ends with the first value of
 grip. `least_vehicles` or more told it. The alert is the first value of a second vehicle, as the service raises it.
 """
 
@@ -9,8 +9,9 @@ from __future__ import annotations
 import ibis
 import pyarrow as pa
 
-from fleet_service.analytics.engines import SLIPPERY, Engine, Table, value
+from fleet_service.analytics.engines import Engine, Table, value
 from fleet_service.analytics.options import Options
+from schemas.thresholds import SLIPPERY_MU
 
 
 def expression(t: Table, least_vehicles: int) -> Table:
@@ -18,7 +19,7 @@ def expression(t: Table, least_vehicles: int) -> Table:
     t = t.filter(value(t)).select("cell", "sector", "time", "vehicle", "boot", "seq", "row", "mu")
     place = ["cell", "sector"]
     order = ["time", "vehicle", "boot", "seq", "row"]
-    t = t.mutate(slippery=(t.mu < SLIPPERY).cast("int64"))
+    t = t.mutate(slippery=(t.mu < SLIPPERY_MU).cast("int64"))
     w = ibis.window(group_by=place, order_by=order)
     before = t.slippery.lag().over(w)
     t = t.mutate(new=(before.isnull() | (before != t.slippery)).cast("int64"), following=t.time.lead().over(w))

@@ -12,9 +12,10 @@ import pyarrow.compute as pc
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 
-from fleet_service.analytics.engines import SLIPPERY, Engine, Table, value
+from fleet_service.analytics.engines import Engine, Table, value
 from fleet_service.analytics.options import Options
 from schemas.errors import InputError
+from schemas.thresholds import SLIPPERY_MU
 
 NEEDED: Final = ("station", "time", "latitude", "longitude", "temperature")
 BAND: Final = 2.0  # [°C] of one row
@@ -54,7 +55,7 @@ def expression(t: Table, stations: Table, readings: Table) -> Table:
         mu_mean=t.y.mean(),
         mu_p10=t.y.quantile(0.1),
         mu_p50=t.y.quantile(0.5),
-        share_slippery=(t.y < SLIPPERY).cast("float64").mean(),
+        share_slippery=(t.y < SLIPPERY_MU).cast("float64").mean(),
     )
 
 

@@ -10,14 +10,13 @@ import pyarrow as pa
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from fleet_service.analytics.engines import SLIPPERY, Engine, Table, value
+from fleet_service.analytics.engines import Engine, Table, value
 from fleet_service.analytics.options import Options
 from schemas import grid
 from schemas.numeric import FloatArray, IntArray
+from schemas.thresholds import METRES_PER_DEGREE, SLIPPERY_MU, Z_95
 
 SHARE: Final = 0.1  # of the values of a cell that were slippery: a stretch that froze one night in ten
-_Z: Final = 1.645  # of the one-sided 95 % bound
-_METRES_PER_DEGREE: Final = 111_195.0
 
 
 def expression(t: Table, least_vehicles: int) -> Table:
@@ -26,9 +25,9 @@ def expression(t: Table, least_vehicles: int) -> Table:
     cells = t.group_by(["cell", "sector"]).aggregate(
         observations=t.count(),
         values=told.sum(),
-        slippery=(told & (t.mu < SLIPPERY)).sum(),
-        mu_sum=ibis.ifelse(told & (t.mu < SLIPPERY), t.mu.cast("float64"), 0.0).sum(),
-        witnesses=ibis.ifelse(told & (t.mu < SLIPPERY), t.vehicle, ibis.null("string")).nunique(),
+        slippery=(told & (t.mu < SLIPPERY_MU)).sum(),
+        mu_sum=ibis.ifelse(told & (t.mu < SLIPPERY_MU), t.mu.cast("float64"), 0.0).sum(),
+        witnesses=ibis.ifelse(told & (t.mu < SLIPPERY_MU), t.vehicle, ibis.null("string")).nunique(),
     )
     return cells.filter(
         cells.slippery >= SHARE * cells["values"], cells.slippery > 0, cells.witnesses >= least_vehicles
@@ -51,8 +50,8 @@ def stretches(cells: pa.Table) -> pa.Table:
         return np.asarray(np.bincount(label, values, minlength=count), np.float64)
 
     west, south, east, north = _boxes(column["cell"], label, count)
-    metres = np.cos(np.radians((south + north) / 2)) * _METRES_PER_DEGREE
-    length = np.hypot((east - west) * metres, (north - south) * _METRES_PER_DEGREE)
+    metres = np.cos(np.radians((south + north) / 2)) * METRES_PER_DEGREE
+    length = np.hypot((east - west) * metres, (north - south) * METRES_PER_DEGREE)
     values, slippery = total(column["values"]), total(column["slippery"])
     lower = wilson(slippery, values)
     first = np.full(count, np.iinfo(np.int64).max)
@@ -73,8 +72,8 @@ def wilson(hits: FloatArray, of: FloatArray) -> FloatArray:
     """Lower 95 % bound of a share (Wilson 1927), (n,)."""
     n = np.maximum(of, 1.0)
     p = hits / n
-    spread = _Z * np.sqrt(p * (1 - p) / n + _Z**2 / (4 * n * n))
-    return np.asarray((p + _Z**2 / (2 * n) - spread) / (1 + _Z**2 / n))
+    spread = Z_95 * np.sqrt(p * (1 - p) / n + Z_95**2 / (4 * n * n))
+    return np.asarray((p + Z_95**2 / (2 * n) - spread) / (1 + Z_95**2 / n))
 
 
 def _touching(cell: IntArray, sector: IntArray) -> IntArray:

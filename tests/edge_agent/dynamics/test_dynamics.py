@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from edge_agent.dynamics import body, loads, parameters, slip, tyres, wheel
-from edge_agent.dynamics.parameters import GRAVITY, P, parameter_row
+from edge_agent.dynamics.parameters import P, parameter_row
+from schemas.thresholds import GRAVITY
 from schemas.vehicle import Vehicle
 
 CAR = Vehicle(

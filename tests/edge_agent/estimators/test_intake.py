@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from edge_agent.dynamics.parameters import GRAVITY
 from edge_agent.estimators.gaussian.intake import BEGUN, EXCITED_S, SLOT_S, STEPPED, new_filters, take
 from edge_agent.estimators.paper_aco_fckf import Memory
 from edge_agent.lab.simulation.presets import PRESETS
 from schemas.signals import CHANNELS, S
+from schemas.thresholds import GRAVITY
 
 CAR = PRESETS["sedan"].vehicle
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from edge_agent.observe.observation_builder import Records
-from edge_agent.observe.trip_privacy import NS, TripEnds
+from edge_agent.observe.trip_privacy import TripEnds
 from schemas.numeric import IntArray
+from schemas.thresholds import NS
 from schemas.wire import Kind
 
 SPEED = 10.0

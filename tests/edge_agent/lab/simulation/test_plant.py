@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from edge_agent.dynamics.parameters import GRAVITY, P
+from edge_agent.dynamics.parameters import P
 from edge_agent.lab.simulation import PRESETS, simulate_manoeuvre
 from edge_agent.lab.simulation.plant import (
     STATES,
@@ -24,6 +24,7 @@ from edge_agent.lab.simulation.plant import (
 )
 from edge_agent.lab.simulation.presets import TrueVehicle
 from schemas.numeric import FloatArray
+from schemas.thresholds import GRAVITY
 
 ROUNDING = 1e-9
 

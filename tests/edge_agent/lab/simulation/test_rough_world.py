@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from edge_agent.dynamics.parameters import GRAVITY, P
+from edge_agent.dynamics.parameters import P
 from edge_agent.lab.simulation import (
     PRESETS,
     ROADS,
@@ -27,6 +27,7 @@ from edge_agent.lab.simulation.sensors import ROUGH_FLEET, Sensors
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S, per_wheel
+from schemas.thresholds import GRAVITY
 
 SLOPES = (-0.08, -0.03, 0.02, 0.05, 0.08)
 

@@ -1,0 +1,25 @@
+"""Numbers that more than one room must agree on; each stands here and nowhere else.
+
+EXCITED_SHARE       share of μ that must be used for a reading of μ to be more than a lower bound (contract)
+UTILISED_WINDOW_S   `mu_utilised` is the largest grip used within this time [s] (contract)
+SLIPPERY_MU         slippery is μ below this: packed snow has .2–.35, wet asphalt .5–.8 (Pacejka 2012, ch. 1)
+Z_95                95 % quantile of the standard normal: half a 90 % interval in standard deviations
+GRAVITY             [m/s²], rounded; standard gravity is 9.80665 (ISO 80000-3)
+EARTH_RADIUS_M      [m] of the sphere that Web Mercator tiles are cut from: WGS 84, semi-major axis
+METRES_PER_DEGREE   [m/°] of latitude on that sphere, π/180 · EARTH_RADIUS_M, rounded
+NS                  nanoseconds of a second
+"""
+
+from __future__ import annotations
+
+from statistics import NormalDist
+from typing import Final
+
+EXCITED_SHARE: Final = 0.6
+UTILISED_WINDOW_S: Final = 1.0
+SLIPPERY_MU: Final = 0.4
+Z_95: Final = NormalDist().inv_cdf(0.95)
+GRAVITY: Final = 9.81
+EARTH_RADIUS_M: Final = 6_378_137.0
+METRES_PER_DEGREE: Final = 111_320.0
+NS: Final = 1_000_000_000
