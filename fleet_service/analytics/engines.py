@@ -113,11 +113,15 @@ class Engine:
         texts = [str(path) for path in paths]
         if self._spark is None:
             quoted = ", ".join("'" + text.replace("'", "''") + "'" for text in texts)
-            files = f"read_parquet([{quoted}], hive_partitioning = true)"
+            files = f"read_parquet([{quoted}], hive_partitioning = true, union_by_name = true)"
             whole = f"epoch_us({moment}) // 1000000 AS {seconds}"
             self.connection.raw_sql(f"CREATE OR REPLACE VIEW {name} AS SELECT {columns}, {whole} FROM {files}")
         else:
-            found = self._spark.read.option("basePath", str(self.root / NAMES[name])).parquet(*texts)
+            found = (
+                self._spark.read.option("basePath", str(self.root / NAMES[name]))
+                .option("mergeSchema", "true")
+                .parquet(*texts)
+            )
             found.selectExpr(*columns.split(", "), f"unix_seconds({moment}) AS {seconds}").createOrReplaceTempView(name)
         return self.connection.table(name)
 

@@ -20,8 +20,9 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_service.app.precompile import warm_up
-from fleet_service.archive import checkpoints, reading
+from fleet_service.archive import checkpoints
 from fleet_service.archive.files import lock
+from fleet_service.archive.load import count_set_aside, set_aside
 from fleet_service.archive.log import Log
 from fleet_service.archive.pseudonyms import Pseudonyms
 from fleet_service.archive.rebuild import Since, observations, replay, restore_streams
@@ -68,6 +69,14 @@ class Engine:
     def __init__(self, config: ServiceConfig, root: Path) -> None:
         self._config, self._root = config, root
         self._lock_file = lock(root)
+        try:
+            self._open(config, root)
+        except BaseException:
+            self._lock_file.close()
+            raise
+
+    def _open(self, config: ServiceConfig, root: Path) -> None:
+        """Begin with what the archive holds."""
         self.counts: Counter[str] = Counter()
         self.report_lag_s = 0.0  # between the end of the newest visit and its arrival
         self.failing = False  # the last segment could not be written
@@ -85,15 +94,15 @@ class Engine:
         self._heard = since or 0  # when the last report of any kind came [ns]
         self._checkpoint_wanted = threading.Event()
         self._checkpoints: queue.SimpleQueue[tuple[dict[str, pa.Table], int]] = queue.SimpleQueue()
-        used = archived(root)  # before the observations, which it acts on
-        self.fusion.weather(used if since is None else archived(root, received_after=since))
+        used = archived(root, damaged=set_aside)  # before the observations, which it acts on
+        self.fusion.weather(used if since is None else archived(root, received_after=since, damaged=set_aside))
         restored = np.array_split(np.arange(self.fusion.size), self.fusion.size // SNAPSHOT_SLOTS + 1)
-        rest = replay(root, self.fusion, Since(received=since))  # first of all: it sets damaged files aside
+        rest = replay(root, self.fusion, Since(received=since), set_aside)
         for slots in chain(restored, (folded.slots for folded in rest)):
             self._alerts.folded(slots)
             self.map.changed(slots)
-        self.seen = restore_streams(root, streams)
-        self.counts["files_set_aside"] = reading.set_aside(root)
+        self.seen = restore_streams(root, streams, set_aside)
+        self.counts["files_set_aside"] = count_set_aside(root)
         if config.weather is not None:
             self._use(self.weather.begin(config.weather, used, time.time_ns()))
         warm_up()

@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from fleet_service.app.engine import Engine
-from fleet_service.archive import checkpoints, reading, segments, snapshots
+from fleet_service.archive import checkpoints, segments, snapshots
+from fleet_service.archive.load import count_set_aside
 from fleet_service.archive.retention import retire
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
@@ -66,7 +67,7 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path) -> list[Job]
         return f"retired: {done.days} days" if done.days else None
 
     def inventory(_: threading.Event) -> str | None:
-        engine.counts["files_set_aside"] = reading.set_aside(root)
+        engine.counts["files_set_aside"] = count_set_aside(root)
         return None
 
     return [

@@ -16,6 +16,7 @@ from typing import Final
 import pyarrow as pa
 
 from fleet_service.archive.files import sync_directory
+from fleet_service.archive.version import KEY, VERSION
 
 FOLDER: Final = "checkpoints"
 KEPT: Final = 2  # the newest, and the one before, should the newest be damaged
@@ -34,8 +35,9 @@ def save(root: Path, tables: dict[str, pa.Table], received: int) -> Path:
     draft.mkdir(parents=True)
     for name, table in tables.items():
         with (draft / f"{name}.arrow").open("wb") as file:
-            with pa.ipc.new_file(file, table.schema) as writer:
-                writer.write_table(table)
+            said = {**(table.schema.metadata or {}), KEY.encode(): str(VERSION).encode()}
+            with pa.ipc.new_file(file, table.schema.with_metadata(said)) as writer:
+                writer.write_table(table.replace_schema_metadata(said))
             file.flush()
             os.fsync(file.fileno())
     sync_directory(draft)

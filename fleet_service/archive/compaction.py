@@ -13,7 +13,7 @@ if a file of its partition names the segment, so that `reading` sees it once, an
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -23,6 +23,8 @@ import pyarrow as pa
 
 from fleet_service.archive import layout, reading, readme, segments
 from fleet_service.archive.files import COMPACTED, exclusive, sync_directory, sync_tree, write_synced
+from fleet_service.archive.load import conformed, content, set_aside
+from fleet_service.archive.version import KEY, VERSION
 from schemas.errors import InputError
 from schemas.wire import Kind
 
@@ -94,27 +96,38 @@ def _round(rest: _Rest, most: int) -> Compacted:
     """Move the next segments: so many rows, or one segment at least."""
     sources: list[Path] = []
     tables: list[pa.Table] = []
+    newest = VERSION
     while sum(table.num_rows for table in tables) < most and (path := next(rest.segments, None)) is not None:
-        table = reading.load(path)
-        if table is not None:
+        found = content(path, set_aside)
+        if found is not None:
             sources.append(path)
-            tables.append(reading.without(table, rest.kind, rest.done.get(path.name, set())))
+            newest = max(newest, found.version)
+            tables.append(reading.without(found.table, rest.kind, rest.done.get(path.name, set())))
     if not sources:
         return Compacted(0, 0, 0)
-    table = pa.concat_tables(tables)
-    files = _place(rest.root, rest.kind, sources, table)
+    table = together(tables, segments.SCHEMAS[rest.kind])
+    named = json.dumps(runs(path.name for path in sources))
+    footer = {KEY: str(newest), reading.SOURCES.decode(): named}
+    files = _place(rest.root, rest.kind, sources[-1].name, table, footer)
     for path in sources:
         path.unlink()
     sync_directory(segments.folder(rest.root, rest.kind))
     return Compacted(table.num_rows, len(sources), files)
 
 
-def _place(root: Path, kind: Kind, sources: list[Path], table: pa.Table) -> int:
+def together(tables: list[pa.Table], known: pa.Schema) -> pa.Table:
+    """Rows of segments of several versions: the columns that are known, null where a segment has none, and behind them
+    those that only a newer version knows, so that nothing is lost on the way back to it."""
+    others = [pa.schema([f for f in table.schema if f.name not in known.names]) for table in tables]
+    schema = pa.schema([*known, *pa.unify_schemas(others, promote_options="permissive")])
+    return pa.concat_tables([conformed(table, schema) for table in tables])
+
+
+def _place(root: Path, kind: Kind, name: str, table: pa.Table, footer: Mapping[str, str]) -> int:
     """Write the files of a round and rename them into place; returns how many."""
     drafts: list[tuple[Path, Path]] = []
-    footer = {reading.SOURCES.decode(): json.dumps(runs(path.name for path in sources))}
     for partition, part in partitioned(table, kind):
-        path = partition.folder(root, layout.TABLES[kind]) / sources[-1].name
+        path = partition.folder(root, layout.TABLES[kind]) / name
         draft = root / "drafts" / f"{len(drafts)}.parquet"
         write_synced(part, draft, COMPACTED, footer)
         drafts.append((draft, path))

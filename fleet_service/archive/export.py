@@ -11,10 +11,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.csv as pacsv
-import pyarrow.parquet as pq
 
 from fleet_service.archive import geo, layout, reading, rollup, snapshots
 from fleet_service.archive.files import MAP, write_table
+from fleet_service.archive.load import load
 from schemas import grid, tables
 from schemas.errors import InputError
 from schemas.wire import Kind
@@ -48,7 +48,9 @@ def map_then(root: Path, part: Part) -> pa.Table:
     path = snapshots.newest(root, part.until)
     if path is None:
         raise InputError("to", "there is no snapshot of the map so early", "give a later time")
-    table = pq.read_table(path, columns=tables.MAP_ARCHIVE.names, partitioning=None)
+    table = load(path, tables.MAP_ARCHIVE)
+    if table is None:
+        raise InputError("to", f"the snapshot {path} is damaged", "give an earlier time")
     return geo.with_cells(_inside(table, part.bbox))
 
 
@@ -58,7 +60,8 @@ def cell_hours(root: Path, part: Part) -> pa.Table:
     where = (hour >= _time(part.since)) & (hour < _time(part.until))
     days = layout.days(root, rollup.TABLE, part.since // layout.DAY_NS, part.until // layout.DAY_NS)
     paths = sorted(path for folder in days for path in folder.glob("*/*.parquet"))
-    found = [pq.read_table(path, filters=where, partitioning=None) for path in paths]
+    loaded = (load(path, tables.CELL_HOUR_SCHEMA, where=where) for path in paths)
+    found = [table for table in loaded if table is not None]
     table = pa.concat_tables([*found, tables.CELL_HOUR_SCHEMA.empty_table()])
     return geo.with_cells(_inside(table, part.bbox).sort_by([("cell", "ascending"), ("hour", "ascending")]))
 

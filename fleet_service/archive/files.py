@@ -12,6 +12,7 @@ from typing import Any, BinaryIO, Final
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from fleet_service.archive import version
 from schemas import tables
 from schemas.errors import InputError
 
@@ -62,7 +63,7 @@ def sync_directory(folder: Path) -> None:
 
 
 def write_synced(table: pa.Table, path: Path, encoding: Encoding, footer: Mapping[str, str] | None = None) -> None:
-    """Write a Parquet file and sync it; `footer` are key-value pairs for its end.
+    """Write a Parquet file and sync it; `footer` are key-value pairs for its end, beside version and digest.
 
     Raises:
         OSError: the disk is full or read-only; nothing is left under `path`.
@@ -78,7 +79,7 @@ def write_synced(table: pa.Table, path: Path, encoding: Encoding, footer: Mappin
         with path.open("wb") as file:
             with pq.ParquetWriter(file, table.schema, **options) as writer:
                 writer.write_table(table, ROW_GROUP)
-                writer.add_key_value_metadata(dict(footer or {}))
+                writer.add_key_value_metadata(version.footer(table.schema, footer))
             file.flush()
             os.fsync(file.fileno())
     except OSError:

@@ -8,10 +8,9 @@ is not read, for its rows were read from the inbox. So it is the order of these 
 from __future__ import annotations
 
 import json
-import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pyarrow as pa
@@ -20,14 +19,13 @@ import pyarrow.parquet as pq
 
 from fleet_service.archive import layout, segments
 from fleet_service.archive.layout import Partition
+from fleet_service.archive.load import Damaged, load, pass_over
+from fleet_service.archive.version import DamagedError, entries_of, judge
 from schemas.numeric import BoolArray
 from schemas.wire import Kind
 
-log = logging.getLogger(__name__)
 # Key in the footer: the segments that the rows come from, as JSON [[SHARD-EPOCH, first number, last number], …].
 SOURCES: Final = b"gripmap.sources"
-BAD: Final = ".bad"
-_TYPES: Final = {f.name: f.type for schema in segments.SCHEMAS.values() for f in schema}
 _TURNS: Final = 100  # a reader that is overtaken by so many compactions has another trouble
 
 
@@ -37,9 +35,9 @@ def read(
     columns: Sequence[str] | None = None,
     where: pc.Expression | None = None,
     days: tuple[int | None, int | None] = (None, None),
-    newer_than: str | None = None,
+    damaged: Damaged = pass_over,
 ) -> Iterator[pa.Table]:
-    """Tables that together hold every row once; damaged files are set aside with the ending `.bad`.
+    """Tables that together hold every row once, of files that are not damaged.
 
     Args:
         root: of the archive.
@@ -47,26 +45,24 @@ def read(
         columns: all, if None.
         where: rows wanted; row groups that cannot hold any are skipped.
         days: first and last day of measurement wanted; may yield more.
-        newer_than: only files with rows of segments newer than this name (and whatever else they hold).
+        damaged: is told of a damaged file.
 
     Raises:
+        InputError: a file is of a newer major version.
         OSError: the system cannot read.
     """
-    wanted = list(columns) if columns is not None else segments.SCHEMAS[kind].names
+    schema = segments.SCHEMAS[kind]
+    wanted = list(columns) if columns is not None else schema.names
     needed = list(dict.fromkeys([*wanted, layout.TIME[kind], "cell"]))
-
-    def new(path: Path) -> bool:
-        return newer_than is None or layout.age(path.name) > layout.age(newer_than)
-
-    fresh = _inbox(root, kind, new, needed, where)
-    files = [path for path in layout.compacted(root, kind, *days) if new(path)]
+    fresh = _inbox(root, kind, needed, where, damaged)
+    files = list(layout.compacted(root, kind, *days))
     done = compacted(files, {path.name for path, _ in fresh})
     for path, table in fresh:
         yield without(table, kind, done.get(path.name, set())).select(wanted)
     fresh.clear()
     for path in files:
         try:
-            part = load(path, wanted, where)
+            part = load(path, schema, wanted, where, damaged=damaged)
         except FileNotFoundError:  # its day was retired meanwhile
             continue
         if part is not None and part.num_rows:
@@ -74,12 +70,13 @@ def read(
 
 
 def _inbox(
-    root: Path, kind: Kind, new: Callable[[Path], bool], columns: list[str], where: pc.Expression | None
+    root: Path, kind: Kind, columns: list[str], where: pc.Expression | None, damaged: Damaged
 ) -> list[tuple[Path, pa.Table]]:
     for _ in range(_TURNS):
         try:
-            paths = [path for path in segments.paths(root, kind) if new(path)]
-            loaded = [(path, load(path, columns, where, whole=True)) for path in paths]
+            paths = segments.paths(root, kind)
+            schema = segments.SCHEMAS[kind]
+            loaded = [(path, load(path, schema, columns, where, whole=True, damaged=damaged)) for path in paths]
         except FileNotFoundError:  # compacted meanwhile
             continue
         return [(path, table) for path, table in loaded if table is not None]
@@ -114,55 +111,15 @@ def without(table: pa.Table, kind: Kind, done: set[Partition]) -> pa.Table:
 
 
 def sources_of(path: Path) -> set[str]:
-    """Segments whose rows of its partition a compacted file holds; none if it is gone or damaged."""
-    try:
-        metadata = pq.read_metadata(path).metadata or {}
-    except (FileNotFoundError, pa.ArrowInvalid):
-        return set()
-    runs = json.loads(metadata.get(SOURCES, b"[]"))
-    return {layout.segment_name(prefix, number) for prefix, first, last in runs for number in range(first, last + 1)}
-
-
-def load(
-    path: Path, columns: list[str] | None = None, where: pc.Expression | None = None, *, whole: bool = False
-) -> pa.Table | None:
-    """Rows of one file; None if any byte of them is not what was written: it is set aside then, and said so.
-
-    Only the columns wanted are looked at, unless it is read `whole`.
+    """Segments whose rows of its partition a compacted file holds; none if it is gone or damaged.
 
     Raises:
-        FileNotFoundError: it is gone.
-        OSError: the system cannot read.
+        InputError: it is of a newer major version.
     """
-    read = None if whole else columns
     try:
-        if where is not None and pq.read_metadata(path).num_row_groups > 1:
-            options: dict[str, Any] = {"filters": where, "partitioning": None}
-            table = _sound(pq.read_table(path, columns=read, page_checksum_verification=True, **options), columns)
-        else:
-            with pq.ParquetFile(path, page_checksum_verification=True) as file:  # for small files half of read_table
-                table = _sound(file.read(read), columns)
-            table = table if where is None else table.filter(where)
-        return table.select(columns) if whole and columns is not None else table
-    except MemoryError:
-        raise
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        if isinstance(error, OSError) and error.errno is not None:
-            raise  # the system's trouble, not the file's
-        log.warning("%s is damaged and set aside: %s", path, str(error).splitlines()[0][:200])
-        path.rename(path.with_name(path.name + BAD))
-        return None
-
-
-def set_aside(root: Path) -> int:
-    """How many damaged files lie in an archive; walks through all of it."""
-    return sum(1 for _ in root.rglob(f"*{BAD}"))
-
-
-def _sound(table: pa.Table, columns: list[str] | None) -> pa.Table:
-    """The table, if it has the columns wanted in their types, and strings that are some; checksums covered the rest."""
-    found = {f.name: f.type for f in table.schema}
-    if any(_TYPES.get(name) != kind for name, kind in found.items()) or not set(columns or ()) <= found.keys():
-        raise pa.ArrowInvalid("columns are not those of the archive")
-    table.validate(full=True)
-    return table
+        footer = pq.read_metadata(path)
+        judge(path, footer.schema.to_arrow_schema(), entries_of(footer.metadata))
+        runs = json.loads((footer.metadata or {}).get(SOURCES, b"[]"))
+    except (FileNotFoundError, pa.ArrowInvalid, DamagedError):
+        return set()
+    return {layout.segment_name(prefix, number) for prefix, first, last in runs for number in range(first, last + 1)}

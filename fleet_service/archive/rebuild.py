@@ -14,6 +14,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from fleet_service.archive import layout, reading, segments
+from fleet_service.archive.load import Damaged, pass_over
 from fleet_service.archive.pseudonyms import number
 from fleet_service.fusion import Folded, Fusion, Observations, evidence
 from fleet_service.fusion.constants import EPOCH_NS
@@ -34,11 +35,12 @@ MARGIN_DEG: Final = 0.002  # around a box: over 100 m, more than a visit's posit
 ROWS_PER_SEQ: Final = 64  # more than a batch has rows: seq and row become one number that keeps their order
 
 
-def restore_streams(root: Path, streams: Streams) -> int:
+def restore_streams(root: Path, streams: Streams, damaged: Damaged = pass_over) -> int:
     """Note every archived batch as admitted; returns the latest time at which one was received [ns], or 0."""
     seen = 0
     for kind, first in _FIRST_TIME.items():
-        tables = list(reading.read(root, kind, (*IDENTITY, "first_held", first, "received_at")))
+        columns = (*IDENTITY, "first_held", first, "received_at")
+        tables = list(reading.read(root, kind, columns, damaged=damaged))
         table = pa.concat_tables(tables) if tables else segments.SCHEMAS[kind].empty_table()
         seen = max(seen, int(segments.nanoseconds(table["received_at"]).max(initial=0)))
         vehicle = _numbers(table["vehicle"].to_numpy().astype(str))
@@ -97,16 +99,22 @@ def _time(ns: int) -> pa.Scalar[Any]:
     return pa.scalar(ns // US_STEP, pa.int64()).cast(US)
 
 
-def replay(root: Path, fusion: Fusion, since: Since = Since()) -> Iterator[Folded]:  # noqa: B008 immutable
+def replay(
+    root: Path,
+    fusion: Fusion,
+    since: Since = Since(),  # noqa: B008 immutable
+    damaged: Damaged = pass_over,
+) -> Iterator[Folded]:
     """Fold the archive into `fusion` in order of time, with the weights that were used; yields once per epoch.
 
     Args:
         root: of the archive.
         fusion: a new one, or one that holds everything that was received before.
         since: the rows wanted.
+        damaged: is told of a damaged file.
     """
     days = (None, None if since.until is None else since.until // layout.DAY_NS + 1)
-    tables = list(reading.read(root, Kind.OBSERVATION, COLUMNS, since.where(), days))
+    tables = list(reading.read(root, Kind.OBSERVATION, COLUMNS, since.where(), days, damaged))
     if not tables:
         return
     table = pa.concat_tables(tables)

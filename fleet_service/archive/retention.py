@@ -11,13 +11,14 @@ from typing import Final, NamedTuple
 
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from fleet_service.archive import checkpoints, layout, rollup
 from fleet_service.archive.compaction import compact, compacting
 from fleet_service.archive.files import COMPACTED, lock, put_in_place, sync_directory
 from fleet_service.archive.layout import TABLES
+from fleet_service.archive.load import content
 from fleet_service.archive.pseudonyms import Pseudonyms
+from fleet_service.archive.version import KEY
 from schemas.errors import InputError
 from schemas.wire import Kind
 
@@ -94,16 +95,19 @@ def forget_vehicle(root: Path, vehicle: str, month: str) -> int:
 
 
 def _without(root: Path, kind: Kind, path: Path, pseudonym: str) -> int:
-    if pseudonym not in pc.unique(pq.read_table(path, columns=["vehicle"], partitioning=None)["vehicle"]).to_pylist():
+    found = content(path, _unread)
+    if found is None or pseudonym not in pc.unique(found.table["vehicle"]).to_pylist():
         return 0
-    with pq.ParquetFile(path) as file:
-        whole, footer = file.read(), file.metadata.metadata or {}
-    table = whole.filter(pc.not_equal(whole["vehicle"], pa.scalar(pseudonym)))
-    kept = {key.decode(): value.decode() for key, value in footer.items() if key.startswith(b"gripmap.")}
-    put_in_place(root, table, path, COMPACTED, kept)
+    table = found.table.filter(pc.not_equal(found.table["vehicle"], pa.scalar(pseudonym)))
+    put_in_place(root, table, path, COMPACTED, {KEY: str(found.version), **found.entries})
     if kind is Kind.OBSERVATION:
         rollup.make(root, path)
-    return whole.num_rows - table.num_rows
+    return found.table.num_rows - table.num_rows
+
+
+def _unread(path: Path, problem: str) -> None:
+    """A damaged file may hold what is to be forgotten: neither passed over nor kept under another name."""
+    raise InputError("archive", f"{path} is damaged ({problem})", "remove it or bring it back, then forget again")
 
 
 def _key(root: Path, month: str) -> Path:

@@ -20,8 +20,9 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.archive import layout, reading, segments
+from fleet_service.archive import layout, segments
 from fleet_service.archive.files import ROLLUP, put_in_place
+from fleet_service.archive.load import load, set_aside
 from schemas import mugrid, tables
 from schemas.numeric import IntArray
 from schemas.wire import Kind
@@ -58,7 +59,7 @@ def make(root: Path, path: Path) -> None:
     Raises:
         OSError: it cannot be read or written.
     """
-    table = reading.load(path, _COLUMNS)
+    table = load(path, tables.OBSERVATION_ARCHIVE, _COLUMNS, damaged=set_aside)
     if table is not None:
         put_in_place(root, rolled_up(table), part_of(path), ROLLUP)
 

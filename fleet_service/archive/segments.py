@@ -21,6 +21,7 @@ from fleet_service.archive.files import SEGMENT, sync_directory, write_synced
 from schemas import mugrid, tables
 from schemas.numeric import IntArray
 from schemas.wire import Kind
+from schemas.wire.batches import ABSENT
 
 SCHEMAS: Final = {Kind.OBSERVATION: tables.OBSERVATION_ARCHIVE, Kind.STATE: tables.STATE_ARCHIVE}
 _FOLDERS: Final = {Kind.OBSERVATION: "inbox", Kind.STATE: "inbox/states"}
@@ -121,7 +122,7 @@ def _column(f: pa.Field[Any], rows: Rows) -> pa.Array[Any]:
 
 
 def rows_of(table: pa.Table) -> Rows:
-    """Columns of a table as `Writer.write` takes them; times are int64."""
+    """Columns of a table as `Writer.write` takes them; times are int64, and null reads as what no sender sent."""
     rows: Rows = {}
     for f in table.schema:
         column = table.column(f.name).combine_chunks()
@@ -131,8 +132,18 @@ def rows_of(table: pa.Table) -> Rows:
         elif f.type == tables.US:
             rows[f.name] = nanoseconds(column)
         else:
-            rows[f.name] = column.to_numpy(zero_copy_only=False)
+            rows[f.name] = _said(f, column).to_numpy(zero_copy_only=False)
     return rows
+
+
+def _said(f: pa.Field[Any], column: pa.Array[Any]) -> pa.Array[Any]:
+    """A column without null: what an older version did not write reads as what no sender sent; NaN in floats."""
+    if not column.null_count or pa.types.is_floating(f.type):
+        return column
+    filled: pa.Array[Any] = column.fill_null(
+        pa.scalar("" if pa.types.is_string(f.type) else ABSENT.get(f.name, 0)).cast(f.type)
+    )
+    return filled
 
 
 def _likelihoods(column: pa.Array[Any]) -> NDArray[np.uint8]:

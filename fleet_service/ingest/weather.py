@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fleet_service.archive.files import write_table
+from fleet_service.archive.load import Damaged, load, pass_over
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.weather import VALID_NS, Reports
 from schemas import grid, keys, mugrid, tables, weather
@@ -124,19 +125,23 @@ def _reports(table: pa.Table) -> Reports:
     return Reports(table["region"].to_numpy(), acts, air, road, water, np.array(prior).reshape(-1, mugrid.BINS))
 
 
-def archived(root: Path, received_until: int | None = None, received_after: int | None = None) -> Reports:
+def archived(
+    root: Path,
+    received_until: int | None = None,
+    received_after: int | None = None,
+    damaged: Damaged = pass_over,
+) -> Reports:
     """Every report that a map used, in the order in which they came, as far as received in that time [ns].
 
+    `damaged` is told of a damaged file: the roads of its reports age by the clock.
+
     Raises:
+        InputError: a file is of a newer major version.
         OSError: the archive cannot be read.
     """
-    parts = []
-    for path in sorted((root / FOLDER).glob("*.parquet"), key=lambda p: p.stem[-20:]):
-        try:
-            parts.append(pq.read_table(path))
-        except pa.ArrowInvalid:  # damaged on disk: its roads age by the clock
-            path.rename(path.with_name(path.name + ".bad"))
-    table = pa.concat_tables([tables.WEATHER_ARCHIVE.empty_table(), *parts])
+    paths = sorted((root / FOLDER).glob("*.parquet"), key=lambda p: p.stem[-20:])
+    parts = [load(path, tables.WEATHER_ARCHIVE, whole=True, damaged=damaged) for path in paths]
+    table = pa.concat_tables([tables.WEATHER_ARCHIVE.empty_table(), *(part for part in parts if part is not None)])
     received = table["received_at"].cast(tables.NS).cast(pa.int64()).to_numpy()
     if received_until is not None:
         table = table.filter(pa.array(received <= received_until))

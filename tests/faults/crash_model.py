@@ -21,7 +21,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.archive import layout, reading, segments
+from fleet_service.archive import layout, load, reading, segments
 from fleet_service.archive.compaction import compact
 from fleet_service.archive.log import Log
 from fleet_service.archive.rebuild import restore_streams
@@ -184,4 +184,4 @@ def run(site: Site) -> list[Figure]:
 
 
 def _quiet() -> None:
-    logging.getLogger(reading.__name__).setLevel(logging.ERROR)  # torn files are set aside all the time
+    logging.getLogger(load.__name__).setLevel(logging.ERROR)  # torn files are set aside all the time

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from fleet_service.app.engine import Engine
-from fleet_service.archive import reading, segments
+from fleet_service.archive import load, reading, segments
 from fleet_service.archive.pseudonyms import Pseudonyms, number
 from fleet_service.archive.rebuild import restore_streams
 from fleet_service.ingest.dedup import Streams
@@ -36,7 +36,7 @@ WHOLE_WAY: Final = 200  # every so many damages a service is started on the arch
 
 def run(site: Site) -> list[Figure]:
     """Cut at every byte, changed at every fifth; in a quick run, some hundred."""
-    logging.getLogger(reading.__name__).setLevel(logging.ERROR)  # thousands of files are set aside
+    logging.getLogger(load.__name__).setLevel(logging.ERROR)  # thousands of files are set aside
     batches, newest = _archive(site.folder)
     whole, rng = newest.read_bytes(), np.random.default_rng(site.seed)
     lost = tried = 0
@@ -46,7 +46,7 @@ def run(site: Site) -> list[Figure]:
         if tried % WHOLE_WAY == 0:
             lost += _after_all_is_sent_again(site.folder, batches)
         for left in newest.parent.glob("*.parquet*"):
-            if left.name.removesuffix(reading.BAD) >= newest.name:
+            if left.name.removesuffix(load.BAD) >= newest.name:
                 left.unlink()
         tried += 1
         if tried % 2000 == 0:

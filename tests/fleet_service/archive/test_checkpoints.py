@@ -59,8 +59,8 @@ def folded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     rows: list[int] = []
     read: Callable[..., Iterable[pa.Table]] = reading.read
 
-    def counted(root: Path, kind: Kind, columns: list[str], *more: object) -> list[pa.Table]:
-        found = list(read(root, kind, columns, *more))
+    def counted(root: Path, kind: Kind, columns: list[str], *more: object, **named: object) -> list[pa.Table]:
+        found = list(read(root, kind, columns, *more, **named))
         if "log_likelihood" in columns:
             rows.append(sum(table.num_rows for table in found))
         return found

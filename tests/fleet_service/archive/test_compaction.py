@@ -19,6 +19,7 @@ import pytest
 
 from fleet_service.app.engine import Engine
 from fleet_service.archive import compaction, files, layout, reading, segments
+from fleet_service.archive import load as loading
 from fleet_service.archive.compaction import compact, compacting
 from fleet_service.archive.segments import Writer
 from schemas import grid, tables
@@ -164,7 +165,7 @@ def test_readers_see_every_row_once_while_it_runs(tmp_path: Path) -> None:
 def test_a_reader_that_is_overtaken_begins_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fill(tmp_path, 3, ROWS)
     whole = identities(tmp_path, Kind.OBSERVATION)
-    load, loaded = reading.load, []
+    load, loaded = loading.load, []
 
     def overtaken(path: Path, *args: object, **named: object) -> pa.Table | None:
         loaded.append(path)

@@ -1,0 +1,148 @@
+"""One file of the archive, verified, with the columns that this version knows.
+
+A column that the file does not have is null, one that is not known is passed over. Damage is what a checksum, a digest
+or a text shows. The service that writes the archive and its compaction set a damaged file aside; who only reads passes
+it over and changes nothing.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from fleet_service.archive.version import DamagedError, Version, entries_of, judge, newer
+from schemas.errors import InputError
+
+log = logging.getLogger(__name__)
+BAD: Final = ".bad"
+
+# Without them a row is none, whatever version wrote it.
+NEEDED: Final = frozenset(
+    {"leave_time", "time", "cell", "sector", "latitude", "longitude", "vehicle", "boot", "region", "seq", "row"}
+    | {"received_at", "hour", "acts_from"}
+)
+
+Damaged = Callable[[Path, str], None]
+
+
+def pass_over(path: Path, problem: str) -> None:
+    """Leave a damaged file where it is, and say so: the way of everybody who only reads."""
+    log.warning("%s is damaged and passed over: %s", path, problem)
+
+
+def set_aside(path: Path, problem: str) -> None:
+    """Rename a damaged file so that it is not read again, and say so: the way of who writes the archive."""
+    log.warning("%s is damaged and set aside: %s", path, problem)
+    path.rename(path.with_name(path.name + BAD))
+
+
+def count_set_aside(root: Path) -> int:
+    """How many damaged files lie in an archive; looks through all of it."""
+    return sum(1 for _ in root.rglob(f"*{BAD}"))
+
+
+class Content(NamedTuple):
+    """Rows of a file with its own columns, the version that wrote it, and its key-value pairs."""
+
+    table: pa.Table
+    version: Version
+    entries: dict[str, str]
+
+
+def load(
+    path: Path,
+    schema: pa.Schema,
+    columns: Sequence[str] | None = None,
+    where: pc.Expression | None = None,
+    *,
+    whole: bool = False,
+    damaged: Damaged = pass_over,
+) -> pa.Table | None:
+    """Rows of one file; None if it is damaged.
+
+    Args:
+        path: of the file.
+        schema: the columns that this version knows.
+        columns: those wanted; None: all that are known.
+        where: rows wanted, by columns wanted; row groups that cannot hold any are skipped.
+        whole: verify every column, not only those wanted.
+        damaged: is told of a damaged file.
+
+    Raises:
+        FileNotFoundError: it is gone.
+        InputError: it is of a newer major version.
+        OSError: the system cannot read.
+    """
+    known = schema if columns is None else pa.schema([schema.field(name) for name in columns])
+
+    def read(file: pq.ParquetFile) -> pa.Table:
+        if where is not None and file.metadata.num_row_groups > 1:
+            options: dict[str, Any] = {"filters": where, "partitioning": None, "page_checksum_verification": True}
+            return pq.read_table(path, columns=None if whole else known.names, schema=schema, **options)
+        names = None if whole else [name for name in known.names if name in file.schema_arrow.names]
+        return file.read(names)  # for small files half of read_table
+
+    found = _content(path, read, damaged)
+    if found is None:
+        return None
+    table = conformed(found.table, schema if whole else known)
+    return (table if where is None else table.filter(where)).select(known.names)
+
+
+def content(path: Path, damaged: Damaged = pass_over) -> Content | None:
+    """All that a file holds, also what this version does not know; None if it is damaged.
+
+    Raises:
+        as `load`.
+    """
+    return _content(path, lambda file: file.read(), damaged)
+
+
+def _content(path: Path, read: Callable[[pq.ParquetFile], pa.Table], damaged: Damaged) -> Content | None:
+    try:
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+            entries = entries_of(file.metadata.metadata)
+            if newer(entries):  # before it is read: it may be written in a way that is not known here
+                judge(path, file.schema_arrow, entries)
+            table = read(file)
+            whole = table.num_columns == file.metadata.num_columns  # then its schema is at hand, in a third of the time
+            version = judge(path, table.schema if whole else file.schema_arrow, entries)
+        table.validate(full=True)
+        return Content(table, version, entries)
+    except MemoryError:
+        raise
+    except (pa.ArrowException, OSError, UnicodeDecodeError, DamagedError) as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise  # the system's trouble, not the file's
+        damaged(path, (str(error).splitlines() or [""])[0][:200])
+        return None
+
+
+def conformed(table: pa.Table, schema: pa.Schema) -> pa.Table:
+    """The columns of `schema`: null where the table has none, of the schema's type where it has another.
+
+    Raises:
+        InputError: a value does not go into the type, or a column is missing without which a row is none.
+    """
+    if table.schema.names == schema.names and table.schema.types == schema.types:
+        return table
+    return pa.Table.from_arrays([_column(table, f) for f in schema], schema=schema)
+
+
+def _column(table: pa.Table, wanted: pa.Field[Any]) -> pa.ChunkedArray[Any]:
+    if wanted.name not in table.column_names:
+        if wanted.name in NEEDED:
+            raise InputError("archive", f"a file has no column {wanted.name}", "read it with the GripMap that wrote it")
+        return pa.chunked_array([pa.nulls(table.num_rows, wanted.type)])
+    column = table.column(wanted.name)
+    try:
+        return column if column.type == wanted.type else column.cast(wanted.type)
+    except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
+        problem = f"column {wanted.name} is {column.type} and not {wanted.type}"
+        raise InputError("archive", problem, "read it with the GripMap that wrote it") from error

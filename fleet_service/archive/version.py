@@ -1,0 +1,122 @@
+"""What a file says of its own format: a version, and a digest of its columns, in the footer.
+
+| version | what is new |
+|---|---|
+| 1.0 | no version and no digest; the columns are exactly those of FIRST |
+| 1.1 | `gripmap.version` and `gripmap.digest` in the footer |
+
+A minor version adds columns: who knows fewer passes over the others, who knows more reads null. A major version changes
+what a column means: who is older refuses it. The digest is made the same way in all versions, so that damage is told
+from another version: Parquet's page checksums cover the values, and nothing else covers the names and types of columns
+that give the values their meaning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from hashlib import blake2b
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import pyarrow as pa
+
+from schemas.errors import InputError
+
+
+class Version(NamedTuple):
+    """Major and minor."""
+
+    major: int
+    minor: int
+
+    def __str__(self) -> str:
+        return f"{self.major}.{self.minor}"
+
+
+VERSION: Final = Version(1, 1)
+OLDEST: Final = Version(1, 0)  # of a file that says none
+PREFIX: Final = "gripmap."
+KEY: Final = PREFIX + "version"
+DIGEST: Final = PREFIX + "digest"
+_PREFIX: Final = PREFIX.encode()
+# Digests of the columns of version 1.0: observations, states, map, roll-up, weather.
+FIRST: Final = frozenset(
+    {"b4e3f43b32a213b3", "1bfeb3d126375335", "6fe39bc9930a552b", "248504dd5bdebddb", "c7a993882fc20c55"}
+)
+
+
+class DamagedError(Exception):
+    """A file is not what was written."""
+
+
+def footer(schema: pa.Schema, entries: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Key-value pairs for the footer of a file: `entries`, a version if they have none, and the digest."""
+    own = {KEY: str(VERSION), **(entries or {})}
+    own = {key: value for key, value in own.items() if key != DIGEST}
+    return own | {DIGEST: digest(schema, own)}
+
+
+def entries_of(metadata: Mapping[bytes, bytes] | None) -> dict[str, str]:
+    """This project's key-value pairs of a file; undecodable ones are damage, which the digest shows."""
+    return {
+        key.decode(errors="replace"): value.decode(errors="replace")
+        for key, value in (metadata or {}).items()
+        if key.startswith(_PREFIX)
+    }
+
+
+def newer(entries: Mapping[str, str]) -> bool:
+    """Whether a file says that it is of a newer major version; only a look, `judge` decides."""
+    return entries.get(KEY, "0").partition(".")[0] > str(VERSION.major)
+
+
+def judge(path: Path, schema: pa.Schema, entries: Mapping[str, str]) -> Version:
+    """The version of a file with these columns and key-value pairs.
+
+    Raises:
+        DamagedError: its columns or its key-value pairs are not those that were written.
+        InputError: it is of a newer major version.
+    """
+    if KEY not in entries and DIGEST not in entries:
+        if digest(schema, {}) not in FIRST:
+            raise DamagedError(f"columns are not those of version {OLDEST}, and it says no other")
+        return OLDEST
+    said = {key: value for key, value in entries.items() if key != DIGEST}
+    if entries.get(DIGEST) != digest(schema, said):
+        raise DamagedError("columns are not those that were written")
+    found = parsed(entries[KEY])
+    if found.major > VERSION.major:
+        raise InputError(
+            "archive", f"{path} is of version {found}, and this GripMap reads {VERSION.major}.x", "use a newer GripMap"
+        )
+    return found
+
+
+def parsed(text: str) -> Version:
+    """A version from its text."""
+    major, minor = text.split(".")
+    return Version(int(major), int(minor))
+
+
+def digest(schema: pa.Schema, entries: Mapping[str, str]) -> str:
+    """Hash (16 hexadecimal digits) of names and types of columns, and of key-value pairs."""
+    state = _columns(tuple(schema.names), tuple(schema.types)).copy()
+    for key in sorted(entries):
+        state.update(f"\n{key}={entries[key]}".encode())
+    return state.hexdigest()
+
+
+@lru_cache(64)
+def _columns(names: tuple[str, ...], types: tuple[pa.DataType, ...]) -> blake2b:
+    lines = (f"{name} {_type(kind)}" for name, kind in zip(names, types, strict=True))
+    return blake2b("\n".join(lines).encode(), digest_size=8)
+
+
+def _type(kind: pa.DataType) -> str:
+    """Name of a type; that of a list's values differs between versions of Arrow and is left out."""
+    if pa.types.is_list(kind):
+        return f"list<{_type(kind.value_type)}>"
+    if pa.types.is_struct(kind):
+        return f"struct<{', '.join(f'{f.name} {_type(f.type)}' for f in kind)}>"
+    return str(kind)

@@ -1,0 +1,143 @@
+"""An archive to keep: every kind of file that a service writes, small, and the map that it stood for when it was made.
+
+    python -m tests.fleet_service.archive.kept FOLDER      a new archive and its map, by the code of today
+
+`data/v1.0` was made so by commit 1f90692, before any file had a version. What is kept is never made again: it is what
+later code must go on reading.
+
+Eight vehicles in two zones, around a midnight: compacted rows with their roll-ups and a snapshot, a checkpoint, and
+segments that came after it; dry road and ice, rows with a value, with a bound only, and too late ones; one weather
+report; states.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from fleet_service.app.engine import Engine
+from fleet_service.archive import checkpoints, rollup, snapshots
+from fleet_service.archive.compaction import compact
+from fleet_service.ingest.inbox import Message
+from fleet_service.ingest.weather import Heard
+from fleet_service.serve.map_state import cell_table
+from schemas import grid, keys, weather, wire
+from schemas.config import ServiceConfig
+from schemas.wire import Batch, Kind
+from tests.fleet_service.examples import SECOND, batch
+from tests.waiting import until
+
+DATA: Final = Path(__file__).parent / "data"
+MIDNIGHT: Final = 20_001 * 86_400 * SECOND
+PLACES: Final = ((57.7, 11.97), (48.1, 11.6))  # in two zones
+VEHICLES: Final = 8
+ROUNDS: Final = 12  # half of them before the midnight and the checkpoint
+ROUND_NS: Final = 40 * SECOND
+COLUMNS: Final = ("cell", "sector", "mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehicles", "observations")
+
+
+def now_of(turn: int) -> int:
+    """When a round is received."""
+    return MIDNIGHT + (turn - ROUNDS // 2) * ROUND_NS
+
+
+def observed(turn: int, vehicle: int) -> Batch:
+    """What a vehicle sends in a round: ice in every second cell, bounds from every third vehicle."""
+    rng = np.random.default_rng([turn, vehicle])
+    latitude, longitude = PLACES[vehicle % 2]
+    step = int(rng.integers(0, 4))
+    latitude += 2e-4 * step
+    cell = int(grid.cell_of(latitude, longitude))
+    mu = [(0.2 if step % 2 else 0.8) + float(x) for x in rng.normal(0.0, 0.03, 2)]
+    late = 600 * SECOND if (turn, vehicle) == (9, 4) else 0
+    where = {"latitude": [latitude] * 2, "longitude": [longitude] * 2, "cell": [cell] * 2}
+    told = vehicle % 3 > 0
+    one = batch(
+        f"sim-{vehicle:03}", turn + 1, now_of(turn) - SECOND - late, mu, told=told, used=None if told else 0.15, **where
+    )
+    return replace(one, region=int(grid.region_of(cell)))
+
+
+def moved(turn: int, vehicle: int) -> Batch:
+    """The state that a vehicle sends in a round."""
+    latitude, longitude = PLACES[vehicle % 2]
+    values = {"time": now_of(turn) - SECOND, "latitude": latitude, "longitude": longitude, "yaw": 0.1, "vx": 15.0}
+    types = wire.column_types(Kind.STATE)
+    columns = {name: np.array([value]).astype(types[name]) for name, value in values.items()}
+    region = int(grid.region_of(grid.cell_of(latitude, longitude)))
+    return Batch(Kind.STATE, f"sim-{vehicle:03}", 7, region, turn + 1, 1, columns, "ckf")
+
+
+def messages(turn: int) -> Iterator[Message]:
+    """All that a round brings."""
+    for vehicle in range(VEHICLES):
+        for one, key in ((observed(turn, vehicle), keys.observation_key), (moved(turn, vehicle), keys.state_key)):
+            yield Message(one.kind, key(one.region, one.vehicle), wire.encode(one), wire.ENCODING[one.kind])
+
+
+def taken(engine: Engine) -> Any:  # noqa: ANN401 tables and a time
+    """A checkpoint as the service takes it: asked by one thread, taken by the worker."""
+    found: list[object] = []
+    stop = threading.Event()
+    thread = threading.Thread(target=lambda: found.append(engine.checkpoint(stop)))
+    thread.start()
+
+    def settled() -> bool:
+        engine.flush()
+        return bool(found)
+
+    try:
+        until(settled)
+    finally:
+        stop.set()
+        thread.join()
+    return found[0]
+
+
+def map_of(engine: Engine, at: int) -> dict[str, Any]:
+    """The map at a time: every cell's line as the contract has it, and its belief; by cell and sector."""
+    fusion = engine.fusion
+    slots = np.lexsort((fusion.sector[: fusion.size], fusion.cell[: fusion.size]))
+    lines = cell_table(fusion, slots, at).select(COLUMNS).to_pylist()
+    return {"at": at, "cells": lines, "beliefs": np.asarray(fusion.beliefs(slots, at), np.float64).tolist()}
+
+
+def make(root: Path) -> dict[str, Any]:
+    """Make the archive; returns the map of its end, alerts and rows."""
+    with closing(Engine(ServiceConfig(), root)) as engine:
+        for turn in range(ROUNDS):
+            if turn == 2:
+                report = weather.encode(weather.Report(now_of(2), air_temperature=-3.0, precipitation=1.0))
+                region = int(grid.region_of(grid.cell_of(*PLACES[0])))
+                engine.weather.hear(Heard(keys.weather_key(region), report, wire.WEATHER_ENCODING))
+                engine.overcast(now_of(2))
+            engine.take(list(messages(turn)), now_of(turn))
+            if turn % 2:
+                engine.flush()
+            if turn == ROUNDS // 2 - 1:
+                compact(root)
+                rollup.complete(root)
+                snapshots.write(root, engine.whole_map(now_of(turn)), now_of(turn))
+                checkpoints.save(root, *taken(engine))
+        rows = {str(kind): engine.counts[kind] for kind in Kind}
+        return map_of(engine, now_of(ROUNDS)) | {"alerts": engine.alerts, "late": engine.counts["late"], "rows": rows}
+
+
+def main() -> None:
+    """Make one in a folder."""
+    folder = Path(sys.argv[1])
+    found = make(folder / "archive")
+    (folder / "lock").unlink(missing_ok=True)
+    (folder / "map.json").write_text(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()
