@@ -47,7 +47,8 @@ class Scenario:
 
     def friction(self, t: FloatArray | float, x: FloatArray, y: FloatArray) -> FloatArray:
         """μ at the times t [s] and points (x, y) [m], in the arrays' common shape."""
-        t, x, y = (np.asarray(a, dtype=np.float64) for a in np.broadcast_arrays(t, x, y))
+        # copies: numpy warns who looks whether a broadcast view may be written, and the compiler does at a first call
+        t, x, y = (np.array(a, dtype=np.float64, order="C") for a in np.broadcast_arrays(t, x, y))
         return look_up_many(self.table, int(F.MU), t.ravel(), x.ravel(), y.ravel()).reshape(x.shape)
 
     def to_latlon(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
