@@ -1,0 +1,169 @@
+"""A third party: `schemas`, eclipse-zenoh, protobuf and pyarrow, in a process that can load nothing else of GripMap.
+
+python -m tests.schemas.third_party ENDPOINT: reports ice by two vehicles, one in protobuf and one in JSON, reads its
+acknowledgements, the reports, the tile, the alerts and the map's answers, and prints what it found as one line of JSON.
+Only ever run as a program: to import it would hinder the importer too.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from importlib import import_module
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec
+from typing import Any, Final
+
+FORBIDDEN: Final = ("numba", "llvmlite", "scipy", "edge_agent", "fleet_service", "deploy")
+
+
+class Blocker(MetaPathFinder):
+    """Refuses to find the forbidden packages, as if they were not installed."""
+
+    def find_spec(self, fullname: str, path: Sequence[str] | None, target: object = None) -> ModuleSpec | None:
+        if fullname.partition(".")[0] in FORBIDDEN:
+            raise ModuleNotFoundError(f"{fullname} is not installed here", name=fullname)
+        return None
+
+
+sys.meta_path.insert(0, Blocker())
+
+import numpy as np  # noqa: E402
+import zenoh  # noqa: E402
+
+from schemas import grid, keys, mugrid, wire  # noqa: E402
+from schemas.wire import Batch, Kind  # noqa: E402
+from schemas.wire.tile import decode_tile  # noqa: E402
+from tests.waiting import matched, until  # noqa: E402
+
+LATITUDE, LONGITUDE, NORTH = 57.7, 11.97, np.pi / 2
+CELL = int(grid.cell_of(LATITUDE, LONGITUDE))
+REGION, TILE = int(grid.region_of(CELL)), int(grid.tile_of(CELL))
+ICE, STD = 0.2, 0.05
+VISITS = 6
+SECOND = 10**9
+JSON_SENDER, PROTOBUF_SENDER = "berta", "anna"
+
+
+def protobuf_batch(now: int) -> bytes:
+    """Visits of one cell with likelihoods, as `schemas.wire` packs them."""
+    leave = now - SECOND * np.arange(VISITS)[::-1]
+    log_likelihood = -0.5 * np.square((mugrid.CENTRES - ICE) / STD)
+    columns: dict[str, Any] = {
+        "enter_time": leave - SECOND // 2, "leave_time": leave, "latitude": np.full(VISITS, LATITUDE),
+        "longitude": np.full(VISITS, LONGITUDE), "yaw": np.full(VISITS, NORTH), "mu": np.full(VISITS, ICE),
+        "mu_lower": np.full(VISITS, 0.12), "mu_upper": np.full(VISITS, 0.28), "mu_utilised": np.full(VISITS, 0.19),
+        "cell": np.full(VISITS, CELL), "sector": np.ones(VISITS, np.int8),
+        "log_likelihood": mugrid.encode_log_likelihood(np.tile(log_likelihood, (VISITS, 1))),
+    }  # fmt: skip
+    return wire.encode(Batch(Kind.OBSERVATION, PROTOBUF_SENDER, 41, REGION, 1, 1, columns, "third-party"))
+
+
+def json_batch(now: int) -> bytes:
+    """The same visits as a person would write them: cell, sector and region follow from the pose."""
+    times = [str(now - SECOND * k) for k in reversed(range(VISITS))]
+    numbers = {"latitude": LATITUDE, "longitude": LONGITUDE, "yaw": NORTH, "mu": ICE, "mu_lower": 0.12,
+               "mu_upper": 0.28, "mu_utilised": 0.19}  # fmt: skip
+    columns = {name: [value] * VISITS for name, value in numbers.items()}
+    return json.dumps({"vehicle": JSON_SENDER, "boot": "42", "seq": "1", "enter_time": times, **columns}).encode()
+
+
+def open_session(endpoint: str) -> zenoh.Session:
+    """A client of one router, by Zenoh's own configuration."""
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    return zenoh.open(config)
+
+
+class Heard:
+    """What subscribers decoded, by topic; a message that cannot be read is kept as its error."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.acks: dict[str, list[wire.StreamAck]] = {}
+        self.batches: list[Batch] = []
+        self.tiles: list[tuple[str, int]] = []
+        self.alerts: list[wire.Alert] = []
+        self.errors: list[str] = []
+        session.declare_subscriber(f"{keys.ROOT}/*/**", self._hear)
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        key, payload, encoding = str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding)
+        try:
+            topic = keys.parse(key).topic.name
+            if topic == "ack":
+                vehicle, streams = wire.decode_ack(payload)
+                self.acks.setdefault(vehicle, []).extend(streams)
+            elif topic == "alert":
+                self.alerts.append(wire.decode_alert(payload))
+            elif topic == "map":
+                self.tiles.append((encoding, decode_tile(payload).num_rows))
+            elif topic == "obs":
+                self.batches.append(wire.decode(payload, encoding, Kind.OBSERVATION))
+        except Exception as error:  # noqa: BLE001 Zenoh would swallow it: it is what the test looks for
+            self.errors.append(f"{key}: {error!r}")
+
+
+def asked(session: zenoh.Session, selector: str) -> list[tuple[str, bytes]]:
+    """Encoding and payload of every reply; an error reply comes back as its text."""
+    return [
+        (str(reply.ok.encoding), reply.ok.payload.to_bytes())
+        if reply.ok is not None
+        else ("error", reply.err.payload.to_bytes() if reply.err else b"no reply")
+        for reply in session.get(selector)
+    ]
+
+
+def blocked() -> list[str]:
+    """Which of the forbidden packages can indeed not be loaded."""
+    out = []
+    for name in FORBIDDEN:
+        try:
+            import_module(name)
+        except ModuleNotFoundError:
+            out.append(name)
+    return out
+
+
+def main(endpoint: str) -> None:
+    """Publish, hear, ask, and print what came of it."""
+    with open_session(endpoint) as session:
+        heard = Heard(session)
+        sent = {
+            PROTOBUF_SENDER: (protobuf_batch(time.time_ns()), wire.ENCODING[Kind.OBSERVATION]),
+            JSON_SENDER: (json_batch(time.time_ns()), wire.JSON),
+        }
+        for vehicle, (payload, encoding) in sent.items():
+            publisher = session.declare_publisher(keys.observation_key(REGION, vehicle), encoding=encoding)
+            matched(publisher)
+            publisher.put(payload)
+        until(lambda: heard.errors or (len(heard.acks) == len(sent) and heard.alerts and heard.tiles and heard.batches))
+        box = f"bbox={LONGITUDE - 0.01},{LATITUDE - 0.01},{LONGITUDE + 0.01},{LATITUDE + 0.01};min_vehicles=2"
+        ((arrow, tile),) = asked(session, f"{keys.ROOT}/map/**?{box}")
+        ((_, document),) = asked(session, f"{keys.ROOT}/map/**?{box};format=json")
+        ((_, features),) = asked(session, f"{keys.map_key(TILE)}?{box};format=geojson")
+        ((standing, alerts),) = asked(session, keys.alert_key(TILE))
+        ((_, refusal),) = asked(session, f"{keys.ROOT}/map/**?bbox=1,2,3")
+    print(json.dumps({
+        "errors": heard.errors,
+        "acks": {vehicle: [stream[:1] + stream[2:] for stream in streams] for vehicle, streams in heard.acks.items()},
+        "batches": [[batch.vehicle, batch.rows, batch.region] for batch in heard.batches],
+        "tiles": heard.tiles,
+        "alerts": [asdict(alert) for alert in heard.alerts],
+        "standing": [standing, [alert.cell for alert in wire.decode_standing(alerts)]],
+        "arrow": [arrow, decode_tile(tile).drop(["first_time", "last_time"]).to_pylist()],
+        "json": json.loads(document),
+        "geojson": json.loads(features),
+        "refusal": refusal.decode(),
+        "sent": {"cell": CELL, "region": REGION, "visits": VISITS, "vehicles": [PROTOBUF_SENDER, JSON_SENDER]},
+        "loaded": sorted({name.partition(".")[0] for name in sys.modules} & set(FORBIDDEN)),
+        "blocked": blocked(),
+    }))  # fmt: skip
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
