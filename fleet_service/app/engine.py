@@ -20,13 +20,10 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_service.app.precompile import warm_up
-from fleet_service.archive import checkpoints
 from fleet_service.archive.files import lock
 from fleet_service.archive.load import count_set_aside, set_aside
 from fleet_service.archive.log import Log
 from fleet_service.archive.pseudonyms import Pseudonyms
-from fleet_service.archive.rebuild import Since, observations, replay, restore_streams
-from fleet_service.checkpoint import fusion_from, tables_of
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.weather import Reports
 from fleet_service.ingest.acks import Acks
@@ -34,6 +31,9 @@ from fleet_service.ingest.dedup import BatchId, Streams
 from fleet_service.ingest.inbox import Admitted, Intake, Message
 from fleet_service.ingest.validation import Clock
 from fleet_service.ingest.weather import WeatherDesk, archived
+from fleet_service.replay import checkpoints
+from fleet_service.replay.checkpoint_tables import fusion_from, tables_of
+from fleet_service.replay.rebuild import Since, observations, replay, restore_streams
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.map_state import MapState, cell_table
 from fleet_service.serve.query import answer

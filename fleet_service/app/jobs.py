@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from fleet_service.app.engine import Engine
-from fleet_service.archive import checkpoints, segments, snapshots
+from fleet_service.archive import segments, snapshots
 from fleet_service.archive.load import count_set_aside
 from fleet_service.archive.retention import retire
+from fleet_service.replay import checkpoints
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
 from schemas.runtime.process import trim_memory

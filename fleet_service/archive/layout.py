@@ -3,6 +3,7 @@
     inbox/…                                                     the log, see `segments`
     observations/date=2026-01-31/zone=q1202310/NAME.parquet     compacted, sorted by cell and time
     states/date=…/zone=…/NAME.parquet                           likewise
+    checkpoints/…                                               what a restart begins from, see `replay.checkpoints`
     drafts/                                                     what is being written; nothing there counts
 
 The date is that of the measurement (UTC). NAME is that of the newest segment whose rows the file holds.
@@ -21,6 +22,7 @@ from schemas.wire import Kind
 
 TABLES: Final = {Kind.OBSERVATION: "observations", Kind.STATE: "states"}
 TIME: Final = {Kind.OBSERVATION: "leave_time", Kind.STATE: "time"}  # of the measurement, by which rows are kept
+CHECKPOINTS: Final = "checkpoints"  # a folder
 DAY_NS: Final = 86_400_000_000_000
 _EPOCH: Final = date(1970, 1, 1)
 

@@ -5,6 +5,7 @@ Only these two rewrite or remove compacted files, one file for one.
 
 from __future__ import annotations
 
+import shutil
 from datetime import date, timedelta
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -12,7 +13,7 @@ from typing import Final, NamedTuple
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_service.archive import checkpoints, layout, rollup
+from fleet_service.archive import layout, rollup
 from fleet_service.archive.compaction import compact, compacting
 from fleet_service.archive.files import COMPACTED, lock, put_in_place, sync_directory
 from fleet_service.archive.layout import TABLES
@@ -85,13 +86,24 @@ def forget_vehicle(root: Path, vehicle: str, month: str) -> int:
         noon = (first - date(1970, 1, 1)).days * layout.DAY_NS + layout.DAY_NS // 2
         pseudonym = Pseudonyms(root / _KEYS).of(vehicle, noon)
         with compacting(root):
-            checkpoints.remove_all(root)  # what it told is in them
+            drop_checkpoints(root)  # what it reported is in them
             return sum(
                 _without(root, kind, path, pseudonym)
                 for kind in Kind
                 # a batch has the pseudonym of its first record and may end a day later
                 for path in layout.compacted(root, kind, (first - date(1970, 1, 1)).days, _last_day(first) + 1)
             )
+
+
+def drop_checkpoints(root: Path) -> None:
+    """Remove all checkpoints: what they were made from changes; a service then replays the log.
+
+    Raises:
+        OSError: one cannot be removed.
+    """
+    if (root / layout.CHECKPOINTS).exists():
+        shutil.rmtree(root / layout.CHECKPOINTS)
+        sync_directory(root)
 
 
 def _without(root: Path, kind: Kind, path: Path, pseudonym: str) -> int:

@@ -7,13 +7,13 @@ from typing import Final
 import numpy as np
 from numpy.random import Generator
 
-from fleet_service.archive.rebuild import observations
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.lab import town
 from fleet_service.lab.agent import Errors
 from fleet_service.lab.drive import CELL, LATENESS_S, rows_of
 from fleet_service.lab.town import LENGTH, Town
+from fleet_service.replay.rebuild import observations
 from fleet_service.serve.alerts import CLEAR_BELOW, RAISE_ABOVE
 from schemas.numeric import FloatArray, IntArray
 

@@ -13,10 +13,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.random import Generator
 
-from fleet_service.archive.rebuild import observations
 from fleet_service.fusion import Fusion, Observations
 from fleet_service.ingest.dedup import Streams
 from fleet_service.lab.town import CELLS, START, Visits, cell_numbers
+from fleet_service.replay.rebuild import observations
 from fleet_service.serve.alerts import Alerts
 from schemas import grid, mugrid
 from schemas.numeric import BoolArray, FloatArray, IntArray

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.random import Generator
 
 from fleet_service.app.engine import Engine
-from fleet_service.archive.rebuild import observations
 from fleet_service.fusion import Fusion
 from fleet_service.lab import agent, town
 from fleet_service.lab.agent import Errors
 from fleet_service.lab.drive import CELL, LATENESS_S, rows_of
 from fleet_service.lab.messages import clock_of, messages
 from fleet_service.lab.town import Visits
+from fleet_service.replay.rebuild import observations
 from schemas import mugrid
 from schemas.config import ServiceConfig
 from schemas.numeric import FloatArray

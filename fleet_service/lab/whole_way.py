@@ -15,10 +15,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_service.archive.rebuild import observations
 from fleet_service.fusion import Fusion, Observations
 from fleet_service.lab.drive import LATENESS_S
 from fleet_service.lab.score import Scores, of_beliefs, safe
+from fleet_service.replay.rebuild import observations
 from fleet_service.serve.map_state import LOWER, UPPER, measured
 from schemas import grid, mugrid, wire
 from schemas.errors import InputError

@@ -29,8 +29,8 @@ from fleet_service.analytics.synthetic import DAY_S, START_NS, World
 from fleet_service.archive import reading, rollup, segments, snapshots
 from fleet_service.archive.compaction import compact
 from fleet_service.archive.export import Part
-from fleet_service.archive.rebuild import Since, replay
 from fleet_service.fusion import Fusion
+from fleet_service.replay.rebuild import Since, replay
 from fleet_service.serve.map_state import cell_table
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure

@@ -19,9 +19,9 @@ import pyarrow as pa
 
 from deploy.router import open_router
 from fleet_service.app.engine import ALERTS, Engine
-from fleet_service.archive import checkpoints
-from fleet_service.checkpoint import tables_of
 from fleet_service.ingest.inbox import Message
+from fleet_service.replay import checkpoints
+from fleet_service.replay.checkpoint_tables import tables_of
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
 from tests.benchmarks.fusion import CELLS, START, filled

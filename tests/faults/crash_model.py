@@ -24,9 +24,9 @@ import pyarrow as pa
 from fleet_service.archive import layout, load, reading, segments
 from fleet_service.archive.compaction import compact
 from fleet_service.archive.log import Log
-from fleet_service.archive.rebuild import restore_streams
 from fleet_service.archive.segments import Rows
 from fleet_service.ingest.dedup import Streams
+from fleet_service.replay.rebuild import restore_streams
 from schemas import grid
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind

@@ -18,9 +18,9 @@ import numpy as np
 from fleet_service.app.engine import Engine
 from fleet_service.archive import load, reading, segments
 from fleet_service.archive.pseudonyms import Pseudonyms, number
-from fleet_service.archive.rebuild import restore_streams
 from fleet_service.ingest.dedup import Streams
 from fleet_service.ingest.inbox import Message
+from fleet_service.replay.rebuild import restore_streams
 from schemas import wire
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure

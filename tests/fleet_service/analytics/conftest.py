@@ -20,8 +20,8 @@ from fleet_service.analytics.synthetic import DAY_S, START_NS, World
 from fleet_service.archive import reading, rollup, snapshots
 from fleet_service.archive.compaction import compact
 from fleet_service.archive.export import Part
-from fleet_service.archive.rebuild import Since, replay
 from fleet_service.fusion import Fusion
+from fleet_service.replay.rebuild import Since, replay
 from fleet_service.serve.map_state import cell_table
 from schemas.numeric import IntArray
 from schemas.wire import Kind

@@ -15,8 +15,8 @@ from fleet_service.analytics import synthetic
 from fleet_service.analytics.questions.worst import stretches, wilson
 from fleet_service.analytics.synthetic import START_NS
 from fleet_service.archive.export import Part
-from fleet_service.archive.rebuild import Since, replay
 from fleet_service.fusion import Fusion
+from fleet_service.replay.rebuild import Since, replay
 from fleet_service.serve.map_state import cell_table
 from schemas import grid
 from schemas.errors import InputError

@@ -24,10 +24,11 @@ from typing import Any, Final
 import numpy as np
 
 from fleet_service.app.engine import Engine
-from fleet_service.archive import checkpoints, rollup, snapshots
+from fleet_service.archive import rollup, snapshots
 from fleet_service.archive.compaction import compact
 from fleet_service.ingest.inbox import Message
 from fleet_service.ingest.weather import Heard
+from fleet_service.replay import checkpoints
 from fleet_service.serve.map_state import cell_table
 from schemas import grid, keys, weather, wire
 from schemas.config import ServiceConfig

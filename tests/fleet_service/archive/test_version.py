@@ -17,10 +17,12 @@ import pytest
 
 from fleet_service import cli
 from fleet_service.app.engine import Engine
-from fleet_service.archive import checkpoints, export, layout, reading, rollup, segments, version
+from fleet_service.archive import export, layout, reading, rollup, segments, version
 from fleet_service.archive.compaction import compact
 from fleet_service.archive.files import COMPACTED, MAP, ROLLUP, SEGMENT, Encoding, write_synced
 from fleet_service.archive.load import content
+from fleet_service.archive.retention import drop_checkpoints
+from fleet_service.replay import checkpoints
 from schemas import query, tables
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
@@ -66,7 +68,7 @@ def test_the_kept_archive_is_of_the_first_version_and_holds_every_kind_of_file(o
 @pytest.mark.parametrize("begin", ["checkpoint", "log"])
 def test_a_service_on_the_kept_archive_has_the_map_that_it_was_made_with(old: Path, begin: str) -> None:
     if begin == "log":
-        checkpoints.remove_all(old)
+        drop_checkpoints(old)
     with closing(Engine(ServiceConfig(), old)) as engine:
         same(map_of(engine, MADE["at"]), MADE)
         assert engine.alerts == MADE["alerts"] > 0
@@ -80,7 +82,7 @@ def test_what_is_kept_is_compacted_together_with_what_is_new_and_gives_the_same_
         for turn in (ROUNDS, ROUNDS + 1):
             engine.take(list(messages(turn)), now_of(turn))
             engine.flush()
-    checkpoints.remove_all(old)
+    drop_checkpoints(old)
     with closing(Engine(ServiceConfig(), old)) as engine:
         before = map_of(engine, now_of(ROUNDS + 2))
     rows = {str(kind): _identities(old, kind) for kind in Kind}

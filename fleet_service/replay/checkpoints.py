@@ -16,9 +16,9 @@ from typing import Final
 import pyarrow as pa
 
 from fleet_service.archive.files import sync_directory
+from fleet_service.archive.layout import CHECKPOINTS
 from fleet_service.archive.version import KEY, VERSION
 
-FOLDER: Final = "checkpoints"
 KEPT: Final = 2  # the newest, and the one before, should the newest be damaged
 _DRAFT: Final = ".draft"
 
@@ -29,7 +29,7 @@ def save(root: Path, tables: dict[str, pa.Table], received: int) -> Path:
     Raises:
         OSError: the disk is full; the checkpoints before stay.
     """
-    folder = root / FOLDER
+    folder = root / CHECKPOINTS
     draft, path = folder / _DRAFT, folder / f"{received:020d}"
     shutil.rmtree(draft, ignore_errors=True)
     draft.mkdir(parents=True)
@@ -67,16 +67,5 @@ def load(path: Path) -> tuple[dict[str, pa.Table], int]:
     return tables, int(path.name)
 
 
-def remove_all(root: Path) -> None:
-    """Remove all checkpoints: what they were made from has changed.
-
-    Raises:
-        OSError: one cannot be removed.
-    """
-    if (root / FOLDER).exists():
-        shutil.rmtree(root / FOLDER)
-        sync_directory(root)
-
-
 def _folders(root: Path) -> list[Path]:
-    return sorted(path for path in (root / FOLDER).glob("[0-9]*") if path.is_dir())
+    return sorted(path for path in (root / CHECKPOINTS).glob("[0-9]*") if path.is_dir())

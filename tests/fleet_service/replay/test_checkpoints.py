@@ -13,9 +13,11 @@ import pyarrow as pa
 import pytest
 
 from fleet_service.app.engine import Engine
-from fleet_service.archive import checkpoints, reading
+from fleet_service.archive import reading
 from fleet_service.archive.compaction import compact
+from fleet_service.archive.retention import drop_checkpoints
 from fleet_service.ingest.inbox import Message
+from fleet_service.replay import checkpoints
 from schemas import wire
 from schemas.config import ServiceConfig
 from schemas.numeric import FloatArray
@@ -90,7 +92,7 @@ def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(tmp_path: Path, f
         again.take(sent, time.time_ns())
         assert again.counts["duplicates"] == 60
     assert path.name < f"{at:020d}"
-    checkpoints.remove_all(tmp_path)
+    drop_checkpoints(tmp_path)
     with closing(Engine(ServiceConfig(), tmp_path)) as whole:
         np.testing.assert_allclose(from_checkpoint, beliefs(whole, at), atol=1e-6)
     np.testing.assert_allclose(from_checkpoint, running, atol=1e-6)

@@ -9,8 +9,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from fleet_service.checkpoint import fusion_from, tables_of
 from fleet_service.fusion import Fusion
+from fleet_service.replay.checkpoint_tables import fusion_from, tables_of
 from schemas.errors import InputError
 from tests.fleet_service.fusion.test_order import LATENESS_S, delayed, drive
 from tests.fleet_service.fusion.test_weather import RAIN, reports
