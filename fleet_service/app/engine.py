@@ -24,7 +24,7 @@ from fleet_service.archive.files import lock
 from fleet_service.archive.load import count_set_aside, set_aside
 from fleet_service.archive.log import Log
 from fleet_service.archive.pseudonyms import Pseudonyms
-from fleet_service.fusion import Fusion
+from fleet_service.fusion import Fusion, observations_of
 from fleet_service.fusion.weather import Reports
 from fleet_service.ingest.acks import Acks
 from fleet_service.ingest.dedup import BatchId, Streams
@@ -33,7 +33,7 @@ from fleet_service.ingest.validation import Clock
 from fleet_service.ingest.weather import WeatherDesk, archived
 from fleet_service.replay import checkpoints
 from fleet_service.replay.checkpoint_tables import fusion_from, tables_of
-from fleet_service.replay.rebuild import Since, observations, replay, restore_streams
+from fleet_service.replay.rebuild import Since, replay, restore_streams
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.map_state import MapState, cell_table
 from fleet_service.serve.query import answer
@@ -95,11 +95,11 @@ class Engine:
         self._checkpoint_wanted = threading.Event()
         self._checkpoints: queue.SimpleQueue[tuple[dict[str, pa.Table], int]] = queue.SimpleQueue()
         used = archived(root, damaged=set_aside)  # before the observations, which it acts on
-        self.fusion.weather(used if since is None else archived(root, received_after=since, damaged=set_aside))
+        self.fusion.update_weather(used if since is None else archived(root, received_after=since, damaged=set_aside))
         restored = np.array_split(np.arange(self.fusion.size), self.fusion.size // SNAPSHOT_SLOTS + 1)
         rest = replay(root, self.fusion, Since(received=since), set_aside)
-        for slots in chain(restored, (folded.slots for folded in rest)):
-            self._alerts.folded(slots)
+        for slots in chain(restored, (updated.slots for updated in rest)):
+            self._alerts.updated(slots)
             self.map.changed(slots)
         self.seen = restore_streams(root, streams, set_aside)
         self.counts["files_set_aside"] = count_set_aside(root)
@@ -179,13 +179,13 @@ class Engine:
         rows = admitted.rows
         self.report_lag_s = float((rows["received_at"] - rows["leave_time"]).min()) * 1e-9
         with self._guard:
-            folded = self.fusion.fold(observations(rows, rows["vehicle_number"]))
-            self.map.changed(folded.slots)
-            raised = self._alerts.folded(folded.slots)
+            updated = self.fusion.update(observations_of(rows, rows["vehicle_number"]))
+            self.map.changed(updated.slots)
+            raised = self._alerts.updated(updated.slots)
             if raised:
                 self._tiles.settle()
-        rows["late"], rows["weight"] = folded.late, folded.weight
-        self.counts["late"] += int(folded.late.sum())
+        rows["late"], rows["weight"] = updated.late, updated.weight
+        self.counts["late"] += int(updated.late.sum())
         return raised
 
     def overcast(self, now: int) -> None:
@@ -196,7 +196,7 @@ class Engine:
     def _use(self, reports: Reports | None) -> None:
         if reports is not None:
             with self._guard:
-                self.fusion.weather(reports)
+                self.fusion.update_weather(reports)
             self.counts["weather"] += len(reports.time)
 
     def flush(self) -> list[tuple[str, bytes]]:
@@ -274,7 +274,7 @@ class Engine:
             raise InputError("at", "lies in the future", "give a time that has been")
         past = Fusion(self._config.lateness_s)
         try:
-            past.weather(archived(self._root, received_until=at))
+            past.update_weather(archived(self._root, received_until=at))
             for _ in replay(self._root, past, Since(until=at, box=_box(query))):
                 pass  # folding is what counts; the alerts of then are history
         except OSError as error:

@@ -39,11 +39,11 @@ def warm_up() -> None:
 
 
 def live() -> None:
-    """Take a throw-away map through its life: fold, grow, advance, fold late within the window, settle, believe."""
+    """Take a throw-away map through its life: update, grow, advance, update late within the window, commit, believe."""
     fusion = Fusion(2 * EPOCH_NS * 1e-9)
     for epoch, cells in ((1, 2), (2, CELLS), (1, 2), (9, 2)):
         o = _visits(epoch * EPOCH_NS, cells)
-        Alerts(fusion).folded(fusion.fold(o).slots)
+        Alerts(fusion).updated(fusion.update(o).slots)
         fusion.slots_of(o.cell, o.sector)
     at_least(np.zeros(1))
     levelled(np.zeros((1, mugrid.BINS), np.uint8), np.zeros(1))
@@ -54,8 +54,9 @@ def live() -> None:
 def _visits(time: int, cells: int) -> Observations:
     """One visit to each of so many cells, by two vehicles."""
     one, number, sector = np.ones(cells, np.int64), np.arange(cells), np.zeros(cells, np.int8)
-    told = unshaped(mugrid.encode_log_likelihood(np.zeros((cells, mugrid.BINS))), np.zeros(cells))
+    flat = unshaped(mugrid.encode_log_likelihood(np.zeros((cells, mugrid.BINS))), np.zeros(cells))
     return Observations(
-        time * one, number, sector, (sector - 1).astype(np.int8), number % 2, one, one, number, *told,
-        np.full((cells, 1), -1), np.zeros((cells, 1), np.float32),
+        time=time * one, cell=number, sector=sector, second=(sector - 1).astype(np.int8),
+        vehicle=number % 2, boot=one, region=one, sequence=number, evidence=flat.steps, reported=flat.reported,
+        other=np.full((cells, 1), -1), other_share=np.zeros((cells, 1), np.float32),
     )  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fleet_service.fusion.fuse import Folded, Fusion, Observations
-from fleet_service.fusion.likelihoods import evidence
+from fleet_service.fusion.fuse import Fusion, Updated
+from fleet_service.fusion.observations import Observations, observations_of
 
-__all__ = ["Folded", "Fusion", "Observations", "evidence"]
+__all__ = ["Fusion", "Observations", "Updated", "observations_of"]

@@ -168,7 +168,7 @@ def forget(p: Bins, drift_s: float, change_s: float, prior: Float32Array, padded
 
 
 @refcount_free_inlined
-def doubt(p: Bins, change_s: float, power: float, prior: Float32Array) -> None:
+def ensure_change(p: Bins, change_s: float, power: float, prior: Float32Array) -> None:
     """Make up what `forget` over `change_s` lacks to CHANGE_LEAST, for a value of which `power` is new. In place."""
     lacking = c.CHANGE_LEAST * power + math.expm1(-max(change_s, 0.0) / c.CHANGE_S)
     if lacking > 0.0:
@@ -185,7 +185,7 @@ def kind_of(evidence: ByteArray) -> int:
 
 
 @refcount_free_inlined
-def spread(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> None:
+def convolve_bias(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> None:
     """L̃ of a visit into `out` (32), mean 1. The fall of a BOUND above its maximum is noise and is levelled.
 
     `padded` (PADDED) must hold zeros in its first and last REACH places.
@@ -209,11 +209,11 @@ def spread(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> None:
 
 
 @refcount_free_inlined
-def vote(p: Bins, spread_likelihood: Bins, strength: float) -> None:
+def vote(p: Bins, likelihood: Bins, strength: float) -> None:
     """p ← p·(s·L̃ + 1 - s), in place and not normalised."""
     s, rest = np.float32(strength), np.float32(1.0 - strength)
     for i in range(_BINS):
-        p[i] *= s * spread_likelihood[i] + rest
+        p[i] *= s * likelihood[i] + rest
 
 
 @refcount_free_inlined

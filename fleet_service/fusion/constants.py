@@ -99,7 +99,7 @@ PEER_STD: Final = 0.25  # wider ones agree with everything
 # Meetings with one vehicle after which the old count half: who was honest and begins to lie is seen in minutes, and a
 # repaired sensor as soon; the mean over many others keeps it quiet.
 PEER_MEMORY: Final = 3.0
-SPEAKERS: Final = 6  # last values of a cell that a new one is held against
+REPORTERS: Final = 6  # last values of a cell that a new one is held against
 PEERS: Final = 48  # places for others: a sample, which is enough for a mean
 # As a mean over others, beginning with TRUST_PRIOR_PEERS imagined ones that agreed in TRUST_PRIOR. No weight is left to
 # who disagrees with 30 % of those that are trusted; with less than a third of a fleet colluding that is the colluders.
@@ -109,15 +109,15 @@ TRUST_NONE: Final = 0.7
 TRUST_FULL: Final = 0.9
 TRUST_HEARD_LEAST: Final = 0.2  # how much a vehicle's word about others counts at least: all distrusted is no end
 # Once so many vehicles are known (met so many others, and are trusted), one that is not is a newcomer: it votes with
-# this weight, bears no witness, and shares one vote per cell with all others that are not trusted (CROWD).
+# this weight, is no corroborating source, and shares one vote per cell with all others that are not trusted.
 ESTABLISHED_PEERS: Final = 4.0
 ESTABLISHED_VEHICLES: Final = 10
 NEWCOMER: Final = 0.4
-WITNESS_TRUST: Final = 0.5  # less trusted vehicles vote, but do not bear witness for an alert
-WITNESS_SHARE: Final = 0.6  # P(slippery) from the vote alone, against the uniform prior, that makes a witness
-# A bound is a witness of grip from this much grip used on: only a dry road gives it. On the best roads values lie at
+SOURCE_TRUST: Final = 0.5  # less trusted vehicles vote, but are no corroborating sources for an alert
+SOURCE_SHARE: Final = 0.6  # P(slippery) from the vote alone, against the uniform prior, that makes a source of ice
+# A bound is a source of grip from this much grip used on: only a dry road gives it. On the best roads values lie at
 # the grid's end and are bounds, and without them nobody would clear an alert there.
-WITNESS_USED: Final = EXCITED_SHARE
+SOURCE_USED: Final = EXCITED_SHARE
 
 # Trust acts from the next epoch on, so that it depends on the order of time and not of arrival.
 EPOCH_NS: Final = 60_000_000_000

@@ -6,63 +6,30 @@ observations of the epoch that begins there, so that a vote's weight depends on 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import fields
+from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.belief import PackedArray, forget, read, unpack
-from fleet_service.fusion.cells import NOBODY, NONE, SECOND, Cells, Records
-from fleet_service.fusion.stores import Stores, distinct
+from fleet_service.fusion.belief import forget, read, unpack
+from fleet_service.fusion.observations import Observations, SmallArray
+from fleet_service.fusion.store.cells import Cells
+from fleet_service.fusion.store.records import NOBODY, NONE, SECOND, Rows
+from fleet_service.fusion.store.store import Store, distinct
 from fleet_service.fusion.trust import newcomer, trusted
 from fleet_service.fusion.votes import PADDED, SCRATCH, P
 from fleet_service.fusion.weather import Reports, Weather, aged, no_reports, weather_of
-from fleet_service.fusion.window import absorb, settle
+from fleet_service.fusion.window import Arrivals, Votes, absorb, commit
 from schemas import grid
-from schemas.numeric import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
+from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import NS
 
-SmallArray = NDArray[np.int8]
-_ANY = 1 << 62
+_ANY: Final = 1 << 62
 
 
-@dataclass(frozen=True)
-class Observations:
-    """Admitted visits, arrays of shape (n,).
-
-    Attributes:
-        time: end of the visit [ns].
-        cell, sector, second: where; `second` is a sector whose edge is near, or -1.
-        vehicle, boot, region, place: identity; `vehicle` is a number that stands for the vehicle, `place` counts rows
-            in the stream of (vehicle, boot, region).
-        evidence: (n, 32) log-likelihood in steps, see `likelihoods.evidence`.
-        said: (n, 3) mean, standard deviation and P(slippery) of a value as it was told, NaN to read them in `evidence`.
-        beside: (n, k) other cells in which the vehicle may have been instead, -1 where there is none.
-        beside_share: (n, k) probability that it was there; what is left belongs to `cell`.
-    """
-
-    time: IntArray
-    cell: IntArray
-    sector: SmallArray
-    second: SmallArray
-    vehicle: IntArray
-    boot: IntArray
-    region: IntArray
-    place: IntArray
-    evidence: ByteArray
-    said: Float32Array
-    beside: IntArray
-    beside_share: Float32Array
-
-    def take(self, rows: IntArray | BoolArray) -> Observations:
-        """Some of the rows."""
-        return Observations(*(getattr(self, f.name)[rows] for f in fields(self)))
-
-
-@dataclass(frozen=True)
-class Folded:
+class Updated(NamedTuple):
     """What became of observations: whether each was late or one too many, and so not fused (n,); weight that was used
     (n,); slots that changed (k,)."""
 
@@ -78,7 +45,7 @@ class Fusion:
         lateness_s: L [s]; an observation older than the checkpoint is reported late and not fused.
 
     Attributes:
-        stores: cells, windows, pairs and vehicles.
+        store: cells, windows, pairs and vehicles.
         trusts: epoch from which they act, weights by vehicle, and that of an unknown vehicle; the oldest first.
         reports: the weather that may still be asked for.
     """
@@ -87,13 +54,13 @@ class Fusion:
         self._lateness_ns = int(lateness_s * NS)
         self._kept_epochs = self._lateness_ns // c.EPOCH_NS + 2  # whose trust an observation in time may still need
         self._epoch: int | None = None
-        self.stores = Stores()
+        self.store = Store()
         self.trusts: list[tuple[int, Float32Array, float]] = [(-1, np.zeros(0, np.float32), newcomer(False))]
         self.reports: Reports = no_reports()
         self._weather: Weather = weather_of(self.reports)
 
     def resume(self, epoch: int | None, trusts: list[tuple[int, Float32Array, float]], reports: Reports) -> None:
-        """Go on from an epoch, the weights that were given since, and the weather; the stores are set before."""
+        """Go on from an epoch, the weights that were given since, and the weather; the store is set before."""
         self._epoch, self.trusts, self.reports = epoch, trusts, reports
         self._weather = weather_of(reports)
 
@@ -105,12 +72,12 @@ class Fusion:
     @property
     def live(self) -> Cells:
         """The cells as they are now; rows beyond `size` are not in use."""
-        return self.stores.live
+        return self.store.live
 
     @property
     def size(self) -> int:
         """Slots in use."""
-        return self.stores.size
+        return self.store.size
 
     @property
     def cell(self) -> IntArray:
@@ -125,7 +92,7 @@ class Fusion:
     @property
     def waiting(self) -> int:
         """Observations in the window, counted per cell."""
-        return self.stores.waiting
+        return self.store.waiting
 
     @property
     def checkpoint(self) -> int | None:
@@ -134,21 +101,21 @@ class Fusion:
 
     @property
     def next_epoch(self) -> int:
-        """First time [ns] of which no observation was folded yet; 0 before the first."""
+        """First time [ns] of which no observation was taken yet; 0 before the first."""
         return 0 if self._epoch is None else (self._epoch + 1) * c.EPOCH_NS
 
-    def fold(self, o: Observations, weight: Float32Array | None = None, late: BoolArray | None = None) -> Folded:
+    def update(self, o: Observations, weight: Float32Array | None = None, late: BoolArray | None = None) -> Updated:
         """Take in observations in any order.
 
         Args:
             o: the observations.
-            weight, late: what `Folded` said the first time, when an archive is replayed.
+            weight, late: what `Updated` held the first time, when an archive is replayed.
         """
         if late is None:
             late = np.zeros(len(o.time), bool) if self.checkpoint is None else o.time < self.checkpoint
         used = np.zeros(len(o.time), np.float32)
         touched = [np.zeros(0, np.int64)]
-        vehicle = self.stores.vehicles_of(o.vehicle)
+        vehicle = self.store.vehicles_of(o.vehicle)
         epoch = o.time // c.EPOCH_NS
         for e in distinct(epoch[~late]).tolist():
             self._advance(e)
@@ -158,9 +125,9 @@ class Fusion:
             touched.append(slots)
             late = late | left_out
             used[left_out] = 0.0
-        return Folded(late, used, distinct(np.concatenate(touched)))
+        return Updated(late, used, distinct(np.concatenate(touched)))
 
-    def weather(self, reports: Reports) -> None:
+    def update_weather(self, reports: Reports) -> None:
         """Take in weather; each report must act from `next_epoch` on at the earliest, or the map depends on when it
         came."""
         columns = (np.concatenate([getattr(r, f.name) for r in (self.reports, reports)]) for f in fields(Reports))
@@ -171,31 +138,32 @@ class Fusion:
 
     def beliefs(self, slots: IntArray, now: int) -> FloatArray:
         """Belief of each slot about its road, (k, 32), with what time did to it until `now` [ns]."""
-        return read(_beliefs(self.stores.state.belief, self.stores.state.cells, self._weather, slots, now))
+        return read(_beliefs(self.store.state.live, self._weather, slots, now))
 
     def believed(self, slots: IntArray) -> FloatArray:
         """Belief of each slot about its road, (k, 32), at its last observation."""
-        return read(self.stores.state.belief[slots].astype(np.float64))
+        return read(self.live.belief[slots].astype(np.float64))
 
     def slots_of(self, cell: IntArray, sector: IntArray | SmallArray) -> IntArray:
         """Slot of each cell and sector, -1 where nobody was."""
-        return self.stores.slots_of(cell * grid.SECTORS + sector)
+        return self.store.slots_of(cell * grid.SECTORS + sector)
 
     def trust(self, vehicle: int) -> float:
         """Weight of a vehicle's next vote."""
-        index = self.stores.known(np.array([vehicle]))
+        index = self.store.known(np.array([vehicle]))
         newest = self.trusts[-1][0]
-        return float(self._weights(newest, np.where(index < 0, self.stores.vehicles, index))[0])
+        return float(self._weights(newest, np.where(index < 0, self.store.vehicles, index))[0])
 
-    def witnesses(self, slots: IntArray, kind: int, since: IntArray | int) -> tuple[IntArray, IntArray]:
-        """Vehicles that called slots (k,) GRIP or ICE after `since` [ns] and are still trusted: how many, and the last.
+    def sources(self, slots: IntArray, side: int, since: IntArray | int) -> tuple[IntArray, IntArray]:
+        """Corroborating sources: vehicles that reported GRIP or ICE of slots (k,) after `since` [ns] and are still
+        trusted; how many, and when the last did.
 
-        At most WITNESSES are remembered; the last time [ns] is 0 where there is none.
+        At most SOURCES are remembered; the last time [ns] is 0 where there is none.
         """
-        voice, voices = self.live.voice[slots], self.stores.state.voices
-        who = np.where(voice[:, None] == NONE, NOBODY, voices["witness"][voice, kind])
-        when = voices["witnessed"][voice, kind].astype(np.int64) * SECOND
-        trust = self._weights(self.trusts[-1][0], np.maximum(who, 0)) >= c.WITNESS_TRUST
+        row, reporters = self.live.reporters[slots], self.store.state.live.reporters
+        who = np.where(row[:, None] == NONE, NOBODY, reporters["source"][row, side])
+        when = reporters["source_time"][row, side].astype(np.int64) * SECOND
+        trust = self._weights(self.trusts[-1][0], np.maximum(who, 0)) >= c.SOURCE_TRUST
         counted = (who != NOBODY) & trust & (when > np.reshape(since, (-1, 1)))
         return counted.sum(axis=1), np.where(counted, when, 0).max(axis=1)
 
@@ -212,28 +180,28 @@ class Fusion:
         while self._epoch < epoch:
             self._epoch = self._epoch + 1 if self.waiting else epoch
             before = self._epoch * c.EPOCH_NS - self._lateness_ns
-            stores = self.stores
-            for due in stores.due_windows(before):
-                settle(stores.state, self._weather, stores.peers, stores.names, due, before)
-            stores.forget(before // SECOND)
+            store = self.store
+            for due in store.due_windows(before):
+                commit(store.state, self._weather, store.peers, store.names, due, before)
+            store.forget(before // SECOND)
             weights = self.trusts[-1][1]
-            joined = np.full(stores.vehicles - len(weights), newcomer(False), np.float32)
-            weights, established = trusted(stores.peers, np.append(weights, joined))
+            joined = np.full(store.vehicles - len(weights), newcomer(False), np.float32)
+            weights, established = trusted(store.peers, np.append(weights, joined))
             record = (self._epoch, weights, newcomer(established))
             self.trusts = [self.trusts[0], *self.trusts[1:][-self._kept_epochs :], record]
 
     def _absorb(
         self, o: Observations, rows: IntArray, vehicle: IntArray, weight: Float32Array, most: int
     ) -> tuple[IntArray, BoolArray]:  # fmt: skip
-        rows = rows[np.argsort(o.time[rows], kind="stable")]  # in the order of time nothing has to be folded again
+        rows = rows[np.argsort(o.time[rows], kind="stable")]  # in the order of time nothing has to be computed anew
         at, keys, share = _votes(o, rows)
-        slots = self.stores.slots_for(keys)
-        self.stores.reserve(len(slots))
-        left_out = absorb(
-            self.stores.state, self._weather, slots, at, share, o.time, o.vehicle, o.boot, o.place, vehicle, weight,
-            o.evidence, o.said, most,
+        slots = self.store.slots_for(keys)
+        self.store.reserve(len(slots))
+        arrivals = Arrivals(
+            time=o.time, number=o.vehicle, boot=o.boot, sequence=o.sequence, vehicle=vehicle, weight=weight,
+            evidence=o.evidence, reported=o.reported,
         )  # fmt: skip
-        return slots, left_out
+        return slots, absorb(self.store.state, self._weather, arrivals, Votes(at, slots, share), most)
 
     def _oldest(self) -> int:
         times = self.live.time[: self.size]
@@ -241,8 +209,8 @@ class Fusion:
 
 
 def _votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, Float32Array]:
-    """Votes of some observations: row, key and share; those beside and in a second sector too. In order of `rows`."""
-    own = 1.0 - o.beside_share[rows].sum(axis=1)
+    """Votes of some observations: row, key and share; those of other cells and of a second sector too; by time."""
+    own = 1.0 - o.other_share[rows].sum(axis=1)
     key = o.cell[rows] * grid.SECTORS
     at, keys, share = [rows], [key + o.sector[rows]], [own]
     second = np.flatnonzero(o.second[rows] >= 0)
@@ -250,11 +218,11 @@ def _votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, Float32
         at.append(rows[second])
         keys.append(key[second] + o.second[rows[second]])
         share.append(own[second])
-    beside, which = np.nonzero(o.beside[rows] >= 0)
-    if len(beside):
-        at.append(rows[beside])
-        keys.append(o.beside[rows[beside], which] * grid.SECTORS + o.sector[rows[beside]])
-        share.append(o.beside_share[rows[beside], which])
+    elsewhere, which = np.nonzero(o.other[rows] >= 0)
+    if len(elsewhere):
+        at.append(rows[elsewhere])
+        keys.append(o.other[rows[elsewhere], which] * grid.SECTORS + o.sector[rows[elsewhere]])
+        share.append(o.other_share[rows[elsewhere], which])
     whole = np.concatenate(at)
     order = np.argsort(o.time[whole], kind="stable") if len(at) > 1 else slice(None)
     return whole[order], np.concatenate(keys)[order], np.concatenate(share)[order].astype(np.float32)
@@ -266,7 +234,8 @@ def _recent(reports: Reports, oldest: int) -> Reports:
 
 
 @compiled
-def _beliefs(belief: PackedArray, cells: Records, weather: Weather, slots: IntArray, now: int) -> FloatArray:
+def _beliefs(live: Rows, weather: Weather, slots: IntArray, now: int) -> FloatArray:
+    belief, cells = live.belief, live.cells
     scratch = np.empty((3, SCRATCH))
     p = scratch[P]
     out = np.empty((len(slots), belief.shape[1]))

@@ -18,28 +18,28 @@ from numpy.typing import NDArray
 
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.normal import log_distribution
-from fleet_service.fusion.shape import Told, unshaped
+from fleet_service.fusion.shape import Evidence, unshaped
 from schemas import mugrid
 from schemas.numeric import BoolArray, ByteArray, FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import Z_95
 
 
-def evidence(columns: Mapping[str, NDArray[Any]], told: BoolArray) -> Told:
-    """Log-likelihood of each visit in steps of 1/16 nat below its maximum, (n, 32), and the values as they were told.
+def evidence(columns: Mapping[str, NDArray[Any]], has_likelihood: BoolArray) -> Evidence:
+    """Log-likelihood of each visit in steps of 1/16 nat below its maximum, (n, 32), and the values as reported.
 
     Args:
         columns: `log_likelihood` (n, 32); `mu`, `mu_lower`, `mu_upper`, `mu_utilised`, each (n,), NaN where absent.
-        told: (n,) whether the sender gave a likelihood.
+        has_likelihood: (n,) whether the sender gave a likelihood.
 
     A likelihood that falls towards the upper end is a value, any other a bound; see `shape.unshaped` and `levelled`.
     A posterior counts as a value where `mu_utilised ≥ 0.6·mu`; otherwise, and where there is no `mu`, only "at least
     mu_utilised" remains. A visit with none of them is flat.
     """
     sent = columns["log_likelihood"]
-    taken, said = unshaped(sent, columns["mu_utilised"])
-    out = levelled(taken, columns["mu_utilised"])
-    rest = np.flatnonzero(~told)
+    steps, reported = unshaped(sent, columns["mu_utilised"])
+    out = levelled(steps, columns["mu_utilised"])
+    rest = np.flatnonzero(~has_likelihood)
     if len(rest):
         mu, lower, upper, used = (
             columns[n][rest].astype(np.float64) for n in ("mu", "mu_lower", "mu_upper", "mu_utilised")
@@ -47,7 +47,7 @@ def evidence(columns: Mapping[str, NDArray[Any]], told: BoolArray) -> Told:
         value = used >= c.VALUE_UTILISATION * mu  # False where either is NaN
         log_likelihood = np.where(value[:, None], posterior(mu, lower, upper), at_least(used))
         out[rest] = mugrid.encode_log_likelihood(log_likelihood)
-    return Told(out, said)
+    return Evidence(out, reported)
 
 
 def levelled(steps: ByteArray, used: NDArray[Any]) -> ByteArray:

@@ -1,20 +1,20 @@
 """What a vehicle that left grip unused takes the road for. Compiled, pure.
 
 Far from the limit the grip is read from how much the tyre's curve has bent, and so from the shape that the sender
-assumes. If the shape is wrong, so is the reading, in the same direction for every vehicle that did the same; and since
-only readings that came out low look like values, what is told errs low. So a likelihood is held against each road with
-the error that a vehicle would make *there*, having used the share s = u/μ of it:
+assumes. If the shape is wrong, so is the reading, in the same direction for every vehicle that did the same. Only
+readings that came out low look like values, so that what is reported errs low. So a likelihood is compared with each
+road under the error that a vehicle would make *there*, having used the share s = u/μ of it:
 
     L'(μ_i) = Σ_j S_ij·L(μ_j),    S_ij ∝ exp(-½·((μ_j - μ_i)/(μ_i·σ(s_i)))²),    rows sum to 1
     σ(s) = clip(SHAPE_SLOPE·(SHAPE_SHARE - s), 0, SHAPE_MOST)
 
 Near the limit of a road nothing changes; a road of which little was used is hardly contradicted. That is for the belief
-about the road. Whether vehicles agree, and whether one says something new, is judged by what was told: there the error
-is the same on both sides.
+about the road. Whether vehicles agree, and whether one reports something new, is judged by what was reported: there the
+error is the same on both sides.
 
 Legend
     u    grip used                                                  (n,)
-    L    likelihood of a visit as it was told, L' as it is taken    (n, 32)
+    L    likelihood of a visit as reported, L' as it is used        (n, 32)
     σ    relative standard deviation of the reading                 [-]
 """
 
@@ -59,25 +59,25 @@ _LN_2: Final = np.float32(math.log(2.0))
 _MANTISSA, _ONE = np.int32(0x007FFFFF), np.int32(0x3F800000)  # bits of a number of single precision: 2^e·(1 + x)
 
 
-class Told(NamedTuple):
-    """Likelihoods as they are taken (n, 32) in steps, and the values as they were told (n, 3): mean, standard deviation
-    and P(slippery) against the uniform prior; NaN where nothing was taken from them."""
+class Evidence(NamedTuple):
+    """Likelihoods as they are used (n, 32) in steps, and values as they were reported (n, 3): mean, standard deviation
+    and P(slippery) against the uniform prior; NaN where the likelihood is used as it was reported."""
 
-    taken: ByteArray
-    said: Float32Array
+    steps: ByteArray
+    reported: Float32Array
 
 
-def unshaped(steps: ByteArray, used: NDArray[Any]) -> Told:
+def unshaped(steps: ByteArray, used: NDArray[Any]) -> Evidence:
     """Likelihoods (n, 32) in steps, brought to maximum 0, after visits that used `used` (n,) of the grip, without what
     rests on the tyre's shape alone. Bounds stay as they are, and so does everything where `used` is NaN."""
-    taken, said = steps.copy(), np.full((len(steps), 3), np.nan, np.float32)
-    _unshape(taken, np.asarray(used, np.float64), said)
-    return Told(taken, said)
+    out, reported = steps.copy(), np.full((len(steps), 3), np.nan, np.float32)
+    _unshape(out, np.asarray(used, np.float64), reported)
+    return Evidence(out, reported)
 
 
 @compiled
-def _unshape(steps: ByteArray, used: FloatArray, said: Float32Array) -> None:
-    told, taken = np.empty(mugrid.BINS, np.float32), np.empty(mugrid.BINS, np.float32)
+def _unshape(steps: ByteArray, used: FloatArray, reported: Float32Array) -> None:
+    before, after = np.empty(mugrid.BINS, np.float32), np.empty(mugrid.BINS, np.float32)
     for n in range(len(steps)):
         least = np.uint8(255)
         for j in range(mugrid.BINS):
@@ -88,16 +88,16 @@ def _unshape(steps: ByteArray, used: FloatArray, said: Float32Array) -> None:
             continue
         kernel = _KERNELS[min(max(int(used[n] / _USED_STEP + 0.5), 0), len(_KERNELS) - 1)]
         for j in range(mugrid.BINS):
-            told[j] = _LIKELIHOOD[steps[n, j]]
-        _say(told, said[n])
+            before[j] = _LIKELIHOOD[steps[n, j]]
+        _summarise(before, reported[n])
         for i in range(mugrid.BINS):
-            taken[i] = 0.0
+            after[i] = 0.0
         for j in range(mugrid.BINS):
             for i in range(mugrid.BINS):
-                taken[i] += kernel[j, i] * told[j]
-        most = largest(taken)
+                after[i] += kernel[j, i] * before[j]
+        most = largest(after)
         for i in range(mugrid.BINS):
-            below = _STEPS * _ln(most / max(taken[i], _LEAST)) + np.float32(0.5)
+            below = _STEPS * _ln(most / max(after[i], _LEAST)) + np.float32(0.5)
             steps[n, i] = np.uint8(min(below, _FLOOR))
 
 
@@ -113,16 +113,16 @@ def _ln(x: np.float32) -> np.float32:
 
 
 @compiled
-def _say(told: Float32Array, said: Float32Array) -> None:
+def _summarise(likelihood: Float32Array, reported: Float32Array) -> None:
     """Mean, standard deviation with the vehicle's own error, and P(slippery) of a likelihood."""
     whole, first, second, slippery = 0.0, 0.0, 0.0, 0.0
     for i in range(mugrid.BINS):
-        whole += told[i]
-        first += told[i] * mugrid.CENTRES[i]
-        slippery += told[i] * SLIPPERY_SHARE[i]
+        whole += likelihood[i]
+        first += likelihood[i] * mugrid.CENTRES[i]
+        slippery += likelihood[i] * SLIPPERY_SHARE[i]
     mean = first / whole
     for i in range(mugrid.BINS):
-        second += told[i] * (mugrid.CENTRES[i] - mean) ** 2
-    said[0] = mean
-    said[1] = math.sqrt(second / whole + (c.BIAS_RELATIVE * mean) ** 2 + c.BIAS_ABSOLUTE**2)
-    said[2] = slippery / whole
+        second += likelihood[i] * (mugrid.CENTRES[i] - mean) ** 2
+    reported[0] = mean
+    reported[1] = math.sqrt(second / whole + (c.BIAS_RELATIVE * mean) ** 2 + c.BIAS_ABSOLUTE**2)
+    reported[2] = slippery / whole

@@ -27,7 +27,7 @@ _EARTH_M: Final = 2.0 * math.pi * EARTH_RADIUS_M  # circumference at the equator
 _STEPS: Final = np.array([k for k in range(-c.SPREAD_CELLS, c.SPREAD_CELLS + 1) if k])
 
 
-def places(
+def other_cells(
     cell: IntArray, latitude: FloatArray, yaw: FloatArray, position_std: FloatArray
 ) -> tuple[IntArray, Float32Array]:  # fmt: skip
     """Other cells of visits (n,), and the probability that the vehicle was there instead, both (n, 2·SPREAD_CELLS).

@@ -19,53 +19,49 @@ import math
 import numpy as np
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.cells import NOBODY, SECOND, Records
-from fleet_service.fusion.pools import PEER
+from fleet_service.fusion.store.records import NOBODY, SECOND
 from schemas.numeric import BoolArray, Float32Array, FloatArray
 from schemas.runtime.jit import refcount_free
-
-
-def no_peers(vehicles: int) -> Records:
-    """Nobody met."""
-    peers = np.zeros(vehicles, PEER)
-    peers["other"] = NOBODY
-    return peers
+from schemas.runtime.records import RecordArray
 
 
 @refcount_free
-def meet(voices: Records, voice: int, peers: Records, names: Records, entries: Records, entry: int) -> None:
-    """Let a value meet those that others gave here lately, and take the place of its vehicle's own, or the oldest.
+def compare(
+    reporters: RecordArray, row: int, peers: RecordArray, names: RecordArray, entries: RecordArray, entry: int
+) -> None:  # fmt: skip
+    """Compare a value with those that others gave here lately; it takes the place of its vehicle's own, or the oldest.
 
-    `names` (V,) are the vehicles' numbers, by index. Who was more probably elsewhere meets nobody.
+    `names` (V,) are the vehicles' numbers, by index. Who was more probably elsewhere is compared with nobody.
     """
+    here = reporters[row]
     if entries[entry].share < c.HERE_SHARE:
         return
     vehicle, now = int(entries[entry].vehicle), entries[entry].time // SECOND
     mean, std = float(entries[entry].mean), float(entries[entry].std)
-    speaker, spoke = voices[voice].speaker, voices[voice].spoke
+    reporter, reported = here.reporter, here.time
     place = 0
-    for k in range(c.SPEAKERS):
-        if speaker[k] == vehicle:
+    for k in range(c.REPORTERS):
+        if reporter[k] == vehicle:
             place = k
             break
-        if spoke[k] < spoke[place]:
+        if reported[k] < reported[place]:
             place = k
-    for k in range(c.SPEAKERS):
-        other = int(speaker[k])
-        if other == NOBODY or other == vehicle or now - spoke[k] > c.PEER_S:  # noqa: SIM109 not known to the compiler
+    for k in range(c.REPORTERS):
+        other = int(reporter[k])
+        if other == NOBODY or other == vehicle or now - reported[k] > c.PEER_S:  # noqa: SIM109 not known to the compiler
             continue
-        spread = math.hypot(std, float(voices[voice].std[k]))
+        spread = math.hypot(std, float(here.std[k]))
         if spread > c.PEER_STD:
             continue
-        deviations = abs(mean - voices[voice].mean[k]) / spread
+        deviations = abs(mean - here.mean[k]) / spread
         agreement = (c.PEERS_DISAGREE - deviations) / (c.PEERS_DISAGREE - c.PEERS_AGREE)
         agreement = min(max(agreement, 0.0), 1.0)
         _note(peers, vehicle, other, _rank(names[vehicle].key, names[other].key), agreement)
         _note(peers, other, vehicle, _rank(names[other].key, names[vehicle].key), agreement)
-    speaker[place] = vehicle
-    spoke[place] = now
-    voices[voice].mean[place] = mean
-    voices[voice].std[place] = std
+    reporter[place] = vehicle
+    reported[place] = now
+    here.mean[place] = mean
+    here.std[place] = std
 
 
 @refcount_free
@@ -73,7 +69,7 @@ def _rank(vehicle: int, other: int) -> int:
     """A fixed random number of a pair, by their own numbers and not by the order in which they came.
 
     Of all that share a place the lowest stays, so that a rare companion is as likely to be kept as a frequent one; or
-    those that talk most would crowd out the others.
+    those that report most would displace the others.
     """
     mixed = np.uint64(vehicle) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(other) * np.uint64(0xBF58476D1CE4E5B9)
     mixed = (mixed ^ (mixed >> np.uint64(29))) * np.uint64(0x94D049BB133111EB)
@@ -81,7 +77,7 @@ def _rank(vehicle: int, other: int) -> int:
 
 
 @refcount_free
-def _note(peers: Records, vehicle: int, other: int, rank: int, agreement: float) -> None:
+def _note(peers: RecordArray, vehicle: int, other: int, rank: int, agreement: float) -> None:
     place = rank % c.PEERS
     known = peers[vehicle].other[place]
     if known != other:
@@ -98,7 +94,7 @@ def _note(peers: Records, vehicle: int, other: int, rank: int, agreement: float)
         peers[vehicle].met[place] *= 0.5
 
 
-def trusted(peers: Records, before: Float32Array) -> tuple[Float32Array, bool]:
+def trusted(peers: RecordArray, before: Float32Array) -> tuple[Float32Array, bool]:
     """Trust of each vehicle, (V,), from whom it met and their trust `before`, (V,); whether the service is established.
 
     In an established one, who has met few that are trusted is a newcomer.
@@ -112,14 +108,14 @@ def trusted(peers: Records, before: Float32Array) -> tuple[Float32Array, bool]:
     mean = (c.TRUST_PRIOR * c.TRUST_PRIOR_PEERS + (weight * agreement).sum(axis=1)) / (c.TRUST_PRIOR_PEERS + heard)
     trust = _scaled(mean)
     known: BoolArray = heard >= c.ESTABLISHED_PEERS
-    established = int((known & (trust >= c.WITNESS_TRUST)).sum()) >= c.ESTABLISHED_VEHICLES
+    established = int((known & (trust >= c.SOURCE_TRUST)).sum()) >= c.ESTABLISHED_VEHICLES
     if established:
         trust = np.where(known, trust, np.minimum(trust, c.NEWCOMER))
     return trust.astype(np.float32), established
 
 
 def newcomer(established: bool) -> float:
-    """Weight of a vehicle that met nobody yet."""
+    """Weight of a vehicle that was compared with nobody yet."""
     weight = float(_scaled(np.array([c.TRUST_PRIOR]))[0])
     return min(weight, c.NEWCOMER) if established else weight
 

@@ -1,4 +1,4 @@
-"""One vote: how much of it is new, and how it is folded into a row of cells. Compiled."""
+"""One vote: how much of it is new, and how it updates a row of cells. Compiled."""
 
 from __future__ import annotations
 
@@ -13,56 +13,55 @@ from fleet_service.fusion.belief import (
     REACH,
     VALUE,
     Bins,
-    PackedArray,
+    convolve_bias,
     describe,
-    doubt,
+    ensure_change,
     forget,
     kind_of,
     mean_of,
     mix,
     pack,
-    spread,
     unpack,
     vote,
 )  # fmt: skip
-from fleet_service.fusion.cells import NONE, SECOND, Records
-from fleet_service.fusion.pairs import returning
-from fleet_service.fusion.pools import FINE, GRIP, ICE, WITNESSES
+from fleet_service.fusion.store.pairs import returning
+from fleet_service.fusion.store.records import FINE, GRIP, ICE, NONE, SECOND, SOURCES, Rows
 from fleet_service.fusion.weather import Weather, aged
 from schemas import mugrid
 from schemas.numeric import Float32Array
 from schemas.runtime.jit import refcount_free, refcount_free_inlined
+from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS
 
-# Rows of scratch, (3, SCRATCH) single precision: the belief, what `forget` and `spread` need, and the likelihood.
+# Rows of scratch, (3, SCRATCH) single precision: the belief, padding for `forget` and `convolve_bias`, the likelihood.
 P, PADDED, LIKELIHOOD = 0, 1, 2
 SCRATCH: Final = mugrid.BINS + 2 * REACH
 _HOUR: Final = 3600
-_GRIP_MEAN: Final = 0.5 * (c.WITNESS_USED + mugrid.UPPER)  # of "at least u" against the uniform prior
-_NO_WITNESS: Final = 0.5  # P(slippery) that is neither ice nor grip
+_GRIP_MEAN: Final = 0.5 * (c.SOURCE_USED + mugrid.UPPER)  # of "at least u" against the uniform prior
+_NEITHER: Final = 0.5  # P(slippery) that is neither ice nor grip
 _FORGOTTEN: Final = int(c.FORGOTTEN_S)
 
 
 @refcount_free_inlined
-def voice_of(entries: Records, entry: int, said: Float32Array, scratch: Bins) -> None:
+def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scratch: Bins) -> None:
     """Kind of an entry's vote, and what describes it; leaves its likelihood in the scratch.
 
-    What was `said` (3,) is a value, and described as it was said, whatever of it was taken.
+    What was `reported` (3,) is a value, and described as it was reported, whatever of it is used.
     """
     evidence, likelihood = entries[entry].evidence, scratch[LIKELIHOOD]
-    known = not math.isnan(said[0])
+    known = not math.isnan(reported[0])
     kind = VALUE if known else kind_of(evidence)
     _clear(scratch)
-    spread(evidence, kind, scratch[PADDED], likelihood)
+    convolve_bias(evidence, kind, scratch[PADDED], likelihood)
     entries[entry].kind = kind
     if known:
-        entries[entry].mean = said[0]
-        entries[entry].std = max(said[1], np.float32(c.NOVELTY_STD))
-        entries[entry].slippery = said[2]
+        entries[entry].mean = reported[0]
+        entries[entry].std = max(reported[1], np.float32(c.NOVELTY_STD))
+        entries[entry].slippery = reported[2]
         return
     mean = mean_of(likelihood)
     entries[entry].mean = mean
-    entries[entry].slippery = 0.0 if mean >= _GRIP_MEAN else _NO_WITNESS
+    entries[entry].slippery = 0.0 if mean >= _GRIP_MEAN else _NEITHER
     if kind == VALUE:
         std, slippery = describe(likelihood, mean)
         entries[entry].std = max(std, c.NOVELTY_STD)
@@ -70,10 +69,10 @@ def voice_of(entries: Records, entry: int, said: Float32Array, scratch: Bins) ->
 
 
 @refcount_free
-def respread(entries: Records, entry: int, scratch: Bins) -> None:
+def load_likelihood(entries: RecordArray, entry: int, scratch: Bins) -> None:
     """The likelihood of an entry into the scratch again."""
     _clear(scratch)
-    spread(entries[entry].evidence, int(entries[entry].kind), scratch[PADDED], scratch[LIKELIHOOD])
+    convolve_bias(entries[entry].evidence, int(entries[entry].kind), scratch[PADDED], scratch[LIKELIHOOD])
 
 
 @refcount_free_inlined
@@ -84,8 +83,8 @@ def _clear(scratch: Bins) -> None:
 
 
 @refcount_free_inlined
-def recall(entries: Records, pairs: Records, entry: int) -> None:
-    """How much of a vote is new, from what its vehicle said here before: in the window, or before the checkpoint.
+def discount(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
+    """How much of a vote is new, from what its vehicle reported here before: in the window, or before the checkpoint.
 
     Times are whole seconds from either, so that it does not matter which.
     """
@@ -147,11 +146,11 @@ def _novelty(kind: int, mean: float, std: float, new_mean: float, new_std: float
 
 
 @refcount_free
-def fold(
-    belief: PackedArray, cells: Records, row: int, voices: Records, voice: int, entries: Records, entry: int,
-    weather: Weather, scratch: Bins,
+def update(
+    rows: Rows, row: int, sources: int, entries: RecordArray, entry: int, weather: Weather, scratch: Bins
 ) -> None:  # fmt: skip
-    """Fold one entry, whose likelihood is in the scratch, onto a row of cells; `voice` is its row of witnesses."""
+    """Update a row of cells by one entry, whose likelihood is in the scratch; `sources` is where its sources lie."""
+    belief, cells = rows.belief, rows.cells
     time, kind = entries[entry].time, int(entries[entry].kind)
     key, p, seconds, passed = cells[row].key, scratch[P], 0.0, 0.0
     unpack(belief, row, p)
@@ -171,32 +170,32 @@ def fold(
         forget(p, drift, change, weather.prior[prior], scratch[PADDED])
         cells[row].aged = 0.0
     weight = float(entries[entry].weight)
-    if 0.0 < weight < c.WITNESS_TRUST or cells[row].crowd[0] + cells[row].crowd[1] > 0.0:
-        weight = _crowded(cells, row, kind, float(entries[entry].power), weight, passed)
+    if 0.0 < weight < c.SOURCE_TRUST or cells[row].untrusted[0] + cells[row].untrusted[1] > 0.0:
+        weight = _untrusted_weight(cells, row, kind, float(entries[entry].power), weight, passed)
     strength = weight * entries[entry].power * entries[entry].share
     if kind == VALUE and not new:
-        doubt(p, change, strength, weather.prior[prior])
+        ensure_change(p, change, strength, weather.prior[prior])
     vote(p, scratch[LIKELIHOOD], (1.0 - c.CONTAMINATION) * strength)
     pack(p, belief, row)
     cells[row].time = time
     _count(cells, row, entries, entry)
     if kind == VALUE:
         cells[row].values += np.float32(strength)
-    if weight * entries[entry].share >= c.WITNESS_TRUST:
-        if entries[entry].slippery >= c.WITNESS_SHARE:
-            _witness(voices, voice, ICE, entries[entry].vehicle, time)
-        elif entries[entry].slippery <= 1.0 - c.WITNESS_SHARE:
-            _witness(voices, voice, GRIP, entries[entry].vehicle, time)
+    if weight * entries[entry].share >= c.SOURCE_TRUST:
+        if entries[entry].slippery >= c.SOURCE_SHARE:
+            _note_source(rows.reporters, sources, ICE, entries[entry].vehicle, time)
+        elif entries[entry].slippery <= 1.0 - c.SOURCE_SHARE:
+            _note_source(rows.reporters, sources, GRIP, entries[entry].vehicle, time)
 
 
 @refcount_free_inlined
-def speaks(entries: Records, entry: int) -> bool:
-    """Whether a cell needs voices for an entry: it is a value, or bears witness."""
-    return bool(entries[entry].kind == VALUE or entries[entry].slippery <= 1.0 - c.WITNESS_SHARE)
+def needs_reporters(entries: RecordArray, entry: int) -> bool:
+    """Whether a cell needs reporters for an entry: it is a value, or a source of grip."""
+    return bool(entries[entry].kind == VALUE or entries[entry].slippery <= 1.0 - c.SOURCE_SHARE)
 
 
 @refcount_free_inlined
-def _count(cells: Records, row: int, entries: Records, entry: int) -> None:
+def _count(cells: RecordArray, row: int, entries: RecordArray, entry: int) -> None:
     """Visits and vehicles; who was probably elsewhere is not counted."""
     if entries[entry].share < c.HERE_SHARE:
         return
@@ -206,31 +205,31 @@ def _count(cells: Records, row: int, entries: Records, entry: int) -> None:
 
 
 @refcount_free_inlined
-def _crowded(cells: Records, row: int, kind: int, power: float, weight: float, passed: float) -> float:
+def _untrusted_weight(cells: RecordArray, row: int, kind: int, power: float, weight: float, passed: float) -> float:
     """Weight of a vote among others that are not trusted either: the k-th new one counts 1/k², all together 1.6 votes.
 
     So names cost nothing and bring nothing. A vehicle's repeated vote is discounted by its `power` already.
     """
     left = np.float32(math.exp(-max(passed, 0.0) / c.VOTE_RENEWAL_S))
-    cells[row].crowd[BOUND] *= left
-    cells[row].crowd[VALUE] *= left
-    if not 0.0 < weight < c.WITNESS_TRUST:
+    cells[row].untrusted[BOUND] *= left
+    cells[row].untrusted[VALUE] *= left
+    if not 0.0 < weight < c.SOURCE_TRUST:
         return weight
-    crowd = cells[row].crowd[kind]
-    cells[row].crowd[kind] = crowd + np.float32(power)
-    return weight / float((np.float32(1.0) + crowd) ** 2)
+    others = cells[row].untrusted[kind]
+    cells[row].untrusted[kind] = others + np.float32(power)
+    return weight / float((np.float32(1.0) + others) ** 2)
 
 
 @refcount_free
-def _witness(voices: Records, voice: int, side: int, vehicle: int, time: int) -> None:
-    """Note a witness: at its own place if it has one, else at that of the oldest."""
-    witness, witnessed = voices[voice].witness, voices[voice].witnessed
+def _note_source(reporters: RecordArray, row: int, side: int, vehicle: int, time: int) -> None:
+    """Note a corroborating source: at its own place if it has one, else at that of the oldest."""
+    source, source_time = reporters[row].source, reporters[row].source_time
     place = 0
-    for k in range(WITNESSES):
-        if witness[side, k] == vehicle:
+    for k in range(SOURCES):
+        if source[side, k] == vehicle:
             place = k
             break
-        if witnessed[side, k] < witnessed[side, place]:
+        if source_time[side, k] < source_time[side, place]:
             place = k
-    witness[side, place] = vehicle
-    witnessed[side, place] = time // SECOND
+    source[side, place] = vehicle
+    source_time[side, place] = time // SECOND

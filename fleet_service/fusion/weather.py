@@ -92,9 +92,9 @@ def rates(reports: Reports) -> FloatArray:
 
 def priors(reports: Reports) -> Float32Array:
     """Priors (n, 32), mixed with the uniform one."""
-    told = np.where(np.isnan(reports.prior), mugrid.PRIOR, reports.prior)
-    told = told / told.sum(axis=1, keepdims=True)
-    mixed: FloatArray = UNIFORM_SHARE * mugrid.PRIOR + (1.0 - UNIFORM_SHARE) * told
+    given = np.where(np.isnan(reports.prior), mugrid.PRIOR, reports.prior)
+    given = given / given.sum(axis=1, keepdims=True)
+    mixed: FloatArray = UNIFORM_SHARE * mugrid.PRIOR + (1.0 - UNIFORM_SHARE) * given
     return mixed.astype(np.float32)
 
 

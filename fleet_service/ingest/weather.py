@@ -2,7 +2,7 @@
 
     weather/NAME-TIME.parquet     reports as they came, with the time from which the map used them
 
-A report acts on observations of which none was folded yet (`acts_from`). It is durable before it acts, so that a replay
+A report acts on observations of which none was fused yet (`acts_from`). It is durable before it acts, so that a replay
 of the archive finds the weather that the map had, and gives the same map.
 """
 

@@ -7,13 +7,12 @@ from typing import Final
 import numpy as np
 from numpy.random import Generator
 
-from fleet_service.fusion import Fusion
+from fleet_service.fusion import Fusion, observations_of
 from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.lab import town
 from fleet_service.lab.agent import Errors
 from fleet_service.lab.drive import CELL, LATENESS_S, rows_of
 from fleet_service.lab.town import LENGTH, Town
-from fleet_service.replay.rebuild import observations
 from fleet_service.serve.alerts import CLEAR_BELOW, RAISE_ABOVE
 from schemas.numeric import FloatArray, IntArray
 
@@ -39,14 +38,14 @@ def delays(rng: Generator, before: float, after: float) -> IntArray:
     """
     place = changing(rng, before, after)
     visits = town.drive(rng, place, Errors.draw(rng, VEHICLES), MINUTES)
-    o = observations(rows_of(visits), visits.vehicle)
+    o = observations_of(rows_of(visits), visits.vehicle)
     here = (visits.place < LENGTH) & visits.excited & (visits.seconds >= 60.0 * CHANGE)
     passes, seen = np.zeros(LENGTH, np.int64), np.full(LENGTH, UNREACHED)
     fusion = Fusion(LATENESS_S)
     for part in np.split(np.arange(len(visits)), np.flatnonzero(here) + 1):
         if not len(part) or (seen < UNREACHED).all():
             continue
-        fusion.fold(o.take(part))
+        fusion.update(o.take(part))
         if here[part[-1]]:
             cell = visits.place[part[-1]]
             passes[cell] += 1

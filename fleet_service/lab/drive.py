@@ -13,10 +13,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.random import Generator
 
-from fleet_service.fusion import Fusion, Observations
+from fleet_service.fusion import Fusion, Observations, observations_of
 from fleet_service.ingest.dedup import Streams
 from fleet_service.lab.town import CELLS, START, Visits, cell_numbers
-from fleet_service.replay.rebuild import observations
 from fleet_service.serve.alerts import Alerts
 from schemas import grid, mugrid
 from schemas.numeric import BoolArray, FloatArray, IntArray
@@ -106,11 +105,11 @@ def watch(rng: Generator, v: Visits, count: int) -> Watched:
     at, which = at[kept], which[kept]
     fusion = Fusion(LATENESS_S)
     watched = Watched(fusion, Alerts(fusion))
-    o = observations(rows, v.vehicle).take(which)
+    o = observations_of(rows, v.vehicle).take(which)
     for minute, part in enumerate(minutes(o, at, count), 1):
         if len(part.time):
-            folded = fusion.fold(part)
-            watched.alerts.folded(folded.slots)
-            watched.late += int(folded.late.sum())
+            updated = fusion.update(part)
+            watched.alerts.updated(updated.slots)
+            watched.late += int(updated.late.sum())
         watched.snapshot(START + minute * 60 * NS)
     return watched

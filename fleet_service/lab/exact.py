@@ -10,13 +10,12 @@ import numpy as np
 from numpy.random import Generator
 
 from fleet_service.app.engine import Engine
-from fleet_service.fusion import Fusion
+from fleet_service.fusion import Fusion, observations_of
 from fleet_service.lab import agent, town
 from fleet_service.lab.agent import Errors
 from fleet_service.lab.drive import CELL, LATENESS_S, rows_of
 from fleet_service.lab.messages import clock_of, messages
 from fleet_service.lab.town import Visits
-from fleet_service.replay.rebuild import observations
 from schemas import mugrid
 from schemas.config import ServiceConfig
 from schemas.numeric import FloatArray
@@ -44,11 +43,11 @@ def drive(rng: Generator) -> Visits:
 def order(rng: Generator) -> float:
     """In order of time against any order within the lateness."""
     visits = drive(rng)
-    o = observations(rows_of(visits), visits.vehicle)
+    o = observations_of(rows_of(visits), visits.vehicle)
     straight, mixed = Fusion(LATENESS_S), Fusion(LATENESS_S)
-    straight.fold(o)
+    straight.update(o)
     arrival = np.argsort(visits.seconds + rng.uniform(0.0, 0.5 * LATENESS_S, len(visits)))
-    late = sum(int(mixed.fold(o.take(rows)).late.sum()) for rows in np.array_split(arrival, PARTS))
+    late = sum(int(mixed.update(o.take(rows)).late.sum()) for rows in np.array_split(arrival, PARTS))
     return 1.0 if late else difference(straight, mixed)
 
 
@@ -82,7 +81,7 @@ def upper_shift(rng: Generator) -> float:
             road: FloatArray = np.full(n, mu)
             told = agent.tell(rng, Errors.draw(rng, vehicles), who, road, 0.0 * road, shares, agent.noise(rng, along))
             fusion = Fusion(LATENESS_S)
-            fusion.fold(observations(rows_of(Visits(seconds, who, along, road, along > 0, told)), who))
+            fusion.update(observations_of(rows_of(Visits(seconds, who, along, road, along > 0, told)), who))
             slot = fusion.slots_of(CELL[:1], np.zeros(1, np.int64))
             belief = fusion.beliefs(slot, int(fusion.live.time[slot[0]]))
             worst = max(worst, prior - float(mugrid.quantiles(belief, 0.95)[0]))

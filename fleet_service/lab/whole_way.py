@@ -15,10 +15,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_service.fusion import Fusion, Observations
+from fleet_service.fusion import Fusion, Observations, observations_of
 from fleet_service.lab.drive import LATENESS_S
 from fleet_service.lab.score import Scores, of_beliefs, safe
-from fleet_service.replay.rebuild import observations
 from fleet_service.serve.map_state import LOWER, UPPER, measured
 from schemas import grid, mugrid, wire
 from schemas.errors import InputError
@@ -51,7 +50,7 @@ def measure(drive: Drive, folder: Path) -> dict[str, float]:
     columns = read(folder / "whole_way" / OBSERVATIONS)
     visits = pq.read_table(folder / "whole_way" / TRUTH)
     fusion = Fusion(LATENESS_S)
-    fusion.fold(observations_of(columns))
+    fusion.update(observations_in(columns))
     slots, truth = joined(fusion, visits)
     several = fusion.live.vehicles[slots] >= SEVERAL
     slots, truth = slots[several], truth[several]
@@ -98,7 +97,7 @@ def read(path: Path) -> dict[str, Any]:
     return out | {"vehicle": table["vehicle"].to_numpy()}
 
 
-def observations_of(columns: dict[str, Any]) -> Observations:
+def observations_in(columns: dict[str, Any]) -> Observations:
     """As the service would take them, each row a batch of its own."""
     n = len(columns["cell"])
     told = np.full(n, columns["log_likelihood"].shape[1] > 0)
@@ -106,7 +105,7 @@ def observations_of(columns: dict[str, Any]) -> Observations:
         "boot": columns["vehicle"] + 1, "region": grid.region_of(columns["cell"]), "seq": np.arange(1, n + 1),
         "row": np.zeros(n, np.int32), "told": told,
     }  # fmt: skip
-    return observations(columns | identity, columns["vehicle"])
+    return observations_of(columns | identity, columns["vehicle"])
 
 
 def joined(fusion: Fusion, visits: pa.Table) -> tuple[IntArray, FloatArray]:

@@ -16,11 +16,9 @@ from numpy.typing import NDArray
 from fleet_service.archive import layout, reading, segments
 from fleet_service.archive.load import Damaged, pass_over
 from fleet_service.archive.pseudonyms import number
-from fleet_service.fusion import Folded, Fusion, Observations, evidence
+from fleet_service.fusion import Fusion, Updated, observations_of
 from fleet_service.fusion.constants import EPOCH_NS
-from fleet_service.fusion.space import places
 from fleet_service.ingest.dedup import Streams
-from schemas import grid
 from schemas.numeric import IntArray
 from schemas.tables import US, US_STEP
 from schemas.wire import Kind
@@ -32,7 +30,6 @@ COLUMNS: Final = [
     *("mu_utilised", "log_likelihood", *IDENTITY, "row", "received_at", "late", "weight"),
 ]  # of what the fusion takes
 MARGIN_DEG: Final = 0.002  # around a box: over 100 m, more than a visit's position error moves what it tells
-ROWS_PER_SEQ: Final = 64  # more than a batch has rows: seq and row become one number that keeps their order
 
 
 def restore_streams(root: Path, streams: Streams, damaged: Damaged = pass_over) -> int:
@@ -52,21 +49,6 @@ def restore_streams(root: Path, streams: Streams, damaged: Damaged = pass_over) 
 def _numbers(pseudonyms: NDArray[np.str_]) -> IntArray:
     distinct, index = np.unique(pseudonyms, return_inverse=True)
     return np.array([number(p) for p in distinct.tolist()], np.int64)[index]
-
-
-def observations(rows: segments.Rows, vehicle: IntArray) -> Observations:
-    """Columns of the archive as the fusion takes them; `vehicle` (n,) are the numbers of the pseudonyms.
-
-    Times are those that the archive keeps, in whole microseconds.
-    """
-    _, second = grid.sectors_touched(np.nan_to_num(rows["yaw"]))
-    first = rows["sector"].astype(np.int8)
-    beside = np.where(np.isnan(rows["yaw"]) | (second == first), -1, second).astype(np.int8)
-    return Observations(
-        rows["leave_time"] // US_STEP * US_STEP, rows["cell"], first, beside, vehicle, rows["boot"], rows["region"],
-        rows["seq"] * ROWS_PER_SEQ + rows["row"], *evidence(rows, rows["told"]),
-        *places(rows["cell"], rows["latitude"], rows["yaw"], rows["position_std"]),
-    )  # fmt: skip
 
 
 class Since(NamedTuple):
@@ -104,8 +86,8 @@ def replay(
     fusion: Fusion,
     since: Since = Since(),  # noqa: B008 immutable
     damaged: Damaged = pass_over,
-) -> Iterator[Folded]:
-    """Fold the archive into `fusion` in order of time, with the weights that were used; yields once per epoch.
+) -> Iterator[Updated]:
+    """Replay the archive into `fusion` in order of time, with the weights that were used; yields once per epoch.
 
     Args:
         root: of the archive.
@@ -119,8 +101,8 @@ def replay(
         return
     table = pa.concat_tables(tables)
     rows = segments.rows_of(table.sort_by("leave_time"))
-    o = observations(rows, _numbers(rows["vehicle"].astype(str)))
+    o = observations_of(rows, _numbers(rows["vehicle"].astype(str)))
     borders = np.flatnonzero(np.diff(o.time // EPOCH_NS)) + 1
     for part in np.split(np.arange(len(o.time)), borders):
         if len(part):
-            yield fusion.fold(o.take(part), rows["weight"][part], rows["late"][part].astype(bool))
+            yield fusion.update(o.take(part), rows["weight"][part], rows["late"][part].astype(bool))

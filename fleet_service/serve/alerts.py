@@ -9,7 +9,7 @@ import numpy as np
 
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.belief import SLIPPERY_SHARE, common_kernel
-from fleet_service.fusion.pools import GRIP, ICE, WITNESSES
+from fleet_service.fusion.store.records import GRIP, ICE, SOURCES
 from schemas import grid, mugrid
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.thresholds import NS, SLIPPERY_MU
@@ -19,8 +19,8 @@ RAISE_ABOVE: Final = 0.9  # P(slippery)
 # Grip must be as sure as ice was: clearing too early is the dearer error, and a few liars can lower P for a while.
 CLEAR_BELOW: Final = 0.05
 FADE_BELOW: Final = 0.5  # ... but when nobody confirms it, it ends as soon as it is less likely than not
-LEAST_WITNESSES: Final = 2  # distinct vehicles that said so themselves: one liar, or one bad sensor, moves nothing
-WITNESS_NS: Final = 3600 * NS  # ... within the hour; older ice belongs to an older road
+LEAST_SOURCES: Final = 2  # distinct vehicles that reported it themselves: one liar, or one bad sensor, moves nothing
+SOURCE_NS: Final = 3600 * NS  # ... within the hour; older ice belongs to an older road
 # Of a belief about what the fleet takes the road for: how much of the road it stands for is slippery, and is at all.
 _SLIPPERY_AND_WHOLE: Final = common_kernel().T @ np.stack([SLIPPERY_SHARE, np.ones_like(SLIPPERY_SHARE)], axis=1)
 
@@ -53,14 +53,14 @@ class Alerts:
         )
         self._standing |= {slot: alert for slot, alert in zip(slots.tolist(), standing, strict=True) if slot >= 0}
 
-    def folded(self, slots: IntArray) -> list[Alert]:
-        """Alerts that the cells just folded into raise or clear."""
+    def updated(self, slots: IntArray) -> list[Alert]:
+        """Alerts that the cells just updated raise or clear."""
         time, slippery = self._fusion.live.time[slots], self._slippery(slots)
         standing = np.isin(slots, np.fromiter(self._standing, np.int64, len(self._standing)))
         out = []
         for k in np.flatnonzero((slippery > RAISE_ABOVE) & ~standing).tolist():
             slot, when = int(slots[k]), int(time[k])
-            if self._spoken(slots[k : k + 1], ICE, GRIP, when)[0]:
+            if self._corroborated(slots[k : k + 1], ICE, GRIP, when)[0]:
                 self._standing[slot] = self._alert(
                     slot, when, True, f"P(mu < {SLIPPERY_MU}) = {slippery[k]:.2f} > {RAISE_ABOVE}"
                 )
@@ -69,7 +69,7 @@ class Alerts:
         return out + [
             self._clear(int(slots[k]), int(time[k]), "later visits found grip")
             for k in gripping
-            if self._spoken(slots[k : k + 1], GRIP, ICE, int(time[k]))[0]
+            if self._corroborated(slots[k : k + 1], GRIP, ICE, int(time[k]))[0]
         ]
 
     def _slippery(self, slots: IntArray) -> FloatArray:
@@ -77,20 +77,20 @@ class Alerts:
         slippery, whole = (self._fusion.live.belief[slots].astype(np.float64) @ _SLIPPERY_AND_WHOLE).T
         return np.asarray(slippery / whole)
 
-    def _spoken(self, slots: IntArray, side: int, other: int, time: int) -> BoolArray:
-        """Whether enough witnesses of one side spoke: as many as of the other within the hour, within limits.
+    def _corroborated(self, slots: IntArray, side: int, other: int, time: int) -> BoolArray:
+        """Whether one side has enough corroborating sources: as many as the other within the hour, within limits.
 
         Grip must have been found after the last ice.
         """
-        hour = time - WITNESS_NS
-        against, last = self._fusion.witnesses(slots, other, hour)
-        spoken, _ = self._fusion.witnesses(slots, side, np.maximum(last, hour) if side == GRIP else hour)
-        return spoken >= np.clip(against, LEAST_WITNESSES, WITNESSES)
+        hour = time - SOURCE_NS
+        against, last = self._fusion.sources(slots, other, hour)
+        found, _ = self._fusion.sources(slots, side, np.maximum(last, hour) if side == GRIP else hour)
+        return found >= np.clip(against, LEAST_SOURCES, SOURCES)
 
     def faded(self, now: int) -> list[Alert]:
-        """Alerts that time alone cleared until `now` [ns]: less likely than not, and no witness within the hour."""
+        """Alerts that time alone cleared until `now` [ns]: less likely than not, and no source within the hour."""
         slots = np.array(sorted(self._standing), np.int64)
-        forgotten = self._fusion.witnesses(slots, ICE, now - WITNESS_NS)[0] == 0
+        forgotten = self._fusion.sources(slots, ICE, now - SOURCE_NS)[0] == 0
         faded = (self._fusion.beliefs(slots, now) @ SLIPPERY_SHARE < FADE_BELOW) & forgotten
         reason = "no visit has confirmed it for too long"
         return [self._clear(int(slot), now, reason) for slot in slots[faded]]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.belief import SLIPPERY_SHARE
-from fleet_service.fusion.stores import distinct
+from fleet_service.fusion.store.store import distinct
 from schemas import grid, mugrid, tables
 from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray
 from schemas.thresholds import GRAVITY
@@ -45,7 +45,7 @@ class MapState:
         self.change = 0  # how often anything changed
 
     def changed(self, slots: IntArray) -> None:
-        """Note cells that were folded into."""
+        """Note cells that were updated."""
         self._index()
         self.change += 1
         tiles = distinct(tile_of(self.fusion, slots)).tolist()

@@ -1,6 +1,7 @@
 """Rows of named fields, as one NumPy array of a structured type: what a compiled kernel carries for each vehicle.
 
-A class with annotations says the fields: float, int, bool, another such class, or Annotated[FloatArray, size, ...].
+A class with annotations says the fields: float, int, bool, a NumPy number, another such class, or
+Annotated[FloatArray, size, ...] and likewise for arrays of the other numbers.
 `record_type` makes the type of it and `records` the array; a kernel sees a row as an object with these names.
 
 Why not a tuple of arrays: handing one to a kernel costs .1 to .3 us for each array in it, a record array as much as one
@@ -26,7 +27,16 @@ class Nothing:
     unused: bool
 
 
-KINDS: dict[Any, str] = {float: "f8", int: "i8", bool: "?", FloatArray: "f8", IntArray: "i8"}
+_NUMBERS = (np.int8, np.uint8, np.uint16, np.int32, np.uint32, np.uint64, np.float32)
+KINDS: dict[Any, Any] = {
+    float: "f8",
+    int: "i8",
+    bool: "?",
+    FloatArray: "f8",
+    IntArray: "i8",
+    **{number: number for number in _NUMBERS},
+    **{NDArray[number]: number for number in _NUMBERS},  # type: ignore[valid-type] # a value, not an annotation
+}
 
 
 class Records(Protocol[R_co]):

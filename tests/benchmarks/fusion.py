@@ -7,14 +7,19 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
+from numba import njit, types
+from numba.typed import Dict
 
 from fleet_service.fusion import Fusion, Observations
+from fleet_service.fusion.store.store import Store
 from schemas import grid, mugrid
+from schemas.numeric import IntArray
 from schemas.runtime.figures import Figure
 from schemas.runtime.process import trim_memory
-from tests.benchmarks.measure import ROUNDS, SEED
+from tests.benchmarks.measure import ROUNDS, SEED, paired
 
 BATCH = 5_000  # rows of a turn of the service under load
 VEHICLES = 5_000
@@ -43,9 +48,10 @@ def visits(rng: np.random.Generator, rows: int, cells: int, begin_s: float, seco
     bound = np.where(0.4 * mu > mugrid.CENTRES, -6.0, 0.0)
     evidence = mugrid.encode_log_likelihood(np.where((rng.random(rows) < EXCITED)[:, None], value, bound))
     return Observations(
-        time_ns, cell, np.zeros(rows, np.int8), np.full(rows, -1, np.int8), vehicle, vehicle + 1, grid.region_of(cell),
-        np.arange(rows), evidence, np.full((rows, 3), np.nan, np.float32), np.full((rows, 1), -1),
-        np.zeros((rows, 1), np.float32),
+        time=time_ns, cell=cell, sector=np.zeros(rows, np.int8), second=np.full(rows, -1, np.int8),
+        vehicle=vehicle, boot=vehicle + 1, region=grid.region_of(cell), sequence=np.arange(rows),
+        evidence=evidence, reported=np.full((rows, 3), np.nan, np.float32),
+        other=np.full((rows, 1), -1), other_share=np.zeros((rows, 1), np.float32),
     )  # fmt: skip
 
 
@@ -55,7 +61,7 @@ def filled(cells: int, per_cell: int, seconds: float) -> tuple[Fusion, np.random
     parts = max(cells * per_cell // 100_000, 1)
     for part in range(parts):
         for batch in batches(visits(rng, cells * per_cell // parts, cells, part * seconds / parts, seconds / parts)):
-            fusion.fold(batch)
+            fusion.update(batch)
     return fusion, rng
 
 
@@ -73,9 +79,43 @@ def per_observation_s(cells: int, per_s: int = 5_000) -> float:
         parts = list(batches(visits(rng, 60 * per_s, cells, 660.0 + 60.0 * minute, 60.0)))
         began = time.process_time()
         for part in parts:
-            fusion.fold(part)
+            fusion.update(part)
         spent.append((time.process_time() - began) / (60 * per_s))
     return statistics.median(spent[3:])
+
+
+def table_vs_dict() -> float:
+    """Time of a look-up in 10⁶ keys by numba's typed dictionary over that by the store's table, in turns of BATCH."""
+    keys = np.random.default_rng(SEED).permutation(CELLS) * grid.SECTORS
+    turns = np.random.default_rng(SEED + 1).choice(keys, (100, BATCH))
+    store, known = Store(), Dict.empty(types.int64, types.int64)
+    store.slots_for(keys)
+    _fill(known, keys)
+
+    def table() -> None:
+        for turn in turns:
+            store.slots_of(turn)
+
+    def dictionary() -> None:
+        for turn in turns:
+            _look_up(known, turn)
+
+    ours, other = paired(table, dictionary)
+    return other / ours
+
+
+@njit
+def _fill(known: Any, keys: IntArray) -> None:  # noqa: ANN401 numba's own type
+    for slot in range(len(keys)):
+        known[keys[slot]] = slot
+
+
+@njit
+def _look_up(known: Any, keys: IntArray) -> IntArray:  # noqa: ANN401 numba's own type
+    out = np.empty(len(keys), np.int64)
+    for i in range(len(keys)):
+        out[i] = known.get(keys[i], -1)
+    return out
 
 
 def resident() -> None:
@@ -98,6 +138,7 @@ def fusion() -> list[Figure]:
     megabytes, _ = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
     return [
         Figure("bench.fusion.per_s", 1.0 / many, "observations/s, settling included", 1_000_000, "more"),
+        Figure("bench.fusion.table_vs_dict", table_vs_dict(), "times the look-up of a typed dictionary", 1.5, "more"),
         Figure("bench.growth.cells_ratio", many / few, "cost in 10^6 cells over that in 10^4", 1.3),
         Figure("bench.state.resident_mb", float(megabytes), "MB, a service's process with 10^6 cells", 400),
     ]

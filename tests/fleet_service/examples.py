@@ -8,8 +8,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_service.fusion import Fusion, Observations, evidence
+from fleet_service.fusion import Fusion, Observations
 from fleet_service.fusion.belief import SLIPPERY_SHARE
+from fleet_service.fusion.likelihoods import evidence
 from schemas import grid, keys, mugrid, wire
 from schemas.numeric import FloatArray
 from schemas.wire import Batch, Kind
@@ -47,10 +48,11 @@ def observations(
     time = START + (np.asarray(seconds, float) * SECOND).astype(np.int64)
     vehicle = np.asarray(vehicles, np.int64)
     return Observations(
-        time, whole + np.asarray(cell, np.int64), np.zeros(n, np.int8), np.full(n, second, np.int8), vehicle,
-        vehicle * 7 + 1, whole + REGION, np.arange(n),
-        mugrid.encode_log_likelihood(log_likelihood), np.full((n, 3), np.nan, np.float32),
-        np.full((n, 4), -1), np.zeros((n, 4), np.float32),
+        time=time, cell=whole + np.asarray(cell, np.int64),
+        sector=np.zeros(n, np.int8), second=np.full(n, second, np.int8),
+        vehicle=vehicle, boot=vehicle * 7 + 1, region=whole + REGION, sequence=np.arange(n),
+        evidence=mugrid.encode_log_likelihood(log_likelihood), reported=np.full((n, 3), np.nan, np.float32),
+        other=np.full((n, 4), -1), other_share=np.zeros((n, 4), np.float32),
     )  # fmt: skip
 
 
@@ -59,7 +61,7 @@ def posterior_evidence(mu: float, lower: float, upper: float, used: float) -> Fl
     names = ("mu", "mu_lower", "mu_upper", "mu_utilised")
     columns: dict[str, NDArray[Any]] = dict(zip(names, (np.array([v]) for v in (mu, lower, upper, used)), strict=True))
     columns["log_likelihood"] = np.zeros((1, mugrid.BINS), np.uint8)
-    return np.asarray(mugrid.decode_log_likelihood(evidence(columns, np.array([False])).taken)[0])
+    return np.asarray(mugrid.decode_log_likelihood(evidence(columns, np.array([False])).steps)[0])
 
 
 def belief(fusion: Fusion, cell: int = CELL, sector: int = 0, now: int | None = None) -> FloatArray:

@@ -1,4 +1,4 @@
-"""`replay`: the map as of any moment, folded from the archive as the service folded it; or a day of it, in frames."""
+"""`replay`: the map as of any moment, replayed from the archive as the service fused it; or a day of it, in frames."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ def ask(engine: Engine, options: Options) -> pa.Table:
     """Cells of the map at `at`, or of each frame from the part's begin to its end; `frame` is its time."""
     at = options.at if options.at is not None else engine.part.until
     fusion = Fusion(options.lateness_s)
-    fusion.weather(archived(engine.root, received_until=max(at, engine.part.until) if options.step_s else at))
+    fusion.update_weather(archived(engine.root, received_until=max(at, engine.part.until) if options.step_s else at))
     if not options.step_s:
         rows = 0
-        for folded in replay(engine.root, fusion, Since(until=at, box=engine.part.bbox)):
-            rows += len(folded.late)
-            if rows // TOLD_ROWS > (rows - len(folded.late)) // TOLD_ROWS:
-                options.say(f"{rows:,} observations folded, {fusion.size:,} cells")
+        for updated in replay(engine.root, fusion, Since(until=at, box=engine.part.bbox)):
+            rows += len(updated.late)
+            if rows // TOLD_ROWS > (rows - len(updated.late)) // TOLD_ROWS:
+                options.say(f"{rows:,} observations replayed, {fusion.size:,} cells")
         return _frame(engine, fusion, at)
     step, due, frames = int(options.step_s * NS), engine.part.since, []
-    for folded in replay(engine.root, fusion, Since(until=engine.part.until, box=engine.part.bbox)):
-        now = int(fusion.live.time[folded.slots].max(initial=0))
+    for updated in replay(engine.root, fusion, Since(until=engine.part.until, box=engine.part.bbox)):
+        now = int(fusion.live.time[updated.slots].max(initial=0))
         while due + step <= now:
             due += step
             frames.append(_frame(engine, fusion, due))

@@ -24,7 +24,7 @@ def a_map(cells: int = 300) -> pa.Table:
     rng = np.random.default_rng(2)
     cell = CELL + rng.permutation(cells)
     fusion = Fusion(120.0)
-    fusion.fold(
+    fusion.update(
         observations(np.arange(cells), np.arange(cells) % 7, value(rng.uniform(0.2, 0.9, cells)), cell.tolist())
     )
     return cell_table(fusion, np.arange(fusion.size), START + 10**12)

@@ -16,8 +16,8 @@ def forget(p: np.ndarray, seconds: float) -> None:
     b.forget(p, seconds, seconds, b.PRIOR, np.empty(b.PADDED))
 
 
-def spread(evidence: np.ndarray, kind: int, vote: np.ndarray) -> None:
-    b.spread(evidence, kind, np.zeros(b.PADDED), vote)
+def convolve_bias(evidence: np.ndarray, kind: int, vote: np.ndarray) -> None:
+    b.convolve_bias(evidence, kind, np.zeros(b.PADDED), vote)
 
 
 def vote_for(p: np.ndarray, vote: np.ndarray, strength: float) -> None:
@@ -36,7 +36,7 @@ def test_a_belief_stays_a_probability_whatever_time_and_votes_do(
     p, vote = mugrid.PRIOR.copy(), np.empty(32)
     for _ in range(3):
         forget(p, seconds)
-        spread(evidence, b.kind_of(evidence), vote)
+        convolve_bias(evidence, b.kind_of(evidence), vote)
         vote_for(p, vote, (1.0 - contamination) * power)
     assert p.min() >= 0.0
     assert p.sum() == pytest.approx(1.0, abs=1e-6)
@@ -60,7 +60,7 @@ def test_time_keeps_a_rising_belief_rising(p: np.ndarray, seconds: float) -> Non
 def test_no_number_of_bounds_lowers_the_upper_end(evidence: np.ndarray, votes: int) -> None:
     p, vote = mugrid.PRIOR.copy(), np.empty(32)
     assert b.kind_of(evidence) == b.BOUND
-    spread(evidence, b.BOUND, vote)
+    convolve_bias(evidence, b.BOUND, vote)
     for _ in range(votes):
         vote_for(p, vote, 1.0 - c.CONTAMINATION)
         forget(p, 60.0)
@@ -116,7 +116,7 @@ def test_one_vote_moves_the_odds_by_a_bounded_factor() -> None:
     evidence = np.full(32, 255, np.uint8)
     evidence[4] = 0
     vote, p = np.empty(32), mugrid.PRIOR.copy()
-    spread(evidence, b.VALUE, vote)
+    convolve_bias(evidence, b.VALUE, vote)
     vote_for(p, vote, 1.0 - c.CONTAMINATION)
     assert p.max() / p.min() < 32 / c.CONTAMINATION
 
@@ -124,7 +124,7 @@ def test_one_vote_moves_the_odds_by_a_bounded_factor() -> None:
 def test_a_vote_of_no_weight_or_no_power_changes_nothing() -> None:
     evidence = np.arange(32, dtype=np.uint8) * 8
     vote = np.empty(32)
-    spread(evidence, b.VALUE, vote)
+    convolve_bias(evidence, b.VALUE, vote)
     for contamination, power in ((1.0, 1.0), (c.CONTAMINATION, 0.0)):
         p = np.linspace(1.0, 2.0, 32)
         p /= p.sum()

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_service.fusion import Folded, Fusion, Observations
+from fleet_service.fusion import Fusion, Observations, Updated
 from schemas import mugrid
 from schemas.numeric import IntArray
 from tests.fleet_service.examples import CELL, at_least, observations, value
@@ -33,9 +33,9 @@ def delayed(o: Observations, most_s: float, seed: int) -> IntArray:
     return np.argsort(o.time + (np.random.default_rng(seed).random(len(o.time)) * most_s * 1e9).astype(np.int64))
 
 
-def fold_in(o: Observations, order: IntArray, parts: int) -> tuple[Fusion, list[tuple[IntArray, Folded]]]:
+def fold_in(o: Observations, order: IntArray, parts: int) -> tuple[Fusion, list[tuple[IntArray, Updated]]]:
     fusion = Fusion(LATENESS_S)
-    told = [(rows, fusion.fold(o.take(rows))) for rows in np.array_split(order, parts)]
+    told = [(rows, fusion.update(o.take(rows))) for rows in np.array_split(order, parts)]
     return fusion, told
 
 
@@ -53,7 +53,7 @@ def test_any_order_within_the_window_gives_the_same_beliefs(seed: int, parts: in
     o = drive(seed, 400, 900.0)
     straight, _ = fold_in(o, np.arange(400), 400)
     mixed, told = fold_in(o, delayed(o, 110.0, seed), parts)
-    assert not any(folded.late.any() for _, folded in told)
+    assert not any(updated.late.any() for _, updated in told)
     assert difference(straight, mixed) <= 1e-6
     order = mixed.slots_of(straight.cell[: straight.size], straight.sector[: straight.size])
     np.testing.assert_array_equal(straight.live.visits[: straight.size], mixed.live.visits[order])
@@ -65,32 +65,32 @@ def test_a_replay_with_the_weights_that_were_used_gives_the_same_map() -> None:
     order = delayed(o, 300.0, 4)
     fusion, told = fold_in(o, order, 300)
     late, weight = np.zeros(3000, bool), np.zeros(3000, np.float32)
-    for rows, folded in told:
-        late[rows], weight[rows] = folded.late, folded.weight
+    for rows, updated in told:
+        late[rows], weight[rows] = updated.late, updated.weight
     assert 0 < late.sum() < 2000
     assert len(np.unique(weight)) > 5
     again = Fusion(LATENESS_S)
-    again.fold(o, weight, late)
+    again.update(o, weight, late)
     assert difference(fusion, again) <= 1e-6
     assert [again.trust(v) for v in range(12)] == pytest.approx([fusion.trust(v) for v in range(12)], abs=1e-6)
 
 
 def test_an_observation_before_the_checkpoint_is_late_and_changes_nothing() -> None:
     fusion = Fusion(LATENESS_S)
-    fusion.fold(observations([0.0], [1], value([0.8])))
-    fusion.fold(observations([400.0], [2], value([0.8])))
+    fusion.update(observations([0.0], [1], value([0.8])))
+    fusion.update(observations([400.0], [2], value([0.8])))
     before = fusion.live.belief[0].copy()
-    folded = fusion.fold(observations([100.0], [3], value([0.2])))
-    assert folded.late.tolist() == [True]
-    assert not len(folded.slots)
-    assert not folded.weight.any()
+    updated = fusion.update(observations([100.0], [3], value([0.2])))
+    assert updated.late.tolist() == [True]
+    assert not len(updated.slots)
+    assert not updated.weight.any()
     np.testing.assert_array_equal(fusion.live.belief[0], before)
 
 
 def test_a_window_frees_its_places_when_the_checkpoint_passes() -> None:
     fusion = Fusion(LATENESS_S)
     for k in range(200):
-        fusion.fold(observations(k * 60.0 + np.arange(50.0), np.arange(50), value(np.full(50, 0.7))))
+        fusion.update(observations(k * 60.0 + np.arange(50.0), np.arange(50), value(np.full(50, 0.7))))
     assert fusion.waiting <= 4 * 50
 
 
@@ -101,7 +101,7 @@ def test_stores_grow_without_disturbing_what_they_hold() -> None:
     o = observations(np.linspace(0.0, 900.0, n), rng.integers(0, 300, n), value(np.full(n, 0.6)), cell=cells)
     grown, _ = fold_in(o, np.arange(n), 37)
     whole = Fusion(LATENESS_S)
-    whole.fold(o)
+    whole.update(o)
     assert grown.size == n
     assert difference(grown, whole) <= 1e-6
     np.testing.assert_array_equal(np.sort(grown.cell[:n]), np.arange(n))

@@ -18,7 +18,7 @@ WIDTH_M = 10.2  # of a cell at LATITUDE
 
 
 def spread(std: float, yaw: float = 0.0, cell: int = CELL) -> tuple[IntArray, FloatArray]:
-    found = space.places(np.array([cell]), np.array([LATITUDE]), np.array([yaw]), np.array([std]))
+    found = space.other_cells(np.array([cell]), np.array([LATITUDE]), np.array([yaw]), np.array([std]))
     return found[0][0], found[1][0].astype(float)
 
 
@@ -70,9 +70,9 @@ def test_a_visit_is_not_spread_into_another_region() -> None:
 def test_all_cells_together_learn_no_more_than_one_would(std: float, mu: float, width: float, yaw: float) -> None:
     sure, unsure = Fusion(120.0), Fusion(120.0)
     o = observations([0.0], [1], value([mu], width))
-    cells, share = space.places(o.cell, np.array([LATITUDE]), np.array([yaw]), np.array([std]))
-    sure.fold(o)
-    unsure.fold(dataclasses.replace(o, beside=cells, beside_share=share))
+    cells, share = space.other_cells(o.cell, np.array([LATITUDE]), np.array([yaw]), np.array([std]))
+    sure.update(o)
+    unsure.update(dataclasses.replace(o, other=cells, other_share=share))
     total = sum(information(unsure.believed(np.array([slot]))[0]) for slot in range(unsure.size))
     assert total <= information(belief(sure)) + 2e-3  # rounding of the 16 bits
 
@@ -81,7 +81,7 @@ def test_a_cell_where_the_vehicle_was_perhaps_learns_a_little_and_is_not_visited
     fusion = Fusion(120.0)
     cells, share = spread(5.0)
     o = observations([0.0], [1], value([0.2]))
-    fusion.fold(dataclasses.replace(o, beside=cells[None], beside_share=share[None].astype(np.float32)))
+    fusion.update(dataclasses.replace(o, other=cells[None], other_share=share[None].astype(np.float32)))
     own, beside = belief(fusion), belief(fusion, int(cells[2]))
     assert information(own) > 3 * information(beside) > 0.0
     slots = fusion.slots_of(np.array([CELL, cells[2]]), np.zeros(2, np.int64))

@@ -21,7 +21,7 @@ def driven(private: int = 0) -> Fusion:
         who = np.concatenate([rng.choice(HONEST, 12), LIARS, np.repeat(LIARS, private)])
         cells = np.concatenate([rng.integers(0, 4, 12 + len(LIARS)), 100 + rng.integers(0, 4, private * len(LIARS))])
         mu = np.where(who < 100, 0.8 + 0.05 * rng.normal(size=len(who)), 0.25)
-        fusion.fold(observations(60.0 * minute + np.sort(rng.random(len(who))), who, value(mu), cell=cells))
+        fusion.update(observations(60.0 * minute + np.sort(rng.random(len(who))), who, value(mu), cell=cells))
     return fusion
 
 
@@ -41,15 +41,15 @@ def test_a_newcomer_is_believed_less_once_others_are_known() -> None:
 def test_any_number_of_newcomers_together_has_less_than_two_votes() -> None:
     fusion = driven()
     n = 200
-    folded = fusion.fold(observations(1900.0 + np.arange(n), 1000 + np.arange(n), value(np.full(n, 0.2)), cell=1))
+    updated = fusion.update(observations(1900.0 + np.arange(n), 1000 + np.arange(n), value(np.full(n, 0.2)), cell=1))
     assert slippery(belief(fusion, cell=1)) < 0.1
-    assert not Alerts(fusion).folded(folded.slots)
+    assert not Alerts(fusion).updated(updated.slots)
 
 
 def test_a_vehicle_that_keeps_changing_its_mind_has_two_votes() -> None:
     fusion = Fusion(120.0)
-    fusion.fold(observations(np.arange(6) * 10.0, np.arange(6), value(np.full(6, 0.8))))
+    fusion.update(observations(np.arange(6) * 10.0, np.arange(6), value(np.full(6, 0.8))))
     n = 60
     flips = np.where(np.arange(n) % 2 == 0, 0.1, 1.1)
-    fusion.fold(observations(100.0 + np.arange(n), np.full(n, 50), value(flips)))
+    fusion.update(observations(100.0 + np.arange(n), np.full(n, 50), value(flips)))
     assert fusion.live.values[0] < 6 * 0.75 + 0.75 * (c.VOTES + 0.2)

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from fleet_service.fusion import Fusion, evidence
+from fleet_service.fusion import Fusion
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.likelihoods import levelled
+from fleet_service.fusion.likelihoods import evidence, levelled
 from schemas import mugrid
 from tests.fleet_service.examples import (
     START,
@@ -38,9 +38,9 @@ def test_five_vehicles_narrow_a_cell_more_than_fifty_visits_of_one() -> None:
     rng = np.random.default_rng(1)
     one, five = Fusion(120.0), Fusion(120.0)
     for visit in range(50):
-        one.fold(observations([30.0 * visit], [1], value(0.8 + 0.03 * rng.normal(size=1))))
+        one.update(observations([30.0 * visit], [1], value(0.8 + 0.03 * rng.normal(size=1))))
     for vehicle in range(5):
-        five.fold(observations([300.0 * vehicle], [vehicle], value(0.8 + 0.05 * rng.normal(size=1))))
+        five.update(observations([300.0 * vehicle], [vehicle], value(0.8 + 0.05 * rng.normal(size=1))))
     assert width(five) < 0.8 * width(one)
     assert one.live.vehicles[0] == 1
     assert five.live.vehicles[0] == 5
@@ -50,7 +50,7 @@ def test_five_vehicles_narrow_a_cell_more_than_fifty_visits_of_one() -> None:
 def test_any_number_of_unexcited_vehicles_leaves_the_upper_end_at_the_priors(used: float) -> None:
     fusion = Fusion(120.0)
     n = 200
-    fusion.fold(observations(np.arange(n) * 5.0, np.arange(n), at_least(np.full(n, used))))
+    fusion.update(observations(np.arange(n) * 5.0, np.arange(n), at_least(np.full(n, used))))
     lower, upper = interval(belief(fusion))
     assert upper >= PRIOR_UPPER - 0.02
     assert lower > PRIOR_LOWER
@@ -60,16 +60,16 @@ def test_any_number_of_unexcited_vehicles_leaves_the_upper_end_at_the_priors(use
 def test_a_fall_that_senders_disagree_about_is_no_value() -> None:
     fusion = Fusion(120.0)
     sloping = np.tile(-0.9 * np.linspace(0.0, 1.0, 32), (50, 1))
-    fusion.fold(observations(np.arange(50.0), np.arange(50), sloping))
+    fusion.update(observations(np.arange(50.0), np.arange(50), sloping))
     np.testing.assert_allclose(belief(fusion), mugrid.PRIOR, atol=1e-6)
 
 
 def test_ice_is_believed_after_few_passes_of_vehicles_that_had_said_dry() -> None:
     fusion = Fusion(120.0)
-    fusion.fold(observations(np.arange(10) * 20.0, np.arange(10), value(np.full(10, 0.85))))
+    fusion.update(observations(np.arange(10) * 20.0, np.arange(10), value(np.full(10, 0.85))))
     assert slippery(belief(fusion)) < 0.01
     for passes in range(1, 7):
-        fusion.fold(observations([300.0 + 20.0 * passes], [passes], value([0.2])))
+        fusion.update(observations([300.0 + 20.0 * passes], [passes], value([0.2])))
         if slippery(belief(fusion)) > 0.9:
             break
     assert passes <= 4
@@ -78,7 +78,7 @@ def test_ice_is_believed_after_few_passes_of_vehicles_that_had_said_dry() -> Non
 def test_a_repeated_value_hardly_counts_and_a_changed_one_counts_whole() -> None:
     same, changed = Fusion(120.0), Fusion(120.0)
     for fusion, second in ((same, 0.8), (changed, 0.3)):
-        fusion.fold(observations([0.0, 30.0], [1, 1], value([0.8, second])))
+        fusion.update(observations([0.0, 30.0], [1, 1], value([0.8, second])))
     assert same.live.values[0] < 0.77
     assert changed.live.values[0] == pytest.approx(1.5)
 
@@ -89,8 +89,8 @@ def test_a_vehicle_that_always_disagrees_loses_its_vote() -> None:
     for cell in range(30):
         for place, vehicle in enumerate(rng.permutation([1, 2, 3, 4, 5, 99])):
             mu = 0.25 if vehicle == 99 else 0.8 + 0.05 * rng.normal()
-            fusion.fold(observations([cell * 20.0 + place], [vehicle], value([mu]), cell=cell))
-    fusion.fold(observations([2000.0], [1], value([0.8]), cell=99))
+            fusion.update(observations([cell * 20.0 + place], [vehicle], value([mu]), cell=cell))
+    fusion.update(observations([2000.0], [1], value([0.8]), cell=99))
     assert fusion.trust(99) < 0.1
     assert min(fusion.trust(v) for v in (1, 2, 3, 4, 5)) > 0.9
     assert 0.5 < fusion.trust(12345) < 0.9
@@ -98,7 +98,7 @@ def test_a_vehicle_that_always_disagrees_loses_its_vote() -> None:
 
 def test_what_nobody_confirms_fades_to_the_prior() -> None:
     fusion = Fusion(120.0)
-    fusion.fold(observations(np.arange(8) * 10.0, np.arange(8), value(np.full(8, 0.3))))
+    fusion.update(observations(np.arange(8) * 10.0, np.arange(8), value(np.full(8, 0.3))))
     widths = [np.subtract(*interval(belief(fusion, now=START + int(h * 3600e9)))[::-1]) for h in (0.1, 1, 4, 24)]
     assert widths == sorted(widths)
     assert widths[-1] == pytest.approx(PRIOR_UPPER - PRIOR_LOWER, abs=0.01)
@@ -106,7 +106,7 @@ def test_what_nobody_confirms_fades_to_the_prior() -> None:
 
 def test_a_heading_near_a_sectors_edge_votes_in_both() -> None:
     fusion = Fusion(120.0)
-    fusion.fold(observations([0.0], [1], value([0.5]), second=1))
+    fusion.update(observations([0.0], [1], value([0.5]), second=1))
     np.testing.assert_array_equal(belief(fusion, sector=0), belief(fusion, sector=1))
     assert fusion.size == 2
 
@@ -144,7 +144,7 @@ def test_slopes_that_all_point_upwards_make_no_value_of_many_unexcited_visits() 
     columns: dict[str, NDArray[Any]] = {"log_likelihood": sloping, "mu_utilised": np.full(n, 0.2, np.float32)}
     fusion = Fusion(120.0)
     o = observations(np.arange(n) * 2.0, np.arange(n), value(np.full(n, 0.5)))
-    fusion.fold(dataclasses.replace(o, evidence=evidence(columns, np.full(n, True)).taken))
+    fusion.update(dataclasses.replace(o, evidence=evidence(columns, np.full(n, True)).steps))
     lower, upper = interval(belief(fusion))
     assert lower < 0.3
     assert upper == pytest.approx(PRIOR_UPPER, abs=0.03)
@@ -154,11 +154,11 @@ def test_a_flood_of_one_vehicle_is_bounded_in_the_window_and_told_as_not_fused()
     fusion, n = Fusion(120.0), 500
     rng = np.random.default_rng(2)
     o = observations(60.0 * rng.random(n), np.full(n, 7), value(rng.uniform(0.1, 1.1, n)))
-    folded = [fusion.fold(o.take(part)) for part in np.array_split(np.arange(n), 10)]
-    assert fusion.waiting == c.WAITING_MOST == n - sum(int(f.late.sum()) for f in folded)
-    fusion.fold(observations([70.0], [8], value([0.5])))
+    updated = [fusion.update(o.take(part)) for part in np.array_split(np.arange(n), 10)]
+    assert fusion.waiting == c.WAITING_MOST == n - sum(int(f.late.sum()) for f in updated)
+    fusion.update(observations([70.0], [8], value([0.5])))
     assert fusion.waiting == c.WAITING_MOST + 1
     again = Fusion(120.0)
-    again.fold(o, np.concatenate([f.weight for f in folded]), np.concatenate([f.late for f in folded]))
-    again.fold(observations([70.0], [8], value([0.5])))
+    again.update(o, np.concatenate([f.weight for f in updated]), np.concatenate([f.late for f in updated]))
+    again.update(observations([70.0], [8], value([0.5])))
     np.testing.assert_array_equal(belief(again), belief(fusion))

@@ -56,8 +56,8 @@ def test_unknown_values_change_nothing() -> None:
 def after_an_hour(weather: w.Reports | None) -> np.ndarray:
     fusion = Fusion(120.0)
     if weather is not None:
-        fusion.weather(weather)
-    fusion.fold(observations(np.arange(8) * 10.0, np.arange(8), value(np.full(8, 0.8))))
+        fusion.update_weather(weather)
+    fusion.update(observations(np.arange(8) * 10.0, np.arange(8), value(np.full(8, 0.8))))
     return belief(fusion, now=START + HOUR)
 
 
@@ -74,8 +74,8 @@ def test_a_regions_prior_is_what_an_unknown_road_there_fades_to_and_begins_with_
     icy = np.where(mugrid.CENTRES < 0.4, 1.0, 0.0)
     told = dataclasses.replace(reports((0.0, STEADY)), prior=(icy / icy.sum())[None])
     fusion = Fusion(120.0)
-    fusion.weather(told)
-    fusion.fold(observations([60.0], [1], value([0.5], std=30.0)))
+    fusion.update_weather(told)
+    fusion.update(observations([60.0], [1], value([0.5], std=30.0)))
     assert slippery(belief(fusion)) == pytest.approx(0.5 + 0.5 * 0.3, abs=0.02)
     assert belief(fusion).min() > 0.4 / mugrid.BINS
 
@@ -89,14 +89,14 @@ def test_weather_that_acts_on_what_was_not_folded_yet_gives_the_map_of_weather_k
     used = []
     for part, rows in enumerate(np.array_split(np.arange(n), 3)):
         acting = dataclasses.replace(arriving[part], time=np.array([max(told.next_epoch, START)]))
-        told.weather(acting)
+        told.update_weather(acting)
         used.append(acting)
-        told.fold(o.take(rows))
+        told.update(o.take(rows))
     for one in used:
-        known.weather(one)
-    known.fold(o)
+        known.update_weather(one)
+    known.update(o)
     now = START + 4 * HOUR
     np.testing.assert_allclose(belief(told, now=now), belief(known, now=now), atol=1e-6)
     plain = Fusion(120.0)
-    plain.fold(o)
+    plain.update(o)
     assert np.abs(belief(plain, now=now) - belief(known, now=now)).max() > 1e-3

@@ -28,7 +28,7 @@ def test_what_the_vehicles_write_is_joined_with_their_truth(tmp_path: Path) -> N
     true = set(zip(truth["cell"].to_pylist(), truth["sector"].to_pylist(), strict=True))
     assert len(told & true) > 0.5 * len(told)
     fusion = Fusion(120.0)
-    fusion.fold(whole_way.observations_of(columns))
+    fusion.update(whole_way.observations_in(columns))
     slots, mu = whole_way.joined(fusion, truth)
     assert 0 < len(slots) <= fusion.size
     assert ((mu > 0.05) & (mu < 1.2)).all()
@@ -51,7 +51,7 @@ def visits(*rows: tuple[int, float, float]) -> pa.Table:
 
 def test_the_truth_of_a_cell_is_that_of_its_last_half_minute_and_of_all_visits_where_there_was_none() -> None:
     fusion = Fusion(120.0)
-    fusion.fold(observations([1.0, 1.0], [1, 2], value([0.5, 0.5]), cell=[CELL, CELL + 1]))
+    fusion.update(observations([1.0, 1.0], [1, 2], value([0.5, 0.5]), cell=[CELL, CELL + 1]))
     slots, mu = whole_way.joined(
         fusion, visits((0, 10.0, 0.9), (0, 80.0, 0.2), (0, 99.0, 0.4), (1, 5.0, 0.8), (1, 6.0, 0.6), (7, 99.0, 0.1))
     )
@@ -61,7 +61,7 @@ def test_the_truth_of_a_cell_is_that_of_its_last_half_minute_and_of_all_visits_w
 
 def test_excited_vehicles_are_counted_once_per_cell() -> None:
     fusion = Fusion(120.0)
-    fusion.fold(observations([1.0, 1.0], [1, 2], value([0.5, 0.5]), cell=[CELL, CELL + 1]))
+    fusion.update(observations([1.0, 1.0], [1, 2], value([0.5, 0.5]), cell=[CELL, CELL + 1]))
     rows = visits((0, 1.0, 0.9), (0, 2.0, 0.9), (0, 3.0, 0.9), (1, 4.0, 0.1), (1, 5.0, 0.9))
     counts = whole_way.excited(fusion, rows)
     assert counts[fusion.slots_of(np.array([CELL, CELL + 1]), np.zeros(2, np.int64))].tolist() == [2, 1]
@@ -69,6 +69,6 @@ def test_excited_vehicles_are_counted_once_per_cell() -> None:
 
 def test_a_cell_of_two_surfaces_is_told_apart() -> None:
     fusion = Fusion(120.0)
-    fusion.fold(observations([1.0, 1.0], [1, 2], value([0.5, 0.5]), cell=[CELL, CELL + 1]))
+    fusion.update(observations([1.0, 1.0], [1, 2], value([0.5, 0.5]), cell=[CELL, CELL + 1]))
     same = whole_way.one_surface(fusion, visits((0, 1.0, 0.9), (0, 2.0, 0.8), (1, 4.0, 0.6), (1, 5.0, 0.61)))
     assert same[fusion.slots_of(np.array([CELL, CELL + 1]), np.zeros(2, np.int64))].tolist() == [False, True]

@@ -56,7 +56,7 @@ def beliefs(engine: Engine, at: int) -> FloatArray:
 
 
 @pytest.fixture
-def folded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def replayed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Rows of each call of a replay's reading."""
     rows: list[int] = []
     read: Callable[..., Iterable[pa.Table]] = reading.read
@@ -71,7 +71,7 @@ def folded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return rows
 
 
-def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(tmp_path: Path, folded: list[int]) -> None:
+def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(tmp_path: Path, replayed: list[int]) -> None:
     sent = [icy(k % 6, 1 + k // 6, 0.2 if k % 5 else 0.8) for k in range(60)]
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for k in range(0, 40, 4):
@@ -83,10 +83,10 @@ def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(tmp_path: Path, f
         engine.flush()
         at, alerts = time.time_ns(), engine.alerts
         running = beliefs(engine, at)
-    folded.clear()
+    replayed.clear()
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
         from_checkpoint = beliefs(again, at)
-        assert folded == [20]
+        assert replayed == [20]
         assert again.alerts == alerts > 0
         assert again.counts["checkpoints_refused"] == 0
         again.take(sent, time.time_ns())
@@ -96,7 +96,7 @@ def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(tmp_path: Path, f
     with closing(Engine(ServiceConfig(), tmp_path)) as whole:
         np.testing.assert_allclose(from_checkpoint, beliefs(whole, at), atol=1e-6)
     np.testing.assert_allclose(from_checkpoint, running, atol=1e-6)
-    assert folded == [20, 60]
+    assert replayed == [20, 60]
 
 
 def test_what_is_in_a_checkpoint_is_on_disk(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.belief import SLIPPERY_SHARE
-from fleet_service.fusion.pools import ICE
+from fleet_service.fusion.store.records import ICE
 from fleet_service.serve.alerts import RAISE_ABOVE, Alerts
 from tests.fleet_service.examples import CELL, SECOND, START, at_least, belief, observations, slippery, value
 
@@ -19,8 +19,8 @@ def icy(vehicles: list[int]) -> tuple[Fusion, Alerts, list[bool]]:
     alerts = Alerts(fusion)
     raised = []
     for k, vehicle in enumerate(vehicles):
-        folded = fusion.fold(observations([10.0 * k], [vehicle], value([0.2])))
-        raised.append(any(alert.raised for alert in alerts.folded(folded.slots)))
+        updated = fusion.update(observations([10.0 * k], [vehicle], value([0.2])))
+        raised.append(any(alert.raised for alert in alerts.updated(updated.slots)))
     return fusion, alerts, raised
 
 
@@ -33,20 +33,20 @@ def test_the_second_vehicle_raises_the_alert_and_it_is_raised_once() -> None:
 def test_an_alert_is_judged_by_what_is_believed_of_the_road() -> None:
     fusion, cells = Fusion(120.0), np.arange(40)
     for vehicle in range(3):
-        fusion.fold(
+        fusion.update(
             observations(20.0 * vehicle + cells / 4, cells * 9 + vehicle, value(cells / 40 + 0.1), CELL + cells)
         )
     alerts, slots = Alerts(fusion), np.arange(fusion.size)
     believed = fusion.believed(slots) @ SLIPPERY_SHARE
-    told = {alert.cell: float(alert.reason.split()[4]) for alert in alerts.folded(slots)}
+    told = {alert.cell: float(alert.reason.split()[4]) for alert in alerts.updated(slots)}
     assert told == {int(c): round(float(p), 2) for c, p in zip(fusion.cell, believed, strict=True) if p > RAISE_ABOVE}
     assert 0 < len(told) < fusion.size
 
 
-def test_one_vehicle_with_many_unexcited_witnesses_raises_nothing() -> None:
+def test_one_vehicle_with_many_unexcited_others_raises_nothing() -> None:
     fusion, alerts, raised = icy([1] * 20)
-    folded = fusion.fold(observations(300.0 + np.arange(20), np.arange(2, 22), at_least(np.full(20, 0.1))))
-    assert not alerts.folded(folded.slots)
+    updated = fusion.update(observations(300.0 + np.arange(20), np.arange(2, 22), at_least(np.full(20, 0.1))))
+    assert not alerts.updated(updated.slots)
     assert not any(raised)
     assert fusion.live.vehicles[0] == 21
 
@@ -61,16 +61,16 @@ def test_an_alert_that_nobody_confirms_ends_by_itself_with_the_reason() -> None:
 
 def test_between_the_two_limits_an_alert_stays() -> None:
     fusion, alerts, _ = icy([1, 2, 3])
-    folded = fusion.fold(observations([100.0], [4], value([0.85])))
-    assert not alerts.folded(folded.slots)
+    updated = fusion.update(observations([100.0], [4], value([0.85])))
+    assert not alerts.updated(updated.slots)
     assert alerts.raised == {0}
 
 
-def test_old_ice_is_no_witness_for_new_ice() -> None:
+def test_old_ice_does_not_corroborate_new_ice() -> None:
     fusion, alerts, _ = icy([1, 2])
     alerts.faded(START + 6 * HOUR)
-    folded = fusion.fold(observations([6 * 3600.0 + k for k in range(3)], [3, 3, 3], value([0.2, 0.2, 0.2])))
-    assert not alerts.folded(folded.slots)
+    updated = fusion.update(observations([6 * 3600.0 + k for k in range(3)], [3, 3, 3], value([0.2, 0.2, 0.2])))
+    assert not alerts.updated(updated.slots)
 
 
 def called(mu: float, vehicles: range, then: float, others: range) -> tuple[Fusion, list[bool]]:
@@ -80,13 +80,13 @@ def called(mu: float, vehicles: range, then: float, others: range) -> tuple[Fusi
     under = []
     for k, vehicle in enumerate([*vehicles, *others]):
         later = k >= len(vehicles)  # by then the first ones are known
-        folded = fusion.fold(observations([20.0 * k + 400.0 * later], [vehicle], value([then if later else mu])))
-        alerts.folded(folded.slots)
+        updated = fusion.update(observations([20.0 * k + 400.0 * later], [vehicle], value([then if later else mu])))
+        alerts.updated(updated.slots)
         under.append(bool(alerts.raised))
     return fusion, under[len(vehicles) :]
 
 
-def test_what_many_called_dry_takes_five_witnesses_however_sure_the_belief_is() -> None:
+def test_what_many_called_dry_takes_five_sources_however_sure_the_belief_is() -> None:
     fusion, under = called(0.85, range(20), 0.2, range(5, 11))
     assert slippery(belief(fusion)) > 0.9
     assert under == [False, False, False, False, True, True]
@@ -95,10 +95,10 @@ def test_what_many_called_dry_takes_five_witnesses_however_sure_the_belief_is() 
 def test_bounds_clear_an_alert_when_only_a_dry_road_gives_so_much_grip() -> None:
     for used, stands in ((0.7, False), (0.5, True)):
         fusion, alerts, _ = icy([1, 2, 3])
-        folded = fusion.fold(observations([100.0, 101.0], [4, 5], value([0.85, 0.85])))  # the belief turns
-        later = fusion.fold(observations(200.0 + np.arange(8), np.arange(6, 14), at_least(np.full(8, used))))
-        alerts.folded(folded.slots)
-        alerts.folded(later.slots)
+        updated = fusion.update(observations([100.0, 101.0], [4, 5], value([0.85, 0.85])))  # the belief turns
+        later = fusion.update(observations(200.0 + np.arange(8), np.arange(6, 14), at_least(np.full(8, used))))
+        alerts.updated(updated.slots)
+        alerts.updated(later.slots)
         assert bool(alerts.raised) is stands
 
 
@@ -108,25 +108,25 @@ def test_what_many_called_ice_takes_five_vehicles_to_clear() -> None:
     assert under == [True, True, True, True, False, False]
 
 
-def test_who_lost_its_trust_is_no_witness_any_more_for_what_it_said_before() -> None:
+def test_who_lost_its_trust_corroborates_nothing_of_what_it_reported_before() -> None:
     fusion, _ = called(0.2, range(4), 0.2, range(0))
     slot = np.zeros(1, np.int64)
-    assert fusion.witnesses(slot, ICE, 0)[0] == [4]
+    assert fusion.sources(slot, ICE, 0)[0] == [4]
     rng = np.random.default_rng(3)
     for cell in range(40):  # elsewhere the first two say dry things of ice
         who = rng.permutation(12)
         mu = np.where(who < 2, 0.9, 0.2 + 0.02 * rng.normal(size=12))
-        fusion.fold(observations(200.0 + 20.0 * cell + np.arange(12), who, value(mu), cell=cell))
+        fusion.update(observations(200.0 + 20.0 * cell + np.arange(12), who, value(mu), cell=cell))
     assert fusion.trust(0) < 0.5 < fusion.trust(2)
-    assert fusion.witnesses(slot, ICE, 0)[0] == [2]
+    assert fusion.sources(slot, ICE, 0)[0] == [2]
 
 
 def test_an_alert_ends_only_when_grip_is_sure() -> None:
     fusion, alerts, _ = icy([1, 2, 3])
     ended = []
     for vehicle in range(10, 18):
-        folded = fusion.fold(observations([200.0 + 10.0 * vehicle], [vehicle], value([0.85])))
-        ended += alerts.folded(folded.slots)
+        updated = fusion.update(observations([200.0 + 10.0 * vehicle], [vehicle], value([0.85])))
+        ended += alerts.updated(updated.slots)
     (only,) = ended
     assert (only.raised, only.reason) == (False, "later visits found grip")
     assert only.p_slippery < 0.05

@@ -1,7 +1,7 @@
 """All that a fusion knows as plain arrays, and back: so that a snapshot goes on exactly where the fusion was. Pure.
 
 A column is a one-dimensional array, records are a column of bytes. Columns of one length belong together: `Image` is a
-table of tables, by name. LAYOUT tells what the bytes mean, by every field's name, place and order of bytes.
+table of tables, by name. LAYOUT says what the bytes mean, by every field's name, place and order of bytes.
 """
 
 from __future__ import annotations
@@ -14,47 +14,53 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.fusion.belief import PackedArray
-from fleet_service.fusion.cells import CELL, Records, no_beliefs, rows_of_lines
 from fleet_service.fusion.fuse import Fusion
-from fleet_service.fusion.pools import (
+from fleet_service.fusion.store.cells import no_beliefs, rows_of_lines
+from fleet_service.fusion.store.records import (
+    CELL,
     ENTRY,
     FREE_ENTRIES,
     FREE_WINDOWS,
-    KEPT_VOICE,
     PAIR,
     PEER,
+    REPORTER,
+    REPORTERS_USED,
+    SOURCE,
     VEHICLE,
-    VOICE,
-    VOICES,
     WINDOW,
+    Rows,
+    State,
 )  # fmt: skip
-from fleet_service.fusion.stores import Stores
+from fleet_service.fusion.store.store import Store
 from fleet_service.fusion.weather import Reports
 from schemas import mugrid
 from schemas.numeric import ByteArray
+from schemas.runtime.records import RecordArray
 
 Image = dict[str, dict[str, NDArray[Any]]]
 _RECORDS: Final = {
-    "cells": CELL, "kept": CELL, "kept_voices": KEPT_VOICE, "windows": WINDOW, "entries": ENTRY, "pairs": PAIR,
-    "voices": VOICE, "peers": PEER, "names": VEHICLE,
+    "cells": CELL, "base_cells": CELL, "base_sources": SOURCE, "windows": WINDOW, "entries": ENTRY, "pairs": PAIR,
+    "reporters": REPORTER, "peers": PEER, "names": VEHICLE,
 }  # fmt: skip
 LAYOUT: Final = hashlib.blake2b(repr([kind.descr for kind in _RECORDS.values()]).encode(), digest_size=8).hexdigest()
-_BELIEFS: Final = ("belief", "kept_belief")
 
 
 def image_of(fusion: Fusion) -> Image:
     """Everything that a fusion holds. Windows, entries and pairs keep their places, since they point at each other."""
-    stores, state = fusion.stores, fusion.stores.state
-    used = {"cells": stores.size, "voices": int(state.used[VOICES]), "peers": stores.vehicles, "names": stores.vehicles}
-    whole = {name: getattr(state, name, None) for name in _RECORDS} | {"peers": stores.peers, "names": stores.names}
-    image: Image = {
-        name: {"bytes": _bytes(array[: used.get(name)])} for name, array in whole.items() if array is not None
-    }
-    image["belief"] = {"bins": state.belief[: stores.size].reshape(-1)}
-    image["kept_belief"] = {"bins": state.kept_belief.reshape(-1)}
+    store, state = fusion.store, fusion.store.state
+    live, base = state.live, state.base
+    records = {
+        "cells": live.cells[: store.size], "base_cells": base.cells, "base_sources": base.reporters,
+        "windows": state.windows, "entries": state.entries, "pairs": state.pairs,
+        "reporters": live.reporters[: int(state.used[REPORTERS_USED])],
+        "peers": store.peers[: store.vehicles], "names": store.names[: store.vehicles],
+    }  # fmt: skip
+    image: Image = {name: {"bytes": _bytes(array)} for name, array in records.items()}
+    image["belief"] = {"bins": live.belief[: store.size].reshape(-1)}
+    image["base_belief"] = {"bins": base.belief.reshape(-1)}
     image["free_windows"] = {"row": state.free_windows[: int(state.used[FREE_WINDOWS])]}
     image["free_entries"] = {"row": state.free_entries[: int(state.used[FREE_ENTRIES])]}
-    image["used"] = {"count": state.used, "more": np.array([stores.size, stores.vehicles, stores.hour, fusion.epoch])}
+    image["used"] = {"count": state.used, "more": np.array([store.size, store.vehicles, store.hour, fusion.epoch])}
     image["trust"] = {
         "epoch": np.concatenate([np.full(len(weights), epoch) for epoch, weights, _ in fusion.trusts]),
         "weight": np.concatenate([weights for _, weights, _ in fusion.trusts]),
@@ -73,13 +79,15 @@ def fusion_of(image: Image, lateness_s: float) -> Fusion:
     """The fusion of an image, with the lateness that it had."""
     fusion = Fusion(lateness_s)
     records = {name: _records(image[name]["bytes"], kind) for name, kind in _RECORDS.items()}
-    beliefs = {name: _beliefs(image[name]["bins"]) for name in _BELIEFS}
-    free = {name: _padded(image[name]["row"], len(records[name.removeprefix("free_")])) for name in _FREE}
-    peers, names = records.pop("peers"), records.pop("names")
     size, vehicles, hour, epoch = image["used"]["more"].tolist()
-    parts: dict[str, Any] = {**records, **beliefs, **free, "used": image["used"]["count"].copy()}
-    state = fusion.stores.state._replace(**parts)
-    fusion.stores = Stores.of(state, peers, names, size, vehicles, hour)
+    state = State(
+        live=Rows(_beliefs(image["belief"]["bins"]), records["cells"], records["reporters"]),
+        base=Rows(_beliefs(image["base_belief"]["bins"]), records["base_cells"], records["base_sources"]),
+        windows=records["windows"], free_windows=_padded(image["free_windows"]["row"], len(records["windows"])),
+        entries=records["entries"], free_entries=_padded(image["free_entries"]["row"], len(records["entries"])),
+        pairs=records["pairs"], used=image["used"]["count"].copy(),
+    )  # fmt: skip
+    fusion.store = Store.of(state, records["peers"], records["names"], size, vehicles, hour)
     ends = np.cumsum(image["trusts"]["vehicles"])[:-1]
     weights = np.split(image["trust"]["weight"], ends)
     epochs, newcomers = image["trusts"]["epoch"].tolist(), image["trusts"]["newcomer"].tolist()
@@ -90,14 +98,11 @@ def fusion_of(image: Image, lateness_s: float) -> Fusion:
     return fusion
 
 
-_FREE: Final = ("free_windows", "free_entries")
-
-
-def _bytes(records: Records) -> ByteArray:
+def _bytes(records: RecordArray) -> ByteArray:
     return records.view(np.uint8) if len(records) else np.zeros(0, np.uint8)
 
 
-def _records(stored: ByteArray, kind: np.dtype[Any]) -> Records:
+def _records(stored: ByteArray, kind: np.dtype[Any]) -> RecordArray:
     out = rows_of_lines(len(stored) // kind.itemsize, kind)
     out[:] = stored.view(kind)
     return out

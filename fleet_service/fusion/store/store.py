@@ -1,4 +1,4 @@
-"""Room for the fusion's arrays: tables and pools that grow. The compiled code finds all of it in `State`."""
+"""The store of a fusion: tables and pools that grow. Compiled code finds all of it in `State`."""
 
 from __future__ import annotations
 
@@ -8,32 +8,48 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.cells import CELL, NONE, Cells, Int32Array, Records, cells_of, no_beliefs, rows_of_lines
-from fleet_service.fusion.pairs import mark_returned, moved, staying
-from fleet_service.fusion.pools import (
+from fleet_service.fusion.store.cells import Cells, cells_of, no_beliefs, rows_of_lines
+from fleet_service.fusion.store.pairs import count_staying, mark_returned, move_pairs
+from fleet_service.fusion.store.records import (
+    CELL,
     ENTRY,
     FREE_ENTRIES,
     FREE_WINDOWS,
-    KEPT_VOICE,
+    NOBODY,
+    NONE,
     PAIR,
     PAIRS,
+    PEER,
+    REPORTER,
+    REPORTERS_USED,
+    SOURCE,
     VEHICLE,
-    VOICE,
-    VOICES,
     WINDOW,
+    Int32Array,
+    Rows,
     State,
 )  # fmt: skip
-from fleet_service.fusion.table import LEAST, PAIRS_MOST, ROWS_MOST, grown, is_full, numbered, room, rows_of, slots_for
-from fleet_service.fusion.trust import no_peers
-from fleet_service.fusion.window import due
+from fleet_service.fusion.store.table import (
+    LEAST,
+    PAIRS_MOST,
+    ROWS_MOST,
+    is_full,
+    numbered,
+    places_for,
+    rows_of,
+    slots_for,
+    table_of,
+)  # fmt: skip
 from schemas.numeric import IntArray
+from schemas.runtime.jit import compiled
+from schemas.runtime.records import RecordArray
 
 _NOTHING = np.zeros(0, np.int32)
 _HOUR = 3600
 _AHEAD = 120  # s; a checkpoint with little lateness may be ahead of the clock by the rest of an epoch
 
 
-class Stores:
+class Store:
     """Everything that a fusion holds, empty at first.
 
     Attributes:
@@ -46,31 +62,32 @@ class Stores:
 
     def __init__(self) -> None:
         self.state = State(
-            no_beliefs(0), np.zeros(0, CELL), no_beliefs(0), np.zeros(0, CELL), np.zeros(0, KEPT_VOICE),
-            np.zeros(0, WINDOW), _NOTHING, np.zeros(0, ENTRY), _NOTHING, _no_pairs(LEAST), np.zeros(0, VOICE),
-            np.zeros(4, np.int64),
+            live=Rows(no_beliefs(0), np.zeros(0, CELL), np.zeros(0, REPORTER)),
+            base=Rows(no_beliefs(0), np.zeros(0, CELL), np.zeros(0, SOURCE)),
+            windows=np.zeros(0, WINDOW), free_windows=_NOTHING, entries=np.zeros(0, ENTRY), free_entries=_NOTHING,
+            pairs=_no_pairs(LEAST), used=np.zeros(4, np.int64),
         )  # fmt: skip
         self.peers = no_peers(0)
-        self.names: Records = np.zeros(0, VEHICLE)
+        self.names: RecordArray = np.zeros(0, VEHICLE)
         self.size = self.vehicles = 0
         self._slots: IntArray = np.full(LEAST, NONE, np.int64)
         self._known: IntArray = np.full(LEAST, NONE, np.int64)
         self.hour = 0  # whose pairs were dropped last
 
     @staticmethod
-    def of(state: State, peers: Records, names: Records, size: int, vehicles: int, hour: int) -> Stores:
-        """Stores with these contents."""
-        stores = Stores()
-        stores.state, stores.peers, stores.names = state, peers, names
-        stores.size, stores.vehicles, stores.hour = size, vehicles, hour
-        stores._slots = grown(state.cells, size, size)
-        stores._known = grown(names, vehicles, vehicles)
-        return stores
+    def of(state: State, peers: RecordArray, names: RecordArray, size: int, vehicles: int, hour: int) -> Store:
+        """A store with these contents."""
+        store = Store()
+        store.state, store.peers, store.names = state, peers, names
+        store.size, store.vehicles, store.hour = size, vehicles, hour
+        store._slots = table_of(state.live.cells, size, size)
+        store._known = table_of(names, vehicles, vehicles)
+        return store
 
     @property
     def live(self) -> Cells:
         """The slots by columns."""
-        return cells_of(self.state.belief, self.state.cells)
+        return cells_of(self.state.live)
 
     @property
     def waiting(self) -> int:
@@ -80,15 +97,15 @@ class Stores:
     def due_windows(self, before: int) -> tuple[IntArray, IntArray]:
         """Windows with entries before `before` [ns]: those without a value, and those with one in the order of cells.
 
-        Values that pass the checkpoint meet others, which is what reputation is made of; so their order may not depend
-        on who came first. All else is done in the order of memory.
+        Values that pass the checkpoint are compared with others, which is what reputation is made of; so their order
+        may not depend on who came first. All else is done in the order of memory.
         """
-        quiet, talking = due(self.state.windows, before)
-        return quiet, talking[np.argsort(self.state.cells["key"][self.state.windows["slot"][talking]])]
+        plain, valued = due(self.state.windows, before)
+        return plain, valued[np.argsort(self.state.live.cells["key"][self.state.windows["slot"][valued]])]
 
     def slots_of(self, keys: IntArray) -> IntArray:
         """Slot of each key, NONE where there is none."""
-        return rows_of(self._slots, self.state.cells, np.asarray(keys, np.int64))
+        return rows_of(self._slots, self.state.live.cells, np.asarray(keys, np.int64))
 
     def slots_for(self, keys: IntArray) -> IntArray:
         """Slot of each key; new ones begin with the prior."""
@@ -98,12 +115,12 @@ class Stores:
             return slots
         most = self.size + len(distinct(keys[new]))
         if is_full(most, len(self._slots), ROWS_MOST):
-            self._slots = grown(self.state.cells, self.size, most)
-        if most > len(self.state.cells):
-            rows = max(most, 2 * len(self.state.cells))
-            belief, cells = _longer(self.state.belief, rows), _longer(self.state.cells, rows)
-            self.state = self.state._replace(belief=belief, cells=cells)
-        slots[new], self.size = slots_for(self._slots, self.state.belief, self.state.cells, keys[new], self.size)
+            self._slots = table_of(self.state.live.cells, self.size, most)
+        if most > len(self.state.live.cells):
+            live, rows = self.state.live, max(most, 2 * len(self.state.live.cells))
+            live = live._replace(belief=_longer(live.belief, rows), cells=_longer(live.cells, rows))
+            self.state = self.state._replace(live=live)
+        slots[new], self.size = slots_for(self._slots, self.state.live, keys[new], self.size)
         return slots
 
     def known(self, vehicle: IntArray) -> IntArray:
@@ -117,7 +134,7 @@ class Stores:
             return index
         most = self.vehicles + len(distinct(vehicle[index == NONE]))
         if is_full(most, len(self._known), ROWS_MOST):
-            self._known = grown(self.names, self.vehicles, most)
+            self._known = table_of(self.names, self.vehicles, most)
         if most > len(self.names):
             rows = max(most, 2 * len(self.names))
             self.names, peers = _longer(self.names, rows), no_peers(rows)
@@ -133,9 +150,10 @@ class Stores:
             self._more_entries(self.waiting + rows)
         if used[FREE_WINDOWS] < rows:
             self._more_windows(len(self.state.free_windows) - int(used[FREE_WINDOWS]) + rows)
-        if used[VOICES] + rows > len(self.state.voices):
-            most = max(int(used[VOICES]) + rows, 2 * len(self.state.voices))
-            self.state = self.state._replace(voices=_longer(self.state.voices, most))
+        live = self.state.live
+        if used[REPORTERS_USED] + rows > len(live.reporters):
+            most = max(int(used[REPORTERS_USED]) + rows, 2 * len(live.reporters))
+            self.state = self.state._replace(live=live._replace(reporters=_longer(live.reporters, most)))
         if is_full(int(used[PAIRS]) + rows, len(self.state.pairs), PAIRS_MOST):
             self._rebuild_pairs(0, int(used[PAIRS]) + rows)
 
@@ -148,43 +166,65 @@ class Stores:
         old, rows = self.state, max(2 * len(self.state.windows), most)
         windows = _longer(old.windows, rows)
         windows["slot"][len(old.windows) :] = NONE
-        self.state = old._replace(
-            windows=windows, kept=_longer(old.kept, rows), kept_belief=_longer(old.kept_belief, rows),
-            kept_voices=_longer(old.kept_voices, rows),
-            free_windows=_restacked(old.free_windows, old.used, FREE_WINDOWS, rows),
+        base = Rows(
+            _longer(old.base.belief, rows), _longer(old.base.cells, rows), _longer(old.base.reporters, rows)
         )  # fmt: skip
+        free = _restacked(old.free_windows, old.used, FREE_WINDOWS, rows)
+        self.state = old._replace(windows=windows, base=base, free_windows=free)
 
     def forget(self, checkpoint_s: int) -> None:
-        """Once in an hour of the checkpoint drop what nobody asks for any more: what vehicles said FORGOTTEN_S before
-        it (`votes.recall`), speakers and witnesses of an hour before it (`trust.meet`, `Fusion.witnesses`)."""
+        """Once in an hour of the checkpoint drop what nobody asks for any more: what vehicles reported FORGOTTEN_S
+        before it (`votes.discount`), reporters and sources of an hour before it (`trust.compare`, `Fusion.sources`)."""
         hour = checkpoint_s - checkpoint_s % _HOUR
         if hour != self.hour:
             self.hour = hour
             self._rebuild_pairs(hour - int(c.FORGOTTEN_S), 0)
-            self._rebuild_voices(hour - _HOUR - _AHEAD)
+            self._rebuild_reporters(hour - _HOUR - _AHEAD)
 
     def _rebuild_pairs(self, least: int, most: int) -> None:
-        """Drop pairs last heard before `least` [s], and make room for `most`."""
+        """Drop pairs that last reported before `least` [s], and make room for `most`."""
         state = self.state
         old = state.pairs
-        count = staying(old, least)
-        new = _no_pairs(room(max(count, most), PAIRS_MOST))
-        gone = moved(state.entries, old, new, least)
-        mark_returned(state.cells, state.kept, old["slot"][gone], self.names["key"][old["vehicle"][gone]])
+        count = count_staying(old, least)
+        new = _no_pairs(places_for(max(count, most), PAIRS_MOST))
+        gone = move_pairs(state.entries, old, new, least)
+        mark_returned(state, old["slot"][gone], self.names["key"][old["vehicle"][gone]])
         state.used[PAIRS] = count
         self.state = state._replace(pairs=new)
 
-    def _rebuild_voices(self, least: int) -> None:
-        """Drop voices that were last heard before `least` [s], but for those of a window."""
-        cells, old = self.state.cells[: self.size], self.state.voices
-        slots = np.flatnonzero(cells["voice"] != NONE)
-        voice = cells["voice"][slots]
-        heard = np.maximum(old["spoke"].max(axis=1, initial=0), old["witnessed"].max(axis=(1, 2), initial=0))
-        stay = (heard[voice] >= least) | (cells["window"][slots] != NONE)
-        cells["voice"][slots] = NONE
-        cells["voice"][slots[stay]] = np.arange(stay.sum())
-        self.state.used[VOICES] = stay.sum()
-        self.state = self.state._replace(voices=old[voice[stay]])
+    def _rebuild_reporters(self, least: int) -> None:
+        """Drop reporters whose last report was before `least` [s], but for those of a window."""
+        live, cells = self.state.live, self.state.live.cells[: self.size]
+        slots = np.flatnonzero(cells["reporters"] != NONE)
+        row, old = cells["reporters"][slots], live.reporters
+        last = np.maximum(old["time"].max(axis=1, initial=0), old["source_time"].max(axis=(1, 2), initial=0))
+        stay = (last[row] >= least) | (cells["window"][slots] != NONE)
+        cells["reporters"][slots] = NONE
+        cells["reporters"][slots[stay]] = np.arange(stay.sum())
+        self.state.used[REPORTERS_USED] = stay.sum()
+        self.state = self.state._replace(live=live._replace(reporters=old[row[stay]]))
+
+
+@compiled
+def due(windows: RecordArray, before: int) -> tuple[IntArray, IntArray]:
+    """Windows with entries before `before` [ns]: those without a value, and those with one."""
+    plain, valued, without, of_value = np.empty(len(windows), np.int64), np.empty(len(windows), np.int64), 0, 0
+    for window in range(len(windows)):
+        if windows[window].slot != NONE and windows[window].first < before:
+            if windows[window].values:
+                valued[of_value] = window
+                of_value += 1
+            else:
+                plain[without] = window
+                without += 1
+    return plain[:without], valued[:of_value]
+
+
+def no_peers(vehicles: int) -> RecordArray:
+    """Vehicles whose values were compared with nobody's."""
+    peers = np.zeros(vehicles, PEER)
+    peers["other"] = NOBODY
+    return peers
 
 
 def distinct(values: IntArray) -> IntArray:
@@ -193,7 +233,7 @@ def distinct(values: IntArray) -> IntArray:
     return np.asarray(ordered[np.append(np.ones(len(ordered[:1]), bool), ordered[1:] != ordered[:-1])])
 
 
-def _no_pairs(places: int) -> Records:
+def _no_pairs(places: int) -> RecordArray:
     pairs = rows_of_lines(places, PAIR)
     pairs["slot"] = NONE
     return pairs

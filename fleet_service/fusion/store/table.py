@@ -13,17 +13,18 @@ from typing import Final
 
 import numpy as np
 
-from fleet_service.fusion.belief import PackedArray
-from fleet_service.fusion.cells import NONE, Records, begin
+from fleet_service.fusion.store.cells import begin_slot
+from fleet_service.fusion.store.records import NONE, Rows
 from schemas.numeric import IntArray
 from schemas.runtime.jit import compiled, prefetch, refcount_free_inlined
+from schemas.runtime.records import RecordArray
 
 LEAST: Final = 1024  # places of a new table
 ROWS_MOST: Final = 0.8  # share of the places that rows take: eight of them are a line, and probes cost little
 PAIRS_MOST: Final = 0.6  # ... that pairs take, of which two are a line: two or three probes
 _LOWER: Final = 0xFFFFFFFF
 _TAG: Final = 0x7FFFFFFF
-AHEAD: Final = 128  # rows whose memory is asked for before they are worked on, so that it comes for all at once
+AHEAD: Final = 128  # rows whose memory is prefetched before they are worked on, so that it comes for all at once
 
 
 @refcount_free_inlined
@@ -54,7 +55,7 @@ def _held(mixed: np.uint64, row: int) -> int:
 
 
 @refcount_free_inlined
-def locate(table: IntArray, rows: Records, key: int) -> int:
+def locate(table: IntArray, rows: RecordArray, key: int) -> int:
     """Place of the row with `key`, or the free place where it belongs."""
     mixed = _mixed(key)
     place, tag = _first(mixed, len(table)), np.int64(mixed & np.uint64(_TAG))
@@ -64,7 +65,7 @@ def locate(table: IntArray, rows: Records, key: int) -> int:
 
 
 @compiled
-def rows_of(table: IntArray, rows: Records, wanted: IntArray) -> IntArray:
+def rows_of(table: IntArray, rows: RecordArray, wanted: IntArray) -> IntArray:
     """Row of each key, (n,); NONE where it is unknown."""
     out = np.empty(len(wanted), np.int64)
     for group in range(0, len(wanted), AHEAD):
@@ -80,23 +81,21 @@ def rows_of(table: IntArray, rows: Records, wanted: IntArray) -> IntArray:
 
 
 @compiled
-def slots_for(
-    table: IntArray, belief: PackedArray, cells: Records, wanted: IntArray, used: int
-) -> tuple[IntArray, int]:  # fmt: skip
+def slots_for(table: IntArray, live: Rows, wanted: IntArray, used: int) -> tuple[IntArray, int]:
     """Slot of each key, (n,), and how many are used then; an unknown key begins the next. Room must be there."""
     out = np.empty(len(wanted), np.int64)
     for i in range(len(wanted)):
-        place = locate(table, cells, wanted[i])
+        place = locate(table, live.cells, wanted[i])
         if table[place] == NONE:
             table[place] = _held(_mixed(wanted[i]), used)
-            begin(belief, cells, used, wanted[i])
+            begin_slot(live, used, wanted[i])
             used += 1
         out[i] = _row(table[place])
     return out, used
 
 
 @compiled
-def numbered(table: IntArray, rows: Records, wanted: IntArray, used: int) -> tuple[IntArray, int]:
+def numbered(table: IntArray, rows: RecordArray, wanted: IntArray, used: int) -> tuple[IntArray, int]:
     """Row of each key, (n,), and how many are used then; an unknown key is written to the next of `rows`."""
     out = np.empty(len(wanted), np.int64)
     for i in range(len(wanted)):
@@ -110,20 +109,20 @@ def numbered(table: IntArray, rows: Records, wanted: IntArray, used: int) -> tup
 
 
 @compiled
-def fill(table: IntArray, rows: Records, used: int) -> None:
+def fill(table: IntArray, rows: RecordArray, used: int) -> None:
     """Enter the first `used` rows into an empty table."""
     for row in range(used):
         table[locate(table, rows, rows[row].key)] = _held(_mixed(rows[row].key), row)
 
 
 @refcount_free_inlined
-def first_place(pairs: Records, slot: int, vehicle: int) -> int:
+def first_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
     """Where a pair is sought first."""
     return _first(_mixed((np.int64(slot) << np.int64(32)) | np.int64(vehicle)), len(pairs))
 
 
 @refcount_free_inlined
-def pair_place(pairs: Records, slot: int, vehicle: int) -> int:
+def pair_place(pairs: RecordArray, slot: int, vehicle: int) -> int:
     """Place of a pair in a table that holds the pairs themselves, or the free place (slot NONE) where it belongs."""
     place = first_place(pairs, slot, vehicle)
     while pairs[place].slot != NONE and (pairs[place].slot != slot or pairs[place].vehicle != vehicle):
@@ -131,14 +130,14 @@ def pair_place(pairs: Records, slot: int, vehicle: int) -> int:
     return place
 
 
-def grown(rows: Records, used: int, entries: int) -> IntArray:
+def table_of(rows: RecordArray, used: int, entries: int) -> IntArray:
     """A table with room for `entries` that holds the first `used` rows."""
-    table = np.full(room(entries, ROWS_MOST), NONE, np.int64)
+    table = np.full(places_for(entries, ROWS_MOST), NONE, np.int64)
     fill(table, rows, used)
     return table
 
 
-def room(entries: int, most: float) -> int:
+def places_for(entries: int, most: float) -> int:
     """Places for so many entries, and for a third more until a share `most` is taken: an hour after three, of pairs."""
     return max(LEAST, int(1.35 * entries / most))
 

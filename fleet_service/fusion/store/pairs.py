@@ -1,33 +1,33 @@
-"""What a vehicle said in a cell before: its entries in the window, chained, and the pair's row for what is older."""
+"""What a vehicle reported in a cell before: its linked entries in the window, and the record of what is older."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from fleet_service.fusion.belief import VALUE
-from fleet_service.fusion.cells import NONE, SECOND, Records
-from fleet_service.fusion.pools import PAIRS
-from fleet_service.fusion.table import AHEAD, pair_place
+from fleet_service.fusion.store.records import NONE, PAIRS, SECOND, State
+from fleet_service.fusion.store.table import AHEAD, pair_place
 from schemas.numeric import IntArray
 from schemas.runtime.jit import compiled, prefetch, refcount_free_inlined
+from schemas.runtime.records import RecordArray
 
 _FIBONACCI = np.uint64(0x9E3779B97F4A7C15)  # 2⁶⁴ over the golden ratio: its multiples lie far apart
 
 
 @refcount_free_inlined
-def earlier(entries: Records, a: int, b: int) -> bool:
-    """Whether entry `a` is folded before `b`: by time, then by identity."""
+def precedes(entries: RecordArray, a: int, b: int) -> bool:
+    """Whether entry `a` comes before `b`: by time, then by identity."""
     if entries[a].time != entries[b].time:
         return bool(entries[a].time < entries[b].time)
     if entries[a].number != entries[b].number:
         return bool(entries[a].number < entries[b].number)
     if entries[a].boot != entries[b].boot:
         return bool(entries[a].boot < entries[b].boot)
-    return bool(entries[a].place < entries[b].place)
+    return bool(entries[a].sequence < entries[b].sequence)
 
 
 @refcount_free_inlined
-def pair_of(pairs: Records, used: IntArray, slot: int, vehicle: int) -> int:
+def pair_of(pairs: RecordArray, used: IntArray, slot: int, vehicle: int) -> int:
     """Place of a pair; makes it where there is none."""
     pair = pair_place(pairs, slot, vehicle)
     if pairs[pair].slot == NONE:
@@ -42,12 +42,12 @@ def pair_of(pairs: Records, used: IntArray, slot: int, vehicle: int) -> int:
 
 
 @refcount_free_inlined
-def chain(entries: Records, pairs: Records, pair: int, entry: int) -> None:
+def link_pair(entries: RecordArray, pairs: RecordArray, pair: int, entry: int) -> None:
     """Put an entry among those of its vehicle in its window."""
     pairs[pair].waiting += 1
     entries[entry].pair = pair
     before, after = int(pairs[pair].last), NONE
-    while before != NONE and earlier(entries, entry, before):
+    while before != NONE and precedes(entries, entry, before):
         before, after = int(entries[before].before), before
     entries[entry].before = before
     entries[entry].after = after
@@ -60,8 +60,8 @@ def chain(entries: Records, pairs: Records, pair: int, entry: int) -> None:
 
 
 @refcount_free_inlined
-def remember(entries: Records, pairs: Records, entry: int) -> None:
-    """What an entry said becomes what its vehicle said before the checkpoint; later ones stand alone."""
+def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
+    """What an entry reported becomes what its vehicle reported before the checkpoint; later entries stand alone."""
     pair, kind = int(entries[entry].pair), int(entries[entry].kind)
     pairs[pair].time[kind] = entries[entry].time // SECOND
     pairs[pair].mean[kind] = entries[entry].last_mean
@@ -76,15 +76,15 @@ def remember(entries: Records, pairs: Records, entry: int) -> None:
 
 
 @refcount_free_inlined
-def _stays(pairs: Records, place: int, least: int) -> bool:
-    """Whether a pair spoke since `least` [s], or waits in the window."""
+def _stays(pairs: RecordArray, place: int, least: int) -> bool:
+    """Whether a pair reported since `least` [s], or waits in the window."""
     pair = pairs[place]
     return bool(pair.last != NONE or pair.time[0] >= least or pair.time[1] >= least)
 
 
 @compiled
-def staying(pairs: Records, least: int) -> int:
-    """How many pairs spoke since `least` [s]."""
+def count_staying(pairs: RecordArray, least: int) -> int:
+    """How many pairs reported since `least` [s]."""
     count = 0
     for place in range(len(pairs)):
         count += pairs[place].slot != NONE and _stays(pairs, place, least)
@@ -92,8 +92,8 @@ def staying(pairs: Records, least: int) -> int:
 
 
 @compiled
-def moved(entries: Records, old: Records, new: Records, least: int) -> IntArray:
-    """Move the pairs that spoke since `least` [s] to another table; returns the places of the others."""
+def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, least: int) -> IntArray:
+    """Move the pairs that reported since `least` [s] to another table; returns the places of the others."""
     gone, count = np.empty(len(old), np.int64), 0
     for begin in range(0, len(old), AHEAD):
         end = min(begin + AHEAD, len(old))
@@ -123,10 +123,11 @@ def returning(number: int) -> np.uint64:
 
 
 @compiled
-def mark_returned(cells: Records, kept: Records, slots: IntArray, numbers: IntArray) -> None:
-    """Note in cells (k,) that vehicles (k,) were there, though what they said is forgotten."""
+def mark_returned(state: State, slots: IntArray, numbers: IntArray) -> None:
+    """Note in cells (k,) that vehicles (k,) were there, though what they reported is forgotten."""
     for k in range(len(slots)):
         slot, bit = slots[k], returning(numbers[k])
-        cells[slot].returned |= bit
-        if cells[slot].window != NONE:
-            kept[cells[slot].window].returned |= bit
+        state.live.cells[slot].returned |= bit
+        window = state.live.cells[slot].window
+        if window != NONE:
+            state.base.cells[window].returned |= bit

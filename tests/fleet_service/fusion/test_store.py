@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from fleet_service.fusion import Fusion
-from fleet_service.fusion.cells import NONE
-from fleet_service.fusion.pools import GRIP, ICE, PAIRS, VEHICLE, VOICES
-from fleet_service.fusion.table import PAIRS_MOST, fill, rows_of
+from fleet_service.fusion.store.records import GRIP, ICE, NONE, PAIRS, REPORTERS_USED, VEHICLE
+from fleet_service.fusion.store.table import PAIRS_MOST, fill, rows_of
 from tests.fleet_service.examples import CELL, START, at_least, belief, observations, value
 
 LATENESS_S = 120.0
@@ -30,28 +29,28 @@ def test_a_table_of_any_length_finds_every_row_and_no_other(places: int) -> None
 def test_pairs_take_no_more_than_their_share_and_are_found_after_every_growth() -> None:
     fusion, vehicles = Fusion(LATENESS_S), 3000
     for step in range(3):
-        fusion.fold(
+        fusion.update(
             observations(
                 [10.0 * step + 0.001 * k for k in range(vehicles)], np.arange(vehicles), at_least([0.3] * vehicles)
             )
         )
-    state = fusion.stores.state
+    state = fusion.store.state
     assert state.used[PAIRS] == vehicles <= PAIRS_MOST * len(state.pairs)
     assert fusion.live.vehicles[0] == vehicles
     assert fusion.live.visits[0] == 3 * vehicles
 
 
-def test_speakers_and_witnesses_of_hours_ago_are_given_back_and_new_ones_take_their_place() -> None:
+def test_reporters_and_sources_of_hours_ago_are_dropped_and_new_ones_take_their_place() -> None:
     fusion = Fusion(LATENESS_S)
     cells = CELL + np.arange(40)
-    fusion.fold(observations(np.arange(40.0), np.arange(40), value([0.2] * 40), cells))
+    fusion.update(observations(np.arange(40.0), np.arange(40), value([0.2] * 40), cells))
     slots = fusion.slots_of(cells, np.zeros(40, np.int64))
-    assert fusion.witnesses(slots, ICE, START - 1)[0].tolist() == [1] * 40
-    fusion.fold(observations([4 * HOUR], [1], value([0.8]), CELL))
-    assert fusion.stores.state.used[VOICES] == 1  # the window's
+    assert fusion.sources(slots, ICE, START - 1)[0].tolist() == [1] * 40
+    fusion.update(observations([4 * HOUR], [1], value([0.8]), CELL))
+    assert fusion.store.state.used[REPORTERS_USED] == 1  # the window's
     before = belief(fusion, CELL + 7)
-    fusion.fold(observations([4 * HOUR + 10.0, 4 * HOUR + 20.0], [50, 51], value([0.8, 0.8]), CELL + 7))
-    assert fusion.stores.state.used[VOICES] == 2
-    assert fusion.witnesses(slots[7:8], GRIP, START - 1)[0].tolist() == [2]
-    assert fusion.witnesses(slots[8:9], GRIP, START - 1)[0].tolist() == [0]
+    fusion.update(observations([4 * HOUR + 10.0, 4 * HOUR + 20.0], [50, 51], value([0.8, 0.8]), CELL + 7))
+    assert fusion.store.state.used[REPORTERS_USED] == 2
+    assert fusion.sources(slots[7:8], GRIP, START - 1)[0].tolist() == [2]
+    assert fusion.sources(slots[8:9], GRIP, START - 1)[0].tolist() == [0]
     assert not np.allclose(belief(fusion, CELL + 7), before)

@@ -1,0 +1,82 @@
+"""Observations as the fusion takes them, and how they are made of the columns of messages or of the archive. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_service.fusion.likelihoods import evidence
+from fleet_service.fusion.space import other_cells
+from schemas import grid
+from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray
+
+SmallArray = NDArray[np.int8]
+ROWS_PER_SEQ: Final = 64  # more than a batch has rows: seq and row become one number that keeps their order
+_US: Final = 1000  # ns: the archive keeps whole microseconds
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observations:
+    """Admitted visits, arrays of shape (n,).
+
+    Attributes:
+        time: end of the visit [ns].
+        cell, sector, second: where; `second` is a sector whose edge is near, or -1.
+        vehicle, boot, region, sequence: identity; `vehicle` is a number that stands for the vehicle, `sequence` counts
+            rows in the stream of (vehicle, boot, region).
+        evidence: (n, 32) log-likelihood in steps, see `likelihoods.evidence`.
+        reported: (n, 3) mean, standard deviation and P(slippery) of a value as it was reported, NaN to read them in
+            `evidence`.
+        other: (n, k) other cells in which the vehicle may have been instead, -1 where there is none.
+        other_share: (n, k) probability that it was there; what is left belongs to `cell`.
+    """
+
+    time: IntArray
+    cell: IntArray
+    sector: SmallArray
+    second: SmallArray
+    vehicle: IntArray
+    boot: IntArray
+    region: IntArray
+    sequence: IntArray
+    evidence: ByteArray
+    reported: Float32Array
+    other: IntArray
+    other_share: Float32Array
+
+    def take(self, rows: IntArray | BoolArray) -> Observations:
+        """Some of the rows."""
+        return Observations(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+
+def observations_of(columns: Mapping[str, NDArray[Any]], vehicle: IntArray) -> Observations:
+    """Columns (n,) of admitted rows as the fusion takes them.
+
+    Args:
+        columns: those of the archive, times in ns; `told` is whether a sender gave its `log_likelihood` (n, 32).
+        vehicle: (n,) number of each vehicle.
+
+    Times are those that the archive keeps, in whole microseconds.
+    """
+    _, second = grid.sectors_touched(np.nan_to_num(columns["yaw"]))
+    first = columns["sector"].astype(np.int8)
+    steps, reported = evidence(columns, columns["told"])
+    other, share = other_cells(columns["cell"], columns["latitude"], columns["yaw"], columns["position_std"])
+    return Observations(
+        time=columns["leave_time"] // _US * _US,
+        cell=columns["cell"],
+        sector=first,
+        second=np.where(np.isnan(columns["yaw"]) | (second == first), -1, second).astype(np.int8),
+        vehicle=vehicle,
+        boot=columns["boot"],
+        region=columns["region"],
+        sequence=columns["seq"] * ROWS_PER_SEQ + columns["row"],
+        evidence=steps,
+        reported=reported,
+        other=other,
+        other_share=share,
+    )

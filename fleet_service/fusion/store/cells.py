@@ -1,0 +1,78 @@
+"""The cells by columns, to read; and what is done with their rows."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_service.fusion.belief import FULL, PackedArray
+from fleet_service.fusion.store.records import CELL, NONE, SOURCES, Int32Array, Rows, UIntArray
+from schemas import mugrid
+from schemas.numeric import Float32Array, IntArray
+from schemas.runtime.jit import LINE, refcount_free, refcount_free_inlined
+from schemas.runtime.records import RecordArray
+
+
+class Cells(NamedTuple):
+    """What is known of each slot: `belief` (n, 32) in 16 bits, see `belief.unpack`, and the columns (n,) of
+    `records.CellRecord`; `untrusted` is (n, 2)."""
+
+    belief: PackedArray
+    key: IntArray
+    time: IntArray
+    first: IntArray
+    returned: NDArray[np.uint64]
+    aged: Float32Array
+    visits: UIntArray
+    vehicles: UIntArray
+    values: Float32Array
+    untrusted: Float32Array
+    window: Int32Array
+    reporters: Int32Array
+
+
+def cells_of(rows: Rows) -> Cells:
+    """Columns of rows."""
+    return Cells(rows.belief, *(rows.cells[name] for name in CELL.names or ()))
+
+
+def rows_of_lines(rows: int, kind: np.dtype[Any], *shape: int) -> NDArray[Any]:
+    """Zeros (rows, *shape) that begin where a LINE does, so that a row of 64 bytes costs one read of memory."""
+    size = rows * kind.itemsize * int(np.prod(shape, dtype=np.int64))
+    memory = np.zeros(size + LINE, np.uint8)
+    begin = -memory.ctypes.data % LINE
+    return memory[begin : begin + size].view(kind).reshape(rows, *shape)
+
+
+def no_beliefs(rows: int) -> PackedArray:
+    """Room for beliefs at rest."""
+    return rows_of_lines(rows, np.dtype(np.uint16), mugrid.BINS)
+
+
+@refcount_free
+def begin_slot(live: Rows, slot: int, key: int) -> None:
+    """A slot that holds the prior."""
+    live.belief[slot] = FULL
+    cell = live.cells[slot]
+    cell.key, cell.window, cell.reporters = key, NONE, NONE
+
+
+@refcount_free_inlined
+def copy_row(source: Rows, at: int, target: Rows, to: int) -> None:
+    """What is known of a slot, from one row to another; not where its window and its reporters lie."""
+    for i in range(mugrid.BINS):
+        target.belief[to, i] = source.belief[at, i]
+    window, reporters = target.cells[to].window, target.cells[to].reporters
+    target.cells[to] = source.cells[at]
+    target.cells[to].window, target.cells[to].reporters = window, reporters
+
+
+@refcount_free_inlined
+def copy_sources(source: RecordArray, at: int, target: RecordArray, to: int) -> None:
+    """The corroborating sources of a slot, from one row to another."""
+    for side in range(2):
+        for k in range(SOURCES):
+            target[to].source[side, k] = source[at].source[side, k]
+            target[to].source_time[side, k] = source[at].source_time[side, k]
