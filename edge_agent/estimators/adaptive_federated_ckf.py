@@ -35,8 +35,8 @@ from edge_agent.estimators.gaussian.telling import (
     tell_nothing,
     tell_prior,
     tell_rest,
-    variance,
 )
+from edge_agent.filters.cholesky import variance
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled, nogil
 from schemas.runtime.records import Records, records

@@ -46,10 +46,11 @@ from edge_agent.estimators.gaussian.telling import (
     tell_nothing,
     tell_prior,
     tell_rest,
-    variance,
 )
+from edge_agent.filters.cholesky import variance
+from edge_agent.filters.householder import predict, update
+from edge_agent.filters.points import deviations, sigma_points, weighted_mean
 from edge_agent.filters.sigma import cubature
-from edge_agent.filters.squareroot import deviations, predict, sigma_points, update, weighted_mean
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled, nogil
 from schemas.runtime.records import Records, records

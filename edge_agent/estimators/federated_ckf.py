@@ -42,12 +42,12 @@ from edge_agent.estimators.gaussian.telling import (
     tell_nothing,
     tell_rest,
     tell_wheel,
-    variance,
 )
+from edge_agent.filters.cholesky import variance
 from edge_agent.filters.federated import fuse, share
+from edge_agent.filters.householder import update
+from edge_agent.filters.points import axis_points, deviations, weighted_mean
 from edge_agent.filters.sigma import cubature
-from edge_agent.filters.squareroot import deviations, update, weighted_mean
-from edge_agent.filters.svd import axis_points
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled, nogil

@@ -43,10 +43,11 @@ from edge_agent.estimators.gaussian.telling import (
     tell_motion,
     tell_nothing,
     tell_rest,
-    variance,
 )
-from edge_agent.filters.columns import gather, look, spread
-from edge_agent.filters.squareroot import LOG_TWO_PI
+from edge_agent.filters.cholesky import variance
+from edge_agent.filters.columns import gather, spread
+from edge_agent.filters.householder import LOG_TWO_PI
+from edge_agent.filters.sequential import carlson
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled, nogil
 from schemas.runtime.records import Records, records
@@ -199,7 +200,7 @@ def _step(memory: Memory, design: Design, gone: float, scratch: Scratch) -> None
         # the measurement is linear, a state itself
         reading = memory.track.now[r]
         if not math.isnan(reading):
-            far, expected = look(mean, root, X.AX + r, reading, scratch.noise[r], scratch.gain)
+            far, expected = carlson(mean, root, X.AX + r, reading, scratch.noise[r], scratch.gain)
             used, square, determinant = used + 1, square + far, determinant * expected
     memory.nis = square / max(used, 1)
     memory.log_likelihood = -0.5 * (used * LOG_TWO_PI + math.log(determinant) + square)

@@ -50,11 +50,12 @@ from edge_agent.estimators.gaussian.telling import (
     tell_nothing,
     tell_rest,
     tell_wheel,
-    variance,
 )
+from edge_agent.filters.cholesky import variance
 from edge_agent.filters.downdate import update_by_downdate
+from edge_agent.filters.householder import predict
+from edge_agent.filters.points import deviations, sigma_points, weighted_mean
 from edge_agent.filters.sigma import unscented
-from edge_agent.filters.squareroot import deviations, predict, sigma_points, weighted_mean
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled, nogil

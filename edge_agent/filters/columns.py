@@ -4,16 +4,16 @@ Legend
     m, L        state's mean (n,), and its lower-triangular square root of the covariance, P = L*L'     (n, n)
     x           points in columns                                                                      (n, 2n)
     q           standard deviations of the process noise, independent                                  (n,)
-    f, a        row i of L, and the innovation variance f*f' + r of a measurement of state i
 
-The same filter as `sigma.cubature` with `squareroot`, for two cases that allow less work: all weights are 1/(2n), and
-what is measured is a state itself. Points lie along the fast axis, so that the model moves several at once.
+The same points and the same prediction as `points` and `householder` with `sigma.cubature`, for less work: all weights
+are 1/(2n). Points lie along the fast axis, so that the model moves several at once.
 """
 
 from __future__ import annotations
 
 import math
 
+from edge_agent.filters.cholesky import factorize_column
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import inlined
 
@@ -54,44 +54,5 @@ def gather(points: FloatArray, noise_std: FloatArray, pace: float, mean: FloatAr
             sqrt_cov[i, j] = weight * total
     for j in range(n):
         own = (pace * noise_std[j]) ** 2
-        total = sqrt_cov[j, j] + own
-        for k in range(j):
-            total -= sqrt_cov[j, k] * sqrt_cov[j, k]
-        pivot = math.sqrt(max(total, own))
-        sqrt_cov[j, j] = pivot
-        per = 1.0 / pivot
-        for i in range(j + 1, n):
-            total = sqrt_cov[i, j]
-            for k in range(j):
-                total -= sqrt_cov[i, k] * sqrt_cov[j, k]
-            sqrt_cov[i, j] = total * per
-            sqrt_cov[j, i] = 0.0
-
-
-@inlined
-def look(
-    mean: FloatArray, sqrt_cov: FloatArray, i: int, reading: float, variance: float, gain: FloatArray
-) -> tuple[float, float]:
-    """Take in a `reading` of state i with noise `variance` > 0; (innovation squared over a, a). gain (n,) is scratch.
-
-    Carlson (1973): as Potter's update, but L stays triangular. The rows of the factor are turned by 2 x 2 rotations
-    whose cosines come from sums of squares alone; nothing is subtracted from a covariance.
-    """
-    n = mean.shape[0]
-    for k in range(n):
-        gain[k] = 0.0
-    after = variance
-    for j in range(i, -1, -1):
-        part, before = sqrt_cov[i, j], after
-        after = before + part * part
-        per = 1.0 / math.sqrt(before * after)
-        keep, lose = before * per, part * per
-        for k in range(j, n):
-            held = sqrt_cov[k, j]
-            sqrt_cov[k, j] = keep * held - lose * gain[k]
-            gain[k] += part * held
-    innovation = reading - mean[i]
-    share = innovation / after
-    for k in range(n):
-        mean[k] += gain[k] * share
-    return innovation * share, after
+        sqrt_cov[j, j] += own
+        factorize_column(sqrt_cov, j, own)

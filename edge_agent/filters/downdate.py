@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from edge_agent.filters.squareroot import LOG_TWO_PI, triangularize, update
+from edge_agent.filters.householder import LOG_TWO_PI, triangularize, update
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 

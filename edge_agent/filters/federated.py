@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 
-from edge_agent.filters.squareroot import triangularize
+from edge_agent.filters.householder import triangularize
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 

@@ -29,10 +29,10 @@ from edge_agent.estimators.friction_mixture.residuals import (
 )
 from edge_agent.estimators.friction_mixture.tyre_curve import TyreCurve
 from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, NodeWorkspace, Scratch
+from edge_agent.filters.cholesky import multiply
+from edge_agent.filters.sequential import potter, project
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
-
-LEAST_VARIANCE = 1e-18
 
 
 class NodeUpdate(NamedTuple):
@@ -43,25 +43,6 @@ class NodeUpdate(NamedTuple):
     plain: float  # log-likelihood with the plain R, rows taken as independent [nat]
     square: float  # normalised innovation squared with the plain R
     rows: int
-
-
-@compiled
-def factorize(covariance: FloatArray, root: FloatArray) -> None:
-    """root (n, n) = lower-triangular Cholesky factor of covariance (n, n), of which the lower half is read."""
-    n = covariance.shape[0]
-    for j in range(n):
-        total = covariance[j, j]
-        for k in range(j):
-            total -= root[j, k] * root[j, k]
-        diagonal = math.sqrt(max(total, LEAST_VARIANCE))
-        root[j, j] = diagonal
-        share = 1.0 / diagonal
-        for i in range(j + 1, n):
-            total = covariance[i, j]
-            for k in range(j):
-                total -= root[i, k] * root[j, k]
-            root[i, j] = total * share
-            root[j, i] = 0.0
 
 
 @compiled
@@ -220,37 +201,18 @@ def take_rows(mean: FloatArray, root: FloatArray, node: NodeWorkspace, axle_pena
 
     What ln det S costs is weighed by axle_penalty for the axles and nothing for the wheels.
     """
-    n, loss, used = mean.shape[0], 0.0, 0
+    loss, used = 0.0, 0
     for r in range(ROWS):
         if math.isnan(node.residual[r]):
             continue
         used += 1
-        variance = node.inflated[r]
-        for c in range(ACTIVE):
-            node.column[c] = node.deviation[r, c]
-            variance += node.column[c] ** 2
-        share = 1.0 / variance
-        gain = share / (1.0 + math.sqrt(node.inflated[r] * share))
-        step = node.residual[r] * share
+        variance, gain = potter(node.deviation[r], node.inflated[r])
+        step = node.residual[r] * (1.0 / variance)
         loss += 0.5 * node.residual[r] * step
         if r >= 4:
             loss += 0.5 * axle_penalty * math.log(variance)
-        for i in range(n):
-            along = 0.0
-            for c in range(ACTIVE):
-                along += root[i, c] * node.column[c]
-            mean[i] += along * step
-            along *= gain
-            for c in range(ACTIVE):
-                root[i, c] -= along * node.column[c]
-        for k in range(r + 1, ROWS):
-            along = 0.0
-            for c in range(ACTIVE):
-                along += node.deviation[k, c] * node.column[c]
-            node.residual[k] -= along * step
-            along *= gain
-            for c in range(ACTIVE):
-                node.deviation[k, c] -= along * node.column[c]
+        project(mean, root, node.deviation[r], step, gain)
+        project(node.residual[r + 1 :], node.deviation[r + 1 :], node.deviation[r], -step, gain)
     return loss, used
 
 
@@ -289,9 +251,4 @@ def predict_node(
     mean[NodeState.VY] = turn_cos * vy - turn_sin * vx + gained_y
     for i in range(NodeState.LN_KX, n):
         mean[i] = nominal.mean[i] + keep[i] * (mean[i] - nominal.mean[i])
-    for i in range(n):
-        for k in range(i + 1):
-            total = noise[i] if i == k else 0.0
-            for m in range(n):
-                total += root[i, m] * root[k, m]
-            covariance[i, k] = covariance[k, i] = total
+    multiply(root, noise, covariance)

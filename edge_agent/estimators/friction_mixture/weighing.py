@@ -10,13 +10,15 @@ from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.friction_grid import reweigh
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.mixing import awake, reset_diverged
-from edge_agent.estimators.friction_mixture.node_filter import factorize, update_node
+from edge_agent.estimators.friction_mixture.node_filter import update_node
 from edge_agent.estimators.friction_mixture.restart import SLOWEST_M_S
 from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, Scratch
+from edge_agent.filters.cholesky import factorize
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 
+LEAST_VARIANCE = 1e-18  # of a state given the states before it
 LEAST_DEMAND = 1e-3  # [1] below it no evidence is left
 
 
@@ -41,7 +43,7 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
         scratch.actual_sum[group] = scratch.theoretical_sum[group] = 0.0
     top, nis, rows = -math.inf, 0.0, 0
     for j in range(count):
-        factorize(memory.covariance[j], scratch.root[j])
+        factorize(memory.covariance[j], scratch.root[j], LEAST_VARIANCE)
         found = update_node(memory, design, scratch, j, inflation)
         scratch.log_likelihood[j], scratch.moved[j] = found.log_likelihood, found.moved
         scratch.joint[j] = found.plain + math.log(memory.weight[j])

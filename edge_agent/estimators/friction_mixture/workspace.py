@@ -67,7 +67,6 @@ class NodeWorkspace:
     deviation: Annotated[FloatArray, ROWS, ACTIVE]
     noise: Annotated[FloatArray, ROWS]  # variance of the rows' noise
     inflated: Annotated[FloatArray, ROWS]  # the same for correlation in time and for outliers
-    column: Annotated[FloatArray, ACTIVE]
 
 
 class Scratch:

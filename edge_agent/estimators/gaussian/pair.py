@@ -25,9 +25,9 @@ from edge_agent.estimators.gaussian.intake import Track, wheel_force
 from edge_agent.estimators.gaussian.planar import POINTS, carry
 from edge_agent.estimators.gaussian.telling import FIRST_V_STD, UNKNOWN_V_STD
 from edge_agent.filters.federated import fuse, share
+from edge_agent.filters.householder import predict, update
+from edge_agent.filters.points import axis_points, deviations, weighted_mean
 from edge_agent.filters.sigma import cubature
-from edge_agent.filters.squareroot import deviations, predict, update, weighted_mean
-from edge_agent.filters.svd import axis_points
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S

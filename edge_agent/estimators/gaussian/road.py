@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from edge_agent.estimators.gaussian.telling import PRIOR_MU, PRIOR_MU_STD
-from edge_agent.filters.squareroot import triangularize
+from edge_agent.filters.householder import triangularize
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 

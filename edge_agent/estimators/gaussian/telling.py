@@ -14,6 +14,7 @@ from edge_agent.dynamics.slip import SLOWEST_M_S, along_wheel
 from edge_agent.estimators import flags
 from edge_agent.estimators.estimates import Y
 from edge_agent.estimators.gaussian.intake import Track
+from edge_agent.filters.cholesky import variance
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
@@ -86,15 +87,6 @@ def tell_no_wheel(told: FloatArray) -> None:
     for wheel in range(4):
         told[Y.WHEELS + 3 * wheel + 0], told[Y.WHEELS + 3 * wheel + 1] = told[Y.MU], told[Y.MU_LOWER]
         told[Y.WHEELS + 3 * wheel + 2] = told[Y.MU_UPPER]
-
-
-@compiled
-def variance(root: FloatArray, i: int) -> float:
-    """Variance of state i of a covariance with factor root (n, n)."""
-    total = 0.0
-    for j in range(i + 1):
-        total += root[i, j] * root[i, j]
-    return total
 
 
 @compiled

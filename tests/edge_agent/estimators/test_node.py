@@ -1,4 +1,4 @@
-"""The pieces of a node against textbooks: its factor, its update row by row, its tyre curve."""
+"""The pieces of a node against textbooks: its update row by row, its tyre curve."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from edge_agent.dynamics.tyres import magic_formula
 from edge_agent.estimators.friction_mixture.constants import ACTIVE, NODES, ROWS, STATES, Constants
 from edge_agent.estimators.friction_mixture.friction_grid import node_table
-from edge_agent.estimators.friction_mixture.node_filter import factorize, take_rows, unfelt
+from edge_agent.estimators.friction_mixture.node_filter import take_rows, unfelt
 from edge_agent.estimators.friction_mixture.split_sides import project, side_table
 from edge_agent.estimators.friction_mixture.tyre_curve import curve_tables, ratio_at, theta_at
 from edge_agent.estimators.friction_mixture.workspace import NodeWorkspace
@@ -22,14 +22,6 @@ SEEDS = (0, 1, 2)
 def covariance(seed: int) -> np.ndarray:
     factor = np.random.default_rng(seed).normal(size=(STATES, STATES))
     return np.asarray(factor @ factor.T + 0.1 * np.eye(STATES))
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_covariance_is_its_factor_times_itself_turned(seed: int) -> None:
-    root = np.zeros((STATES, STATES))
-    factorize(covariance(seed), root)
-    assert root @ root.T == pytest.approx(covariance(seed), abs=1e-10)
-    assert root == pytest.approx(np.linalg.cholesky(covariance(seed)), abs=1e-10)
 
 
 @pytest.mark.parametrize("missing", [(), (1,), (0, 4)])

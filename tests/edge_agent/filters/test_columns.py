@@ -1,13 +1,12 @@
-"""The cubature filter in columns is the one in rows: same points, same prediction, same update by a measured state."""
+"""The cubature filter in columns is the one in rows: same points, same prediction."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 import pytest
 
-from edge_agent.filters import columns, squareroot
+from edge_agent.filters import columns, householder
+from edge_agent.filters.points import sigma_points
 from edge_agent.filters.sigma import cubature
 from schemas.numeric import FloatArray
 
@@ -25,7 +24,7 @@ def test_columns_are_the_points_of_the_rule() -> None:
     mean, root = belief(0)
     points, rows = np.empty((N, 2 * N)), np.empty((2 * N, N))
     columns.spread(mean, root, points)
-    squareroot.sigma_points(mean, root, RULE.xi, rows)
+    sigma_points(mean, root, RULE.xi, rows)
     assert points == pytest.approx(rows.T, abs=1e-12)
 
 
@@ -34,7 +33,7 @@ def test_gathering_is_the_square_root_prediction(offset: float) -> None:
     points = np.random.default_rng(1).normal(size=(N, 2 * N)) + offset
     std, mean, root = np.linspace(0.1, 0.6, N), np.empty(N), np.empty((N, N))
     expected, expected_root = np.empty(N), np.empty((N, N))
-    squareroot.predict(
+    householder.predict(
         np.ascontiguousarray(points.T), RULE.w_mean, RULE.w_cov, 0.5 * np.diag(std), expected, expected_root,
         np.empty((N, 3 * N)),
     )  # fmt: skip
@@ -55,18 +54,3 @@ def test_a_pivot_is_never_less_than_its_noise_however_alike_the_states_are() -> 
     columns.gather(points, std, 1.0, mean, root)
     assert (np.diag(root) >= std).all()
     assert np.isfinite(root).all()
-
-
-@pytest.mark.parametrize("state", [0, 2, 5])
-def test_a_look_at_a_state_is_the_square_root_update(state: int) -> None:
-    mean, root = belief(3)
-    ours, ours_root, gain = mean.copy(), root.copy(), np.empty(N)
-    far, expected = columns.look(ours, ours_root, state, mean[state] + 0.7, 0.04, gain)
-    used, log_likelihood, square = squareroot.update(
-        mean, root, root.copy(), root[state : state + 1].copy(), np.array([0.7]), np.array([0.2]), np.zeros((9, 9))
-    )
-    assert ours == pytest.approx(mean, abs=1e-12)
-    assert ours_root == pytest.approx(root, abs=1e-12)
-    assert used == 1
-    assert square == pytest.approx(far, rel=1e-12)
-    assert -0.5 * (math.log(2.0 * math.pi * expected) + far) == pytest.approx(log_likelihood, rel=1e-12)

@@ -7,9 +7,9 @@ import pytest
 
 from edge_agent.filters.downdate import downdate, update_by_downdate
 from edge_agent.filters.federated import fuse, share
+from edge_agent.filters.householder import predict, update
+from edge_agent.filters.points import axis_points, sigma_points
 from edge_agent.filters.sigma import cubature
-from edge_agent.filters.squareroot import predict, sigma_points, update
-from edge_agent.filters.svd import axis_points
 from schemas.numeric import FloatArray
 
 

@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from edge_agent.filters import squareroot
+from edge_agent.filters import householder
+from edge_agent.filters.points import deviations, sigma_points
 from edge_agent.filters.sigma import SigmaRule, cubature, unscented
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
@@ -49,7 +50,7 @@ def test_a_negative_covariance_weight_is_refused() -> None:
 def test_triangularizing_keeps_the_product_and_makes_a_cholesky_factor(shape: tuple[int, int]) -> None:
     a = np.random.default_rng(5).normal(size=shape)
     b = a.copy()
-    squareroot.triangularize(b, *shape)
+    householder.triangularize(b, *shape)
     factor = b[:, : shape[0]]
     assert np.allclose(factor @ factor.T, a @ a.T, rtol=0, atol=1e-12)
     assert np.allclose(factor, np.tril(factor))
@@ -60,8 +61,8 @@ def test_triangularizing_keeps_the_product_and_makes_a_cholesky_factor(shape: tu
 def test_a_covariance_keeps_a_centimetre_at_an_offset_of_5400_kilometres(rule: SigmaRule) -> None:
     points, mean, work = np.empty((len(rule.xi), 2)), np.empty(2), np.zeros((2, 8))
     root = np.zeros((2, 2))
-    squareroot.sigma_points(np.array([5.4e6, -5.4e6]), 0.01 * np.eye(2), rule.xi, points)
-    squareroot.predict(points, rule.w_mean, rule.w_cov, np.zeros((2, 2)), mean, root, work)
+    sigma_points(np.array([5.4e6, -5.4e6]), 0.01 * np.eye(2), rule.xi, points)
+    householder.predict(points, rule.w_mean, rule.w_cov, np.zeros((2, 2)), mean, root, work)
     assert np.diag(root) == pytest.approx([0.01, 0.01], rel=1e-6)
 
 
@@ -76,10 +77,10 @@ def _moved(
     n = len(mean)
     count = len(rule.xi)
     points = np.empty((count, n))
-    squareroot.sigma_points(mean, factor_of(cov), rule.xi, points)
+    sigma_points(mean, factor_of(cov), rule.xi, points)
     new, root = np.empty(n), np.zeros((n, n))
     noise = factor_of(q)
-    squareroot.predict(points @ f.T, rule.w_mean, rule.w_cov, noise, new, root, np.zeros((n, count + n)))
+    householder.predict(points @ f.T, rule.w_mean, rule.w_cov, noise, new, root, np.zeros((n, count + n)))
     return new, root
 
 
@@ -88,14 +89,14 @@ def _corrected(
 ) -> tuple[FloatArray, FloatArray, tuple[int, float, float]]:
     n, count, rows = len(mean), len(rule.xi), len(z)
     points = np.empty((count, n))
-    squareroot.sigma_points(mean, root, rule.xi, points)
+    sigma_points(mean, root, rule.xi, points)
     x, y = np.empty((n, count)), np.empty((rows, count))
-    squareroot.deviations(points, mean, rule.w_cov, x, 0)
+    deviations(points, mean, rule.w_cov, x, 0)
     seen = points @ h.T
-    squareroot.deviations(seen, rule.w_mean @ seen, rule.w_cov, y, 0)
+    deviations(seen, rule.w_mean @ seen, rule.w_cov, y, 0)
     new, factor = mean.copy(), root.copy()
     work = np.zeros((rows + n, count + rows))
-    said = squareroot.update(new, factor, x, y, z - rule.w_mean @ seen, std, work)
+    said = householder.update(new, factor, x, y, z - rule.w_mean @ seen, std, work)
     return new, factor, said
 
 
@@ -137,7 +138,7 @@ def test_on_a_curved_measurement_the_square_root_is_the_textbook_covariance_filt
     nu = np.array([0.2, -0.5])
     k = c @ np.linalg.inv(s)
     new, root = mean.copy(), factor_of(cov)
-    squareroot.update(
+    householder.update(
         new, root, (points - mean).T / math.sqrt(6), (seen - centre).T / math.sqrt(6), nu, r, np.zeros((5, 8))
     )
     assert np.allclose(new, mean + k @ nu, rtol=0, atol=1e-9)
@@ -178,13 +179,13 @@ def test_on_a_curved_system_the_square_root_filter_stays_the_textbook_covariance
     for _ in range(100):
         z = rng.normal(0.3, 0.3, size=2)
         mean, cov = _textbook(rule, mean, cov, q, r, z)
-        squareroot.sigma_points(ours, root, rule.xi, points)
-        squareroot.predict(swing(points), rule.w_mean, rule.w_cov, factor_of(q), ours, root, work)
-        squareroot.sigma_points(ours, root, rule.xi, points)
+        sigma_points(ours, root, rule.xi, points)
+        householder.predict(swing(points), rule.w_mean, rule.w_cov, factor_of(q), ours, root, work)
+        sigma_points(ours, root, rule.xi, points)
         seen, x, y = look(points), np.empty((2, 4)), np.empty((2, 4))
-        squareroot.deviations(points, ours, rule.w_cov, x, 0)
-        squareroot.deviations(seen, rule.w_mean @ seen, rule.w_cov, y, 0)
-        squareroot.update(ours, root, x, y, z - rule.w_mean @ seen, r, work)
+        deviations(points, ours, rule.w_cov, x, 0)
+        deviations(seen, rule.w_mean @ seen, rule.w_cov, y, 0)
+        householder.update(ours, root, x, y, z - rule.w_mean @ seen, r, work)
         assert np.allclose(ours, mean, rtol=0, atol=1e-9)
         assert np.allclose(root @ root.T, cov, rtol=0, atol=1e-9)
 

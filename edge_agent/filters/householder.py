@@ -1,4 +1,4 @@
-"""Square-root predict and update on small arrays, for use inside larger compiled kernels.
+"""Square-root predict and update by orthogonal transformations, for use inside larger compiled kernels.
 
 Legend
     x, m        state, its mean                                            (n,)
@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 
+from edge_agent.filters.points import deviations, weighted_mean
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
@@ -52,39 +53,6 @@ def triangularize(a: FloatArray, rows: int, columns: int) -> None:
         elif a[i, i] < 0.0:
             for k in range(i, rows):
                 a[k, i] = -a[k, i]
-
-
-@compiled
-def sigma_points(mean: FloatArray, sqrt_cov: FloatArray, xi: FloatArray, points: FloatArray) -> None:
-    """points[j] = mean + sqrt_cov @ xi[j]; mean (n,), sqrt_cov (n, n), xi and points (points, n)."""
-    count, n = xi.shape
-    for p in range(count):
-        for i in range(n):
-            total = mean[i]
-            for j in range(i + 1):
-                total += sqrt_cov[i, j] * xi[p, j]
-            points[p, i] = total
-
-
-@compiled
-def weighted_mean(points: FloatArray, w_mean: FloatArray, mean: FloatArray) -> None:
-    """mean = sum of w_mean[j]*points[j], as the first point plus deviations so that large offsets lose no digits."""
-    count, n = points.shape
-    for i in range(n):
-        total = 0.0
-        for p in range(count):
-            total += w_mean[p] * (points[p, i] - points[0, i])
-        mean[i] = points[0, i] + total
-
-
-@compiled
-def deviations(points: FloatArray, mean: FloatArray, w_cov: FloatArray, out: FloatArray, row: int) -> None:
-    """out[row + i, j] = sqrt(w_cov[j])*(points[j, i] - mean[i]): the factor of a covariance from centred deviations."""
-    count, n = points.shape
-    for p in range(count):
-        root = math.sqrt(w_cov[p])
-        for i in range(n):
-            out[row + i, p] = root * (points[p, i] - mean[i])
 
 
 @compiled
@@ -169,9 +137,7 @@ def update(
         white /= work[row, row]
         log_likelihood -= math.log(work[row, row])
         square += white * white
-        work[row, points + used - 1] = (
-            white  # right of the diagonal all is zero by now: room for the whitened innovation
-        )
+        work[row, points + used - 1] = white  # right of the diagonal all is zero by now: room for it
         for i in range(n):
             mean[i] += work[used + i, row] * white
         row += 1

@@ -1,0 +1,65 @@
+"""The square root of a covariance, and the covariance of a square root.
+
+Legend: P covariance, L its lower-triangular factor with P = L*L' (Cholesky), both (n, n); q variances (n,).
+A pivot is what is left of a state's variance when the states before it are known; where it is below what is surely
+there (its own noise), rounding has taken it, and what is surely there takes its place.
+"""
+
+from __future__ import annotations
+
+import math
+
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled, inlined
+
+
+@inlined
+def factorize_column(a: FloatArray, j: int, least: float) -> None:
+    """Column j of the factor of a (n, n) in place, the columns before it being done; a pivot is at least `least` > 0.
+
+    Only the lower half is read; what is right of the diagonal becomes zero.
+    """
+    total = a[j, j]
+    for k in range(j):
+        total -= a[j, k] * a[j, k]
+    pivot = math.sqrt(max(total, least))
+    a[j, j] = pivot
+    per = 1.0 / pivot
+    for i in range(j + 1, a.shape[0]):
+        total = a[i, j]
+        for k in range(j):
+            total -= a[i, k] * a[j, k]
+        a[i, j] = total * per
+        a[j, i] = 0.0
+
+
+@compiled
+def factorize(covariance: FloatArray, sqrt_cov: FloatArray, least: float) -> None:
+    """sqrt_cov (n, n) = factor of covariance (n, n), of which the lower half is read."""
+    n = covariance.shape[0]
+    for i in range(n):
+        for j in range(i + 1):
+            sqrt_cov[i, j] = covariance[i, j]
+    for j in range(n):
+        factorize_column(sqrt_cov, j, least)
+
+
+@compiled
+def multiply(sqrt_cov: FloatArray, variances: FloatArray, covariance: FloatArray) -> None:
+    """covariance (n, n) = L*L' + diag(q), of any square root L (n, n) and variances q (n,) of independent noise."""
+    n = sqrt_cov.shape[0]
+    for i in range(n):
+        for j in range(i + 1):
+            total = variances[i] if i == j else 0.0
+            for k in range(n):
+                total += sqrt_cov[i, k] * sqrt_cov[j, k]
+            covariance[i, j] = covariance[j, i] = total
+
+
+@compiled
+def variance(sqrt_cov: FloatArray, i: int) -> float:
+    """Variance of state i of a covariance with factor sqrt_cov (n, n)."""
+    total = 0.0
+    for j in range(i + 1):
+        total += sqrt_cov[i, j] * sqrt_cov[i, j]
+    return total

@@ -1,0 +1,63 @@
+"""Points of a sigma rule from a mean and a square root of the covariance, and back.
+
+Legend
+    m, L        mean (n,) and sqrt_cov, lower triangular, covariance P = L*L'            (n, n)
+    xi          points of the rule for a standard normal variable                       (points, n)
+    A, S        axes and sizes of the covariance's ellipsoid: L = A*S*V' by singular values gives P = A*S^2*A', so A*S
+                is another square root of P (papers 000 and 001, equations 21 and 22)
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+
+
+@compiled
+def sigma_points(mean: FloatArray, sqrt_cov: FloatArray, xi: FloatArray, points: FloatArray) -> None:
+    """points[j] = mean + sqrt_cov @ xi[j]; mean (n,), sqrt_cov (n, n), xi and points (points, n)."""
+    count, n = xi.shape
+    for p in range(count):
+        for i in range(n):
+            total = mean[i]
+            for j in range(i + 1):
+                total += sqrt_cov[i, j] * xi[p, j]
+            points[p, i] = total
+
+
+@compiled
+def axis_points(mean: FloatArray, sqrt_cov: FloatArray, xi: FloatArray, points: FloatArray) -> None:
+    """points[p] = mean + A*S*xi[p]; mean (n,), sqrt_cov (n, n) finite, xi and points (points, n)."""
+    axes, size, _ = np.linalg.svd(sqrt_cov)
+    count, n = xi.shape
+    for p in range(count):
+        for i in range(n):
+            total = mean[i]
+            for j in range(n):
+                total += axes[i, j] * size[j] * xi[p, j]
+            points[p, i] = total
+
+
+@compiled
+def weighted_mean(points: FloatArray, w_mean: FloatArray, mean: FloatArray) -> None:
+    """mean = sum of w_mean[j]*points[j], as the first point plus deviations so that large offsets lose no digits."""
+    count, n = points.shape
+    for i in range(n):
+        total = 0.0
+        for p in range(count):
+            total += w_mean[p] * (points[p, i] - points[0, i])
+        mean[i] = points[0, i] + total
+
+
+@compiled
+def deviations(points: FloatArray, mean: FloatArray, w_cov: FloatArray, out: FloatArray, row: int) -> None:
+    """out[row + i, j] = sqrt(w_cov[j])*(points[j, i] - mean[i]): the factor of a covariance from centred deviations."""
+    count, n = points.shape
+    for p in range(count):
+        root = math.sqrt(w_cov[p])
+        for i in range(n):
+            out[row + i, p] = root * (points[p, i] - mean[i])

@@ -1,0 +1,70 @@
+"""Measurement updates of a square root by one scalar after the other.
+
+Legend
+    m, L        state's mean (n,), and its square root of the covariance, P = L*L'                      (n, n)
+    f           deviation of the measurement in the axes of L's columns, h = L*f its covariance with x   (n,)
+    r, a        variance of the noise, and of the innovation, a = f'*f + r
+    nu          innovation, measured minus predicted
+
+No variance is ever subtracted from another, so none can lose its sign. Rows whose noise is independent may be taken in
+one by one in any order; what the next rows deviate by changes with L, and `project` changes it alike.
+"""
+
+from __future__ import annotations
+
+import math
+
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import inlined
+
+
+@inlined
+def potter(f: FloatArray, noise: float) -> tuple[float, float]:
+    """(a, g) of a row f (k,) with noise variance > 0: then m <- m + L*f*nu/a and L <- L*(I - g*f*f') (Potter 1963)."""
+    a = noise
+    for c in range(f.shape[0]):
+        a += f[c] ** 2
+    share = 1.0 / a
+    return a, share / (1.0 + math.sqrt(noise * share))
+
+
+@inlined
+def project(mean: FloatArray, root: FloatArray, f: FloatArray, step: float, gain: float) -> None:
+    """mean (n,) += L*f*step, root L (n, k or more) <- L*(I - gain*f*f'); f (k,) is zero beyond."""
+    for i in range(mean.shape[0]):
+        along = 0.0
+        for c in range(f.shape[0]):
+            along += root[i, c] * f[c]
+        mean[i] += along * step
+        along *= gain
+        for c in range(f.shape[0]):
+            root[i, c] -= along * f[c]
+
+
+@inlined
+def carlson(
+    mean: FloatArray, sqrt_cov: FloatArray, i: int, reading: float, variance: float, gain: FloatArray
+) -> tuple[float, float]:
+    """Take in a `reading` of state i itself with noise `variance` > 0: (innovation squared over a, a).
+
+    L stays triangular (Carlson 1973): its rows are turned by 2 x 2 rotations whose cosines come from sums of squares
+    alone. gain (n,) is scratch.
+    """
+    n = mean.shape[0]
+    for k in range(n):
+        gain[k] = 0.0
+    after = variance
+    for j in range(i, -1, -1):
+        part, before = sqrt_cov[i, j], after
+        after = before + part * part
+        per = 1.0 / math.sqrt(before * after)
+        keep, lose = before * per, part * per
+        for k in range(j, n):
+            held = sqrt_cov[k, j]
+            sqrt_cov[k, j] = keep * held - lose * gain[k]
+            gain[k] += part * held
+    innovation = reading - mean[i]
+    share = innovation / after
+    for k in range(n):
+        mean[k] += gain[k] * share
+    return innovation * share, after
