@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: setup demo test check lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test
+.PHONY: setup demo test test-shuffled check lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test
 
 setup: $(STAMP)  ## make .venv and install everything, pinned
 
@@ -15,8 +15,11 @@ $(STAMP): pyproject.toml constraints.txt
 demo: setup  ## router, fleet service and simulated vehicles; ends with the map beside the truth
 	$(BIN)/python -m deploy.demo
 
-test: setup  ## the tests that take seconds
-	$(BIN)/python -m pytest -q
+test: setup  ## the tests that take seconds, a process a core; says what the slowest cost
+	$(BIN)/python -m pytest -q --numprocesses auto --dist loadfile --durations 10
+
+test-shuffled: setup  ## ten times in an order drawn anew: none may lean on another
+	for round in 1 2 3 4 5 6 7 8 9 10; do $(BIN)/python -m pytest -q --numprocesses auto --dist loadfile --random-order || exit 1; done
 
 lint: setup
 	$(BIN)/ruff check .

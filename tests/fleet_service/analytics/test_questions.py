@@ -20,6 +20,7 @@ from fleet_service.replay.rebuild import Since, replay
 from fleet_service.serve.map_state import cell_table
 from schemas import grid
 from schemas.errors import InputError
+from schemas.thresholds import Z_95
 from tests.fleet_service.analytics.agreement import Order
 from tests.fleet_service.analytics.conftest import HOUR_NS, PART, WORLD, visited
 
@@ -74,7 +75,7 @@ def test_touching_cells_of_one_sector_are_one_stretch() -> None:
 
 
 def test_the_bound_of_a_share_is_wilson_s() -> None:
-    z = 1.645
+    z = Z_95
     for hits, of in ((3, 10), (10, 10), (0, 5)):
         lower = wilson(np.array([hits]), np.array([of]))[0]
         assert (hits / of - lower) ** 2 == pytest.approx(z**2 * lower * (1 - lower) / of, abs=1e-12)
@@ -138,7 +139,7 @@ def test_the_interval_of_before_and_after_covers_as_often_as_it_says() -> None:
         })  # fmt: skip
         (row,) = expression(ibis.memtable(table), 150).to_pyarrow().to_pylist()
         std = np.sqrt(row["squares"] * row["vehicles"] / (row["vehicles"] - 1)) / row["w"]
-        covered += abs((row["later"] - row["before"]) / row["w"] - 0.1) < 1.645 * std
+        covered += abs((row["later"] - row["before"]) / row["w"] - 0.1) < Z_95 * std
     assert 0.78 < covered / runs < 0.99
 
 

@@ -326,7 +326,7 @@ def test_the_map_of_the_past_is_rebuilt_from_the_archive(fleet: Fleet) -> None:
         ("format=xml", "format: "),
         ("min_vehicles=many", "min_vehicles: "),
         ("route=1,2", "route: "),
-        ("route=0,0|90,0", "route: is 10008 km long"),
+        ("route=0,0|90,0", "route: is 10019 km long"),
         ("at=2999-01-01T00:00:00Z", "at: lies in the future"),
         ("colour=red", "colour: is no parameter"),
     ],
