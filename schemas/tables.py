@@ -6,15 +6,19 @@ from typing import Final, NamedTuple
 
 import pyarrow as pa
 
-from schemas import mugrid
+from schemas import grid, mugrid
 from schemas.signals import UNITS, per_wheel
 from schemas.thresholds import SLIPPERY_MU
 
 
 class Field(NamedTuple):
-    """One column; the service keeps floats as multiples of `step`, where there is one.
+    """One column.
 
-    A step is a power of two far below the value's own uncertainty; finer digits are noise, and a quarter of the bytes.
+    Attributes:
+        name, type, unit, meaning: of the column.
+        step: the service keeps floats as multiples of it, where there is one. It is a power of two far below the
+            value's own uncertainty; finer digits are noise, and a quarter of the bytes.
+        range: least and largest value that a report may carry, where the table is reported; NaN is 'absent'.
     """
 
     name: str
@@ -22,6 +26,7 @@ class Field(NamedTuple):
     unit: str
     meaning: str
     step: float | None = None
+    range: tuple[float, float] | None = None
 
 
 NS = pa.timestamp("ns", tz="UTC")
@@ -31,17 +36,20 @@ LIKELIHOOD = pa.binary(mugrid.BINS)
 F32, F64, I8, I32, I64 = pa.float32(), pa.float64(), pa.int8(), pa.int32(), pa.int64()
 
 _MU_STEP, _DEGREE_STEP, _RADIAN_STEP, _SPEED_STEP = 2.0**-10, 2.0**-23, 2.0**-9, 2.0**-6  # the second is 13 mm
+_MU_RANGE: Final = (0.0, 2.0)  # beyond what a road tyre reaches on any road
+_SPEED_RANGE: Final = (-100.0, 100.0)
+_MAX_I32: Final = 2**31 - 1
 
 _MU = (
-    Field("mu", F32, "-", "peak adhesion coefficient, median; NaN where not said", _MU_STEP),
-    Field("mu_lower", F32, "-", "5 % quantile of mu", _MU_STEP),
-    Field("mu_upper", F32, "-", "95 % quantile of mu", _MU_STEP),
+    Field("mu", F32, "-", "peak adhesion coefficient, median; NaN where not said", _MU_STEP, _MU_RANGE),
+    Field("mu_lower", F32, "-", "5 % quantile of mu", _MU_STEP, _MU_RANGE),
+    Field("mu_upper", F32, "-", "95 % quantile of mu", _MU_STEP, _MU_RANGE),
 )
 _POSE = (
-    Field("latitude", F64, "deg", "WGS 84", _DEGREE_STEP),
-    Field("longitude", F64, "deg", "WGS 84", _DEGREE_STEP),
-    Field("position_std", F32, "m", "standard deviation of the position, each axis", 2.0**-5),
-    Field("yaw", F32, "rad", "counter-clockwise from east", _RADIAN_STEP),
+    Field("latitude", F64, "deg", "WGS 84", _DEGREE_STEP, (-grid.MAX_LATITUDE, grid.MAX_LATITUDE)),
+    Field("longitude", F64, "deg", "WGS 84", _DEGREE_STEP, (-180.0, 180.0)),
+    Field("position_std", F32, "m", "standard deviation of the position, each axis", 2.0**-5, (0.0, 100.0)),
+    Field("yaw", F32, "rad", "counter-clockwise from east", _RADIAN_STEP, (-1000.0, 1000.0)),
 )
 
 # What one vehicle learned about one cell in one visit.
@@ -49,30 +57,32 @@ OBSERVATION: Final = (
     Field("enter_time", NS, "ns since 1970, UTC", "first sample in the cell"),
     Field("leave_time", NS, "ns since 1970, UTC", "last sample in the cell"),
     Field("cell", I64, "quadint z21", "the cell"),
-    Field("sector", I8, "0 east, 1 north, 2 west, 3 south", "heading sector"),
+    Field("sector", I8, "0 east, 1 north, 2 west, 3 south", "heading sector", range=(0, grid.SECTORS - 1)),
     *_POSE,
-    Field("yaw_std", F32, "rad", "standard deviation of yaw", 2.0**-12),
-    Field("speed", F32, "m/s", "mean speed over the visit", _SPEED_STEP),
+    Field("yaw_std", F32, "rad", "standard deviation of yaw", 2.0**-12, (0.0, 10.0)),
+    Field("speed", F32, "m/s", "mean speed over the visit", _SPEED_STEP, (0.0, 100.0)),
     *_MU,
-    Field("mu_utilised", F32, "-", "largest grip used in the visit, any wheel: mu is at least this", _MU_STEP),
+    Field("mu_utilised", F32, "-", "largest grip used in the visit, any wheel: mu is at least this", _MU_STEP,
+          _MU_RANGE),
     Field("log_likelihood", LIKELIHOOD, "1/16 nat below the maximum",
           "log p(measurements | mu) on the 32 bins of the friction grid; absent where the sender has none"),
-    Field("health", I32, "flags", "schemas.signals.Health"),
-    Field("tyre_season", I8, "0 unknown, 1 summer, 2 winter, 3 all-season", "tyres of the vehicle"),
-    Field("air_temperature", F32, "degC", "outside; NaN where not measured", 2.0**-4),
-    Field("abs_active", I8, "-1 unknown, 0 no, 1 yes", "a slip controller intervened"),
+    Field("health", I32, "flags", "schemas.signals.Health", range=(0, _MAX_I32)),
+    Field("tyre_season", I8, "0 unknown, 1 summer, 2 winter, 3 all-season", "tyres of the vehicle",
+          range=(0, 3)),
+    Field("air_temperature", F32, "degC", "outside; NaN where not measured", 2.0**-4, (-90.0, 80.0)),
+    Field("abs_active", I8, "-1 unknown, 0 no, 1 yes", "a slip controller intervened", range=(-1, 1)),
 )  # fmt: skip
 
 # Where a vehicle was and how it moved.
 STATE: Final = (
     Field("time", NS, "ns since 1970, UTC", "of the sample"),
     *_POSE,
-    Field("vx", F32, "m/s", "longitudinal speed at the centre of gravity", _SPEED_STEP),
-    Field("vy", F32, "m/s", "lateral speed at the centre of gravity", _SPEED_STEP),
-    Field("yaw_rate", F32, "rad/s", "positive to the left", 2.0**-12),
-    Field("sideslip", F32, "rad", "atan2(vy, vx)", 2.0**-12),
+    Field("vx", F32, "m/s", "longitudinal speed at the centre of gravity", _SPEED_STEP, _SPEED_RANGE),
+    Field("vy", F32, "m/s", "lateral speed at the centre of gravity", _SPEED_STEP, _SPEED_RANGE),
+    Field("yaw_rate", F32, "rad/s", "positive to the left", 2.0**-12, (-20.0, 20.0)),
+    Field("sideslip", F32, "rad", "atan2(vy, vx)", 2.0**-12, (-4.0, 4.0)),
     *_MU,
-    Field("health", I32, "flags", "schemas.signals.Health"),
+    Field("health", I32, "flags", "schemas.signals.Health", range=(0, _MAX_I32)),
 )
 
 # Who sent a row: the identity of its batch. In the archive the vehicle is a keyed hash.

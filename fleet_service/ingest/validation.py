@@ -19,10 +19,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas import grid, keys
+from schemas import grid, keys, tables
 from schemas.errors import InputError
 from schemas.numeric import IntArray
-from schemas.wire import Columns, Kind
+from schemas.wire import NEEDED, Columns, Kind
 from schemas.wire.batches import Heads
 
 BATCH: Final = -1  # row number of a refusal that concerns the batch as a whole
@@ -42,27 +42,10 @@ class Range(NamedTuple):
     optional: bool = True
 
 
-_POSE: Final = (
-    Range("latitude", -grid.MAX_LATITUDE, grid.MAX_LATITUDE, optional=False),
-    Range("longitude", -180.0, 180.0, optional=False),
-    Range("position_std", 0.0, 100.0),
-    Range("yaw", -1000.0, 1000.0),
-)
-_MU: Final = tuple(Range(name, 0.0, 2.0) for name in ("mu", "mu_lower", "mu_upper"))
-_HEALTH: Final = Range("health", 0, 2**31 - 1)
 RANGES: Final = {
-    Kind.OBSERVATION: (
-        *_POSE, *_MU,
-        Range("mu_utilised", 0.0, 2.0), Range("yaw_std", 0.0, 10.0), Range("speed", 0.0, 100.0),
-        Range("sector", 0, grid.SECTORS - 1), Range("tyre_season", 0, 3), Range("abs_active", -1, 1),
-        Range("air_temperature", -90.0, 80.0), _HEALTH,
-    ),
-    Kind.STATE: (
-        *_POSE, *_MU,
-        Range("vx", -100.0, 100.0), Range("vy", -100.0, 100.0), Range("yaw_rate", -20.0, 20.0),
-        Range("sideslip", -4.0, 4.0), _HEALTH,
-    ),
-}  # fmt: skip
+    kind: tuple(Range(f.name, *f.range, optional=f.name not in NEEDED[kind]) for f in fields if f.range is not None)
+    for kind, fields in ((Kind.OBSERVATION, tables.OBSERVATION), (Kind.STATE, tables.STATE))
+}
 
 
 class Clock(NamedTuple):
