@@ -32,6 +32,7 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.lab.evaluation.bars import figures as figures_of
     from edge_agent.lab.evaluation.campaign import run as campaign
     from edge_agent.lab.evaluation.report import report
+    from edge_agent.lab.seeds import FIGURES
     from schemas.runtime.figures import write
 
     count = args.seeds if args.seeds is not None else QUICK_SEEDS if args.quick else LEAST_SEEDS
@@ -43,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
         args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError("out", f"cannot make {args.out} ({error.strerror})", "name another folder") from error
-    began, seeds = time.monotonic(), range(count)
+    began, seeds = time.monotonic(), range(FIGURES, FIGURES + count)
     results = campaign(
         seeds, quick=args.quick,
         tell=lambda line: print(f"{time.monotonic() - began:6.1f} s  {line}", file=sys.stderr, flush=True),

@@ -10,6 +10,7 @@ import numpy as np
 
 from edge_agent.lab.evaluation.campaign import DEFAULT, Results
 from edge_agent.lab.evaluation.measures import COMPONENTS, bounds
+from edge_agent.lab.evaluation.real_world import SURFACES
 from edge_agent.lab.evaluation.reliability import LEVELS, shares
 from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
@@ -39,6 +40,11 @@ def of(scenario: str, measure: str, estimator: str = DEFAULT) -> Callable[[Resul
 def noise(experiment: str, measure: str) -> Callable[[Results], float]:
     """Mean over seeds of a measure of paper 004's own experiments."""
     return lambda results: mean(results.noise.get((experiment, "paper-aco-fckf"), {}).get(measure))
+
+
+def in_the_world(name: str) -> Callable[[Results], float]:
+    """A figure of the default over the rough towns, or on a slope."""
+    return lambda results: results.world.get(DEFAULT, {}).get(name, math.nan)
 
 
 def mean(values: FloatArray | None) -> float:
@@ -97,16 +103,29 @@ BARS: Final = (
     Bar("default.foreign_tyres.coverage90", on_foreign_tyres, SHARE, 0.85, "more"),
     Bar("default.abs.coverage90", both_stops, SHARE, 0.80, "more"),
     Bar("default.spin.coverage90", of("default.spin", "coverage90"), SHARE, 0.80, "more"),
+    Bar("real_world.standing_5pct.v_max", in_the_world("standing_5pct.v_max"), M_S, 0.2, "less"),
+    Bar("real_world.false_ice", in_the_world("false_ice"), SHARE, 0.002, "less"),
+    Bar("real_world.below", in_the_world("below"), SHARE, 0.002, "less"),
+    Bar("real_world.coverage90", in_the_world("coverage90"), SHARE, 0.88, "more"),
+    *(
+        Bar(f"real_world.coverage90.{name}", in_the_world(f"coverage90.{name}"), SHARE, 0.80, "more")
+        for name in SURFACES
+    ),
+    Bar("real_world.width", in_the_world("width"), SHARE, 0.5, "less"),
 )
 
 UNITS: Final = {
     "vx": M_S, "vy": M_S, "yaw_rate": RAD_S, "beta": "rad", "s": "s", "hours": "h", "changes": "per drive",
+    "rmse_vx": M_S, "rmse_vy": M_S, "v_max": M_S,
 }  # fmt: skip
 
 
 def unit_of(measure: str) -> str:
     """Unit of a measure, by the end of its name."""
-    return next((unit for end, unit in UNITS.items() if measure.endswith(f"_{end}") or measure == end), SHARE)
+    if measure.startswith("coverage90"):
+        return SHARE
+    whole = (unit for end, unit in UNITS.items() if measure == end or measure.endswith((f"_{end}", f".{end}")))
+    return next(whole, SHARE)
 
 
 def figures(results: Results, *, quick: bool) -> list[Figure]:
@@ -120,6 +139,8 @@ def figures(results: Results, *, quick: bool) -> list[Figure]:
         listed += _context(f"noise.004.{experiment}.{estimator}", found)
     for (case, estimator), found in results.faults.items():
         listed += _context(f"faults.{case}.{estimator}", found)
+    for estimator, values in results.world.items():
+        listed += [Figure(f"world.{estimator}.{name}", value, unit_of(name)) for name, value in values.items()]
     listed += _consistency(results)
     return listed + [
         Figure(f"foreign.{kind}.coverage90", mean(value), SHARE) for kind, value in results.foreign.items()

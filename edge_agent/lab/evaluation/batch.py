@@ -9,19 +9,23 @@ import numpy as np
 import pyarrow as pa
 
 from edge_agent.estimators import Estimates, EstimatorBank
-from edge_agent.lab.simulation import simulate_manoeuvre
+from edge_agent.lab.simulation import Fault, simulate_manoeuvre
 from edge_agent.lab.simulation.manoeuvres import Friction
 from edge_agent.lab.simulation.presets import TrueVehicle
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, per_wheel
 from schemas.vehicle import Vehicle
 
+USUAL = "mems-leak"  # accelerometers are fixed to the body, and feel gravity when it rolls and pitches
 FINE_HZ = 500.0  # steering is held over a sample of the simulator; a slow sensor must not see it as steps
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """A manoeuvre of a paper, or of the default estimator's bars: vehicle, speed [m/s], friction, rate, length."""
+    """A manoeuvre of a paper, or of the default estimator's bars: vehicle, speed [m/s], friction, rate, length.
+
+    road, slope: relief by name and a lasting slope upon it; torque: whether it is recorded.
+    """
 
     manoeuvre: str
     vehicle: TrueVehicle
@@ -30,6 +34,9 @@ class Scenario:
     rate_hz: float = 100.0
     duration_s: float | None = None
     about: str = ""
+    road: str = "level"
+    slope: float = 0.0
+    torque: bool = True
 
 
 @dataclass(frozen=True)
@@ -56,7 +63,7 @@ class Batch:
         return slice(int(np.searchsorted(self.t[:, 0], self.t[-1, 0] - seconds)), None)
 
 
-def realistic(scenario: Scenario, seeds: Sequence[int], sensors: str = "mems") -> Batch:
+def realistic(scenario: Scenario, seeds: Sequence[int], sensors: str = USUAL) -> Batch:
     """One drive per seed with ordinary sensors, of a vehicle known to a few per cent."""
     return joined([_drive(scenario, seed, sensors, 1) for seed in seeds])
 
@@ -70,7 +77,8 @@ def ideal(scenario: Scenario) -> Batch:
 def _drive(scenario: Scenario, seed: int, sensors: str, step: int) -> tuple[pa.Table, Vehicle]:
     log, vehicle = simulate_manoeuvre(
         scenario.manoeuvre, mu=scenario.mu, speed=scenario.speed, seed=seed, rate_hz=scenario.rate_hz,
-        duration_s=scenario.duration_s, vehicle=scenario.vehicle, sensors=sensors,
+        duration_s=scenario.duration_s, vehicle=scenario.vehicle, sensors=sensors, road=scenario.road,
+        slope=scenario.slope, faults=() if scenario.torque else (Fault("missing", "torque"),),
     )  # fmt: skip
     return log.take(np.arange(0, len(log), step)), vehicle
 

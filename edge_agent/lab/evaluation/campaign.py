@@ -9,10 +9,11 @@ import numpy as np
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import ESTIMATORS, Estimates, EstimatorBank, adaptive_federated_ckf, compensated_wckf
-from edge_agent.lab.evaluation import faults
+from edge_agent.lab.evaluation import faults, real_world
 from edge_agent.lab.evaluation.batch import Batch, estimates, ideal, realistic, repeated
 from edge_agent.lab.evaluation.measures import arrival, consistency, false_changes, measures, sides
 from edge_agent.lab.evaluation.paper_004 import experiments
+from edge_agent.lab.evaluation.real_world import World
 from edge_agent.lab.evaluation.reliability import watched
 from edge_agent.lab.evaluation.scenarios import FOREIGN, OTHERS, PAPERS, VEHICLES, foreign
 from schemas.numeric import FloatArray
@@ -41,6 +42,8 @@ class Results:
     noise: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)  # paper 004's experiments
     foreign: dict[str, FloatArray] = field(default_factory=dict)  # coverage of the default, by kind of tyre
     faults: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)  # by (fault, estimator)
+    world: dict[str, dict[str, float]] = field(default_factory=dict)  # the rough one: by estimator and "baseline"
+    rough: World | None = None  # its first town, kept for plots
     ranks: dict[str, list[FloatArray]] = field(default_factory=dict)  # of the truth in the posterior, by estimator
     seeds: int = 0
     drives: dict[tuple[str, str], Drive] = field(default_factory=dict)
@@ -70,6 +73,9 @@ def run(seeds: Sequence[int], *, quick: bool, tell: Callable[[str], None]) -> Re
     manoeuvres = tuple(faults.DRIVES)[: 1 if quick else None]
     results.faults = faults.campaign(seeds[:FAULTY_SEEDS], names, manoeuvres)
     tell(f"{len(faults.CASES) - 1} sensor faults")
+    results.rough = real_world.campaign(seeds, names, quick=quick)
+    results.world = results.rough.found
+    tell(f"rough cars in {1 if quick else real_world.TOWNS} hilly towns, and standing on slopes")
     if not quick:
         results.foreign = _foreign_tyres(seeds, tell)
     return results

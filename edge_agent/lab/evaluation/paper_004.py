@@ -18,10 +18,15 @@ from edge_agent.estimators.paper_aco_fckf import AT_THE_TRUTH, bank
 from edge_agent.lab.evaluation.batch import Batch, estimates, ideal, repeated
 from edge_agent.lab.evaluation.measures import measures
 from edge_agent.lab.evaluation.scenarios import MATCHED, PAPERS, SEDAN
+from edge_agent.lab.simulation import PRESETS
 from edge_agent.lab.simulation.white import add_white, scheduled
 from schemas.numeric import FloatArray
 
 CONSTANT = 0.05  # variance of all three noises [SI]
+EXPERIMENTS = {
+    "constant": MATCHED, "variable": MATCHED, "sedan": SEDAN, "sedan.variable": SEDAN, "van": PRESETS["van"],
+    "van.variable": PRESETS["van"],
+}  # fmt: skip
 STILL = Memberships(outputs=(0.0,) * 5)  # fuzzy sets that leave R as it is
 
 
@@ -43,13 +48,14 @@ def experiments(
 ) -> tuple[dict[tuple[str, str], dict[str, FloatArray]], dict[str, tuple[Batch, Estimates]]]:
     """(measures per drive by experiment and filter, drives for plots by experiment).
 
-    "sedan" is "constant" with the simulator's own plant. The filters are the paper's, and its controls: untuned
-    (paper-fckf), without adaptation (paper-ckf). Only a_x, a_y and r are noisy; the names of S are in that order.
+    "sedan" and "van" are "constant" with the simulator's own plants, and with ".variable" the other. The filters are
+    the paper's, and its controls: untuned (paper-fckf), without adaptation (paper-ckf). Only a_x, a_y and r are
+    noisy; the names of S are in that order.
     """
     found, drives = {}, {}
-    for name, vehicle in (("constant", MATCHED), ("variable", MATCHED), ("sedan", SEDAN)):
+    for name, vehicle in EXPERIMENTS.items():
         exact = ideal(replace(PAPERS["004.dlc"], vehicle=vehicle))
-        batch = noisy(exact, variances(exact.t[:, 0], "variable" if name == "variable" else "constant"), seeds)
+        batch = noisy(exact, variances(exact.t[:, 0], "variable" if name.endswith("variable") else "constant"), seeds)
         for estimator, sets in (
             ("paper-ckf", STILL), ("paper-fckf", Memberships()), ("paper-aco-fckf", shipped(TUNED["paper-aco-fckf"]))
         ):  # fmt: skip

@@ -13,7 +13,9 @@ from edge_agent.app.tuned_memberships import shipped
 from edge_agent.estimators import TUNED
 from edge_agent.lab.evaluation.campaign import DEFAULT, Drive, Results
 from edge_agent.lab.evaluation.measures import bounds, nees
+from edge_agent.lab.evaluation.real_world import SURFACES, World
 from schemas.runtime.figures import Figure
+from schemas.signals import Health, S
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,8 +30,11 @@ def draw(results: Results, figures: Sequence[Figure], folder: Path) -> list[Path
     for scenario in sorted({scenario for scenario, _ in results.drives}):
         drives = {name: drive for (of, name), drive in results.drives.items() if of == scenario}
         written.append(_scenario(scenario, drives, folder / f"{scenario}.png"))
+    if results.rough is not None:
+        written.append(_rough(results.rough, folder / "rough.png"))
     return [
         *written,
+        _surfaces(figures, folder / "surfaces.png"),
         _memberships(folder / "memberships.png"),
         _reliability(figures, folder / "reliability.png"),
         _consistency(figures, folder / "consistency.png"),
@@ -66,6 +71,59 @@ def _scenario(scenario: str, drives: dict[str, Drive], path: Path) -> Path:
     axes[0].legend(fontsize="x-small", ncols=3)
     figure.savefig(path, dpi=80)
     plt.close(figure)
+    return path
+
+
+def _rough(world: World, path: Path) -> Path:
+    """One rough car in a hilly town: speed beside the wheels', slope, friction with the default's interval, health."""
+    from matplotlib import pyplot as plt
+
+    batch, car = world.batch, int(np.argmax(np.ptp(world.batch.truth["true_slope"], axis=0)))
+    t, first = batch.t[:, car], next(iter(world.said.values()))
+    figure, axes = plt.subplots(5, 1, figsize=(9, 12), sharex=True, layout="constrained")
+    wheels = batch.vehicles[car].wheel_radius * np.nanmean(batch.signals[:, car, S.OMEGA : S.OMEGA + 4], axis=-1)
+    axes[0].plot(t, batch.truth["true_vx"][:, car], "k", label="true")
+    axes[1].plot(t, wheels - batch.truth["true_vx"][:, car], color="0.7", lw=0.8, label="mean of the wheels")
+    for name, said in world.said.items():
+        line = axes[0].plot(t, said.vx[:, car], lw=0.8, label=name)[0]
+        axes[1].plot(t, said.vx[:, car] - batch.truth["true_vx"][:, car], lw=0.8, color=line.get_color())
+    axes[2].plot(t, 100.0 * batch.truth["true_slope"][:, car], "k")
+    axes[3].plot(t, batch.mu[:, car], "k")
+    axes[3].plot(t, first.mu[:, car], lw=0.8)
+    axes[3].fill_between(t, first.mu_lower[:, car], first.mu_upper[:, car], alpha=0.2, lw=0)
+    for flag in Health:
+        if flag and (when := (first.health[:, car].astype(np.int64) & int(flag)) != 0).any():
+            axes[4].plot(t[when], [flag.name] * int(when.sum()), "|")
+    axes[0].set(
+        ylabel="v_x [m/s]", title=f"car {car + 1} of a hilly town; interval and health: {next(iter(world.said))}"
+    )
+    axes[1].set(ylabel="error of v_x [m/s]", ylim=(-2.0, 2.0))
+    axes[2].set(ylabel="slope [%]")
+    axes[3].set(ylabel="μ and its 90 % band", ylim=(0.0, 1.25))
+    axes[4].set(ylabel="health", xlabel="t [s]")
+    axes[0].legend(fontsize="x-small", ncols=3)
+    figure.savefig(path, dpi=80)
+    plt.close(figure)
+    return path
+
+
+def _surfaces(figures: Sequence[Figure], path: Path) -> Path:
+    """Coverage of the 90 % interval by surface, for every estimator in the rough world."""
+    from matplotlib import pyplot as plt
+
+    values = {figure.name: figure.value for figure in figures if figure.name.startswith("world.")}
+    names = list(dict.fromkeys(name.split(".")[1] for name in values if name.endswith(".coverage90")))
+    drawn, axis = plt.subplots(figsize=(9, 4), layout="constrained")
+    for k, name in enumerate(names):
+        shares = [values.get(f"world.{name}.coverage90.{surface}", np.nan) for surface in SURFACES]
+        axis.bar(np.arange(len(SURFACES)) + 0.8 * (k + 0.5) / len(names) - 0.4, shares, 0.8 / len(names), label=name)
+    axis.axhline(0.9, color="k", ls=":")
+    axis.set(
+        xticks=range(len(SURFACES)), xticklabels=list(SURFACES), ylabel="coverage of the 90 % interval", ylim=(0, 1)
+    )
+    axis.legend(fontsize="x-small", ncols=4)
+    drawn.savefig(path, dpi=80)
+    plt.close(drawn)
     return path
 
 

@@ -43,7 +43,10 @@ GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0  # multiples of it, modulo 1, are spread e
 
 @dataclass(frozen=True)
 class Truth:
-    """What was true in a block, (T, N) or (T, N, 4): pose [m, m, rad], speed [m/s], friction, |F|/(μ F_z)."""
+    """What was true in a block, (T, N) or (T, N, 4): pose [m, m, rad], speed [m/s], friction, |F|/(μ F_z).
+
+    ax, ay: what an accelerometer feels [m/s^2]; slope: rise of the road per metre ahead.
+    """
 
     x: FloatArray
     y: FloatArray
@@ -52,6 +55,10 @@ class Truth:
     vy: FloatArray
     mu_wheel: FloatArray
     utilisation: FloatArray
+    yaw_rate: FloatArray
+    ax: FloatArray
+    ay: FloatArray
+    slope: FloatArray
 
 
 @compiled
@@ -170,7 +177,9 @@ def rough_ones(vehicles: int, share: float) -> BoolArray:
 
 def _truth(records: FloatArray) -> Truth:
     x, y, yaw, vx, vy = (records[..., column] for column in (R.X, R.Y, R.YAW, R.VX, R.VY))
-    return Truth(x, y, yaw, vx, vy, records[..., R.MU : R.MU + 4], records[..., R.UTILISATION : R.UTILISATION + 4])
+    wheels = (records[..., R.MU : R.MU + 4], records[..., R.UTILISATION : R.UTILISATION + 4])
+    felt = (records[..., column] for column in (R.YAW_RATE, R.AX, R.AY, R.SLOPE))
+    return Truth(x, y, yaw, vx, vy, *wheels, *felt)
 
 
 def _start(

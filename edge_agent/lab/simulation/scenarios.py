@@ -9,12 +9,15 @@ from typing import Final
 
 import numpy as np
 
+from edge_agent.lab.simulation.chance import checked_seed, key_of, uniform
 from edge_agent.lab.simulation.friction import DRY, ICE, SNOW, WET, F, Patch, friction_table, look_up_many
 from edge_agent.lab.simulation.place import GOTHENBURG, Origin
 from edge_agent.lab.simulation.relief import LEVEL, Relief, Wave
 from edge_agent.lab.simulation.roads import Network, Road, build_network
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
+
+DRAWN_STREAM: Final = 21
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,30 @@ def hills() -> Scenario:
         crossfall=0.025, banking=0.5,
     )  # fmt: skip
     return replace(demo(), name="hills", about="the demo's town on slopes to 8 %, with crossfall", relief=relief)
+
+
+def drawn(seed: int) -> Scenario:
+    """The demonstration's town with other frictions and other hills, drawn by the seed: for figures.
+
+    What is dry, wet, snow and ice there lies anywhere in the usual range of its kind; no road is one that anybody
+    tuned on, and black ice appears at 30 s.
+    """
+    key, usual = key_of(checked_seed(seed), DRAWN_STREAM), demo()
+    kinds = {DRY: (0.78, 1.05), WET: (0.50, 0.72), SNOW: (0.25, 0.42), ICE: (0.10, 0.195)}
+    now = {kind: low + (high - low) * uniform(key, k) for k, (kind, (low, high)) in enumerate(kinds.items())}
+    patches = tuple(
+        replace(p, mu=now[p.mu], looks=now.get(p.looks, p.looks) if p.looks is not None else None,
+                start=30.0 if math.isfinite(p.start) else p.start)
+        for p in usual.patches
+    )  # fmt: skip
+    waves = tuple(
+        Wave(peak, length, 2.0 * math.pi * uniform(key, 10 + k), 2.0 * math.pi * uniform(key, 20 + k))
+        for k, (peak, length) in enumerate(((0.045, 620.0), (0.035, 290.0), (0.02, 150.0)))
+    )
+    relief = Relief(waves, crossfall=0.03 * uniform(key, 30), banking=0.5)
+    return replace(
+        usual, name=f"hills-{seed}", about="a town on drawn hills", background=now[DRY], patches=patches, relief=relief
+    )
 
 
 def tiny() -> Scenario:

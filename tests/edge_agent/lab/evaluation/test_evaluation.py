@@ -21,6 +21,7 @@ from edge_agent.lab.evaluation.paper_004 import noisy, variances
 from edge_agent.lab.evaluation.printed import OWN, PRINTED
 from edge_agent.lab.evaluation.report import report
 from edge_agent.lab.evaluation.scenarios import FOREIGN, OTHERS, PAPERS, SEDAN, VEHICLES, foreign
+from edge_agent.lab.seeds import FIGURES
 from schemas.runtime.figures import Figure
 from schemas.signals import S
 
@@ -40,6 +41,10 @@ ASKED = {
     "default.straight.width_ratio": (0.8, "more"), "default.straight.coverage90": (0.9, "more"),
     "default.foreign_tyres.coverage90": (0.85, "more"),
     "default.abs.coverage90": (0.80, "more"), "default.spin.coverage90": (0.80, "more"),
+    "real_world.standing_5pct.v_max": (0.2, "less"), "real_world.width": (0.5, "less"),
+    "real_world.false_ice": (0.002, "less"), "real_world.below": (0.002, "less"),
+    "real_world.coverage90": (0.88, "more"),
+    **{f"real_world.coverage90.{name}": (0.80, "more") for name in ("ice", "snow", "wet", "dry")},
 }  # fmt: skip
 
 
@@ -162,7 +167,7 @@ def test_the_quick_campaign_writes_figures_report_and_plots(tmp_path: Path, caps
     assert "double lane change" in told.err
     header, *rows = json.loads((tmp_path / "figures.json").read_text())
     assert header["campaign"] == "edge-agent evaluate --quick"
-    assert header["seeds"] == [0, 1]
+    assert header["seeds"] == [FIGURES, FIGURES + 1]
     named = {row["name"]: row for row in rows}
     assert named["papers.004.constant.mae_vy"]["holds"]
     assert {"papers.003.split.low_error", "default.jump.accel_s"} <= set(named)
@@ -179,7 +184,7 @@ def test_the_quick_campaign_writes_figures_report_and_plots(tmp_path: Path, caps
 
 def test_more_seeds_are_driven_and_no_plots_drawn_where_so_asked(tmp_path: Path) -> None:
     assert main(["evaluate", "--out", str(tmp_path), "--quick", "--seeds", "3", "--no-plots"]) in (0, 1)
-    assert json.loads((tmp_path / "figures.json").read_text())[0]["seeds"] == [0, 1, 2]
+    assert json.loads((tmp_path / "figures.json").read_text())[0]["seeds"] == [FIGURES, FIGURES + 1, FIGURES + 2]
     assert not list(tmp_path.glob("*.png"))
     assert (tmp_path / "report.md").exists()
 

@@ -1,0 +1,173 @@
+"""The world as it is: rough cars in hilly towns, and a car that stands on a slope; what every estimator makes of it.
+
+Towns (friction, hills), cars, sensors and clocks are drawn by the seed, half of the cars without torque. All figures
+are over samples, so that a minute on dry road weighs a minute.
+
+Legend
+    surface       by the mean friction of the four wheels: ice to .2, snow to .45, wet to .75, dry above
+    false ice     share of the samples on wet and dry road whose whole interval lies below SLIPPERY_MU
+    below         share of all samples whose upper end lies below the grip in use: certainly wrong
+    excited       some wheel used EXCITED_SHARE of its grip within the last second
+    lost          share of the samples whose speed is off by more than LOST_M_S
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.estimators import Estimates
+from edge_agent.lab.evaluation.batch import USUAL, Batch, Scenario, estimates, realistic
+from edge_agent.lab.evaluation.measures import covered, errors
+from edge_agent.lab.simulation import PRESETS, SimulatedFleet
+from edge_agent.lab.simulation.scenarios import drawn
+from schemas.errors import InputError
+from schemas.numeric import BoolArray, FloatArray
+from schemas.signals import S, per_wheel
+from schemas.thresholds import EXCITED_SHARE, GRAVITY, SLIPPERY_MU, UTILISED_WINDOW_S, Z_95
+
+SURFACES: Final = {"ice": (0.0, 0.2), "snow": (0.2, 0.45), "wet": (0.45, 0.75), "dry": (0.75, 2.0)}
+LOST_M_S: Final = 1.0
+MISS: Final = 20.0  # of the interval score of Gneiting and Raftery (2007) at 90 %
+PRIOR: Final = (0.1075, 1.1425)  # 90 % of the prior
+NOISE: Final = 0.03  # of the grip in use, which is smoothed over SMOOTH_S
+SMOOTH_S: Final = 0.2
+RATE_HZ: Final = 100.0
+TOWN_CARS, TOWN_S, TOWNS = 16, 120.0, 5
+STANDING_S: Final = 70.0
+STANDING_SLOPES: Final = (0.05, 0.08)
+
+
+@dataclass
+class Tally:
+    """Sums over samples by name: `add` counts, `means` divides."""
+
+    total: dict[str, float] = field(default_factory=dict)
+    count: dict[str, int] = field(default_factory=dict)
+
+    def add(self, name: str, value: FloatArray | BoolArray, among: BoolArray | None = None) -> None:
+        """Count the values (T, N) `among` which the name is a mean; NaN are left out."""
+        taken = np.asarray(value, dtype=np.float64)[slice(None) if among is None else among]
+        taken = taken[np.isfinite(taken)]
+        self.total[name] = self.total.get(name, 0.0) + float(taken.sum())
+        self.count[name] = self.count.get(name, 0) + taken.size
+
+    def means(self) -> dict[str, float]:
+        """Mean by name; NaN of nothing. What ends in "_squared" is told as its root, without that end."""
+        found = {name: total / self.count[name] if self.count[name] else np.nan for name, total in self.total.items()}
+        return {
+            name.removesuffix("_squared"): float(np.sqrt(mean)) if name.endswith("_squared") else mean
+            for name, mean in found.items()
+        }
+
+
+def town(seed: int, cars: int, seconds: float) -> tuple[Batch, FloatArray]:
+    """Rough cars in a town that the seed draws, and the largest share of the grip they use (T, N)."""
+    fleet = SimulatedFleet(drawn(seed), cars, seed, RATE_HZ, rough=1.0)
+    t, signals = fleet.step(round(seconds * RATE_HZ))
+    true = fleet.truth
+    truth = {f"true_{name}": getattr(true, name) for name in ("vx", "vy", "yaw_rate", "ax", "ay", "slope")}
+    truth |= {name: true.mu_wheel[..., i] for i, name in enumerate(per_wheel("true_mu"))}
+    return Batch(t, signals, truth, fleet.vehicles), true.utilisation.max(axis=-1)
+
+
+def in_use(batch: Batch) -> FloatArray:
+    """Grip that the car as a whole uses, smoothed and a little less for noise, (T, N)."""
+    used = np.hypot(batch.truth["true_ax"], batch.truth["true_ay"]) / GRAVITY
+    width = max(1, round(SMOOTH_S * RATE_HZ))
+    summed = np.cumsum(np.concatenate([np.zeros((width, used.shape[1])), used]), axis=0)
+    return np.asarray((summed[width:] - summed[:-width]) / width - NOISE)
+
+
+def lately(used: FloatArray) -> FloatArray:
+    """Largest value of the last UTILISED_WINDOW_S, (T, N)."""
+    samples = round(UTILISED_WINDOW_S * RATE_HZ)
+    padded = np.concatenate([np.zeros((samples - 1, used.shape[1])), used])
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, samples, axis=0).max(axis=-1))
+
+
+def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> FloatArray:
+    """Width and MISS times how far the truth lies outside; the only way to lower it is to be sharp and right."""
+    return np.asarray(upper - lower + MISS * (np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0)))
+
+
+def count(tally: Tally, batch: Batch, said: Estimates, used: FloatArray) -> None:
+    """Add one town to the tally of an estimator."""
+    mu, inside, width = batch.mu, covered(batch, said), said.mu_upper - said.mu_lower
+    excited = lately(used) >= EXCITED_SHARE
+    tally.add("coverage90", inside)
+    for name, (above, most) in SURFACES.items():
+        tally.add(f"coverage90.{name}", inside, (mu > above) & (mu <= most))
+    tally.add("coverage90.excited", inside, excited)
+    tally.add("coverage90.no_torque", inside[:, np.isnan(batch.signals[:, :, S.TORQUE]).all(axis=0)])
+    tally.add("false_ice", said.mu_upper < SLIPPERY_MU, mu > SURFACES["wet"][0])
+    tally.add("below", said.mu_upper < in_use(batch))
+    tally.add("width", width / (PRIOR[1] - PRIOR[0]), excited)
+    tally.add("width.all", width / (PRIOR[1] - PRIOR[0]))
+    tally.add("score", interval_score(said.mu_lower, said.mu_upper, mu))
+    off = errors(batch, said)
+    for name, std in (("vx", said.vx_std), ("vy", said.vy_std)):
+        tally.add(f"rmse_{name}_squared", off[name] ** 2)
+        tally.add(f"coverage90.{name}", np.abs(off[name]) <= Z_95 * std)
+    tally.add("lost", np.abs(off["vx"]) > LOST_M_S)
+
+
+def baseline(tally: Tally, batch: Batch) -> None:
+    """What the prior scores, and what the mean of four wheels makes of v_x."""
+    radius = np.array([vehicle.wheel_radius for vehicle in batch.vehicles])
+    off = radius * np.nanmean(batch.signals[:, :, S.OMEGA : S.OMEGA + 4], axis=-1) - batch.truth["true_vx"]
+    tally.add("rmse_vx_squared", off**2)
+    tally.add("lost", np.abs(off) > LOST_M_S)
+    lower, upper = (np.full(batch.mu.shape, end) for end in PRIOR)
+    tally.add("score", interval_score(lower, upper, batch.mu))
+
+
+def standing(slope: float, seeds: Sequence[int], seconds: float) -> list[Batch]:
+    """Cars that stand on the slope: each seed another, with ordinary sensors, and with rough ones without torque."""
+    batches = []
+    for sensors in (USUAL, "rough"):
+        for k, preset in enumerate(PRESETS.values()):
+            drive = Scenario("standing", preset, duration_s=seconds, slope=slope, torque=sensors == USUAL)
+            batches.append(realistic(drive, seeds[k :: len(PRESETS)] or seeds[:1], sensors))
+    return batches
+
+
+def fastest(estimator: str, batches: Sequence[Batch]) -> float:
+    """Largest speed [m/s], in any direction, that the estimator gives to any of the cars."""
+    said = [estimates(bank_of(estimator, batch.vehicles), batch) for batch in batches]
+    return max(float(np.hypot(each.vx, each.vy).max()) for each in said)
+
+
+@dataclass
+class World:
+    """Figures by estimator, and "baseline" (the wheels' speed, the prior's interval), then by name; a drive to plot."""
+
+    found: dict[str, dict[str, float]]
+    batch: Batch
+    said: dict[str, Estimates]
+
+
+def campaign(seeds: Sequence[int], estimators: Sequence[str], *, quick: bool) -> World:
+    """Towns of rough cars, and cars that stand on slopes, for every estimator; the first town is kept for plots."""
+    cars, seconds, towns = (4, 15.0, 1) if quick else (TOWN_CARS, TOWN_S, TOWNS)
+    tallies, world = {name: Tally() for name in (*estimators, "baseline")}, None
+    for seed in seeds[:towns]:
+        batch, used = town(seed, cars, seconds)
+        baseline(tallies["baseline"], batch)
+        world = world or World({}, batch, {})
+        for name in estimators:
+            said = estimates(bank_of(name, batch.vehicles), batch)
+            count(tallies[name], batch, said, used)
+            world.said.setdefault(name, said)
+    if world is None:
+        raise InputError("seeds", "are none", "give at least one")
+    world.found = {name: tally.means() for name, tally in tallies.items()}
+    for slope in STANDING_SLOPES:
+        batches = standing(slope, seeds, 10.0 if quick else STANDING_S)
+        for name in estimators:
+            world.found[name][f"standing_{100 * slope:.0f}pct.v_max"] = fastest(name, batches)
+    return world

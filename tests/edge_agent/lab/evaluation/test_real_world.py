@@ -1,0 +1,95 @@
+"""The rough world's figures mean what they say, on seeds that nobody tunes on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edge_agent.estimators import Estimates
+from edge_agent.estimators.estimates import ONE_FRICTION, Y
+from edge_agent.lab.evaluation import real_world
+from edge_agent.lab.evaluation.batch import Batch
+from edge_agent.lab.evaluation.real_world import PRIOR, SURFACES, Tally
+from edge_agent.lab.seeds import FIGURES
+from edge_agent.lab.tuning import objectives, study
+from schemas.numeric import FloatArray
+from schemas.signals import S
+from schemas.thresholds import GRAVITY
+
+
+@pytest.fixture(scope="module")
+def driven() -> tuple[Batch, FloatArray]:
+    """Six rough cars for forty seconds in a town of the figures."""
+    return real_world.town(FIGURES, 6, 40.0)
+
+
+def saying(batch: Batch, lower: float, upper: float) -> Estimates:
+    """Estimates that know the motion and always say the same of friction."""
+    told = np.zeros((*batch.t.shape, ONE_FRICTION))
+    for column, name in ((Y.VX, "vx"), (Y.VY, "vy"), (Y.YAW_RATE, "yaw_rate")):
+        told[..., column] = batch.truth[f"true_{name}"]
+    told[..., Y.MU], told[..., Y.MU_LOWER], told[..., Y.MU_UPPER] = (lower + upper) / 2, lower, upper
+    told[..., Y.VX_STD : Y.MU] = 1.0
+    return Estimates(told)
+
+
+def figures(driven: tuple[Batch, FloatArray], said: Estimates) -> dict[str, float]:
+    tally = Tally()
+    real_world.count(tally, driven[0], said, driven[1])
+    return tally.means()
+
+
+def test_the_prior_is_always_right_and_never_tells_anything(driven: tuple[Batch, FloatArray]) -> None:
+    found = figures(driven, saying(driven[0], *PRIOR))
+    baseline = Tally()
+    real_world.baseline(baseline, driven[0])
+    assert found["coverage90"] == 1.0
+    assert found["width"] == found["width.all"] == pytest.approx(1.0)
+    assert found["false_ice"] == found["below"] == found["rmse_vx"] == found["lost"] == 0.0
+    assert found["score"] == pytest.approx(1.035) == baseline.means()["score"]
+    assert 0.0 < baseline.means()["rmse_vx"] < 0.5
+
+
+def test_who_says_ice_of_every_road_is_right_on_ice_alone(driven: tuple[Batch, FloatArray]) -> None:
+    found = figures(driven, saying(driven[0], 0.05, 0.2))
+    assert [found[f"coverage90.{name}"] for name in ("snow", "wet", "dry")] == [0.0, 0.0, 0.0]
+    assert found["false_ice"] == 1.0
+    assert 0.05 < found["below"] < 1.0
+    assert found["score"] > 3.0
+
+
+def test_each_surface_and_cars_without_torque_are_met_in_a_town(driven: tuple[Batch, FloatArray]) -> None:
+    batch, used = driven
+    for above, most in SURFACES.values():
+        assert ((batch.mu > above) & (batch.mu <= most)).any()
+    silent = np.isnan(batch.signals[:, :, S.TORQUE]).all(axis=0)
+    assert silent.any()
+    assert not silent.all()
+    assert np.abs(batch.truth["true_slope"]).max() > 0.03
+    assert (batch.truth["true_vx"] == 0.0).any()
+    assert (real_world.lately(used) >= used).all()
+    assert 0.0 < (real_world.lately(used) >= 0.6).mean() < 1.0
+
+
+def test_the_grip_in_use_never_exceeds_the_friction_where_it_is_one(driven: tuple[Batch, FloatArray]) -> None:
+    batch, _ = driven
+    one = np.ptp(batch.mu_wheel, axis=-1) == 0.0
+    steady = one & (np.abs(np.gradient(batch.mu, axis=0)) == 0.0)
+    assert (real_world.in_use(batch) <= batch.mu)[steady].mean() > 0.999  # it remembers a fifth of a second
+    assert real_world.in_use(batch).max() > 0.3
+
+
+def test_cars_stand_on_the_slope_they_were_put_on() -> None:
+    batches = real_world.standing(0.05, range(FIGURES, FIGURES + 3), 2.0)
+    assert len(batches) == 6
+    for batch in batches:
+        assert not batch.truth["true_vx"].any()
+        assert (np.abs(batch.signals[..., S.OMEGA : S.OMEGA + 4]) < 0.2).all()
+    felt = np.array([batch.signals[..., S.AX].mean() for batch in batches])
+    assert np.abs(felt[:3] / GRAVITY - 0.05).max() < 0.015
+    assert np.isnan(batches[-1].signals[..., S.TORQUE]).all()
+
+
+def test_nobody_tunes_on_the_seeds_of_the_figures() -> None:
+    for drives in (objectives.TRAIN, objectives.HELD_OUT, study.TRAIN, study.HELD_OUT):
+        assert all(drive.seed < FIGURES for drive in drives)
