@@ -35,6 +35,8 @@ def metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
 def troubles(publisher: Publisher, progress: Progress) -> list[str]:
     """What is not as it should be."""
     found = [] if publisher.links else ["no session is open"]
+    if publisher.broken:
+        found.append("the thread that sends has died; start the agent again")
     if progress.now_s > BEHIND_S:
         found.append(f"{progress.now_s:.1f} s behind real time")
     return found

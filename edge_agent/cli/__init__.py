@@ -10,9 +10,11 @@ import argparse
 import importlib
 import logging
 import sys
+import traceback
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
+FAILED: Final = 1
 BAD_INPUT: Final = 2
 LIVE: Final = ("run", "fleet")  # commands that drive for hours
 
@@ -51,11 +53,26 @@ def main(argv: Sequence[str] | None = None) -> int:
             sub.set_defaults(run=module.run)
     args = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
-    from schemas.errors import InputError
-    from schemas.runtime.process import limit_memory
+    from edge_agent.cli.common import left_behind
+    from schemas.runtime.process import end_now, limit_memory
 
     if argv is None and chosen in LIVE:
         limit_memory()
+    code = FAILED
+    try:
+        code = _code(args)
+    except Exception:
+        if not left_behind.is_set():
+            raise
+        traceback.print_exc()
+    if left_behind.is_set():
+        end_now(code)
+    return code
+
+
+def _code(args: argparse.Namespace) -> int:
+    from schemas.errors import InputError
+
     try:
         return int(args.run(args))
     except InputError as error:

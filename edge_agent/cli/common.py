@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import signal
 import sys
@@ -73,20 +72,23 @@ def stop_on_signal() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
+# Set when a session hangs, on a frozen router: it would keep the interpreter from ending, so that the command line ends
+# the process itself, once the command has closed its files and its exit code is known.
+left_behind = threading.Event()
+
+
 def leave(publisher: Publisher, progress: Progress, drain_s: float) -> None:
     """Wait for acknowledgements, close, print the counts as one line of JSON on stdout.
 
-    What is unsettled stays in the spool for the next start. A session that hangs on a frozen router would keep the
-    interpreter from ending, so the process is then ended from here.
+    What is unsettled stays in the spool for the next start.
     """
     from edge_agent.app.live_loop import summary
 
     clean = publisher.close(drain_s)
     if not clean:
         print_line("warning: a session did not close; leaving it behind", sys.stderr)
+        left_behind.set()
     print(json.dumps(summary(progress, publisher)), flush=True)
-    if not clean:
-        os._exit(0)
 
 
 def status(progress: Progress, publisher: Publisher, say: Callable[[str], None]) -> None:

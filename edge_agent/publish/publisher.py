@@ -83,6 +83,11 @@ class Publisher:
         """Sessions that are open."""
         return len(self._links)
 
+    @property
+    def broken(self) -> bool:
+        """Whether the thread that sends has died: records are taken, and dropped once there is no room for more."""
+        return self._sender.ident is not None and not self._sender.is_alive() and not self._closing.is_set()
+
     def unsettled(self, kind: Kind | None = None) -> int:
         """Records that are not settled yet: in the spool, those of an earlier start included, or on their way to it."""
         counts, kinds = self.counts, Kind if kind is None else (kind,)

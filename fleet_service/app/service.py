@@ -60,6 +60,7 @@ class Service:
         limits = Limits(config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, known, self.engine.counts)
         self._replies = Replies(self._answer, self.engine.counts)
         self.inbox = Inbox(config.queue_batches, self.engine.counts, limits)
+        self.failure: BaseException | None = None  # of the worker; leaving the session after it may hang
         self._session: zenoh.Session | None = None
         self._turned_at = self._put_at = self._flushed_at = self._said_at = time.monotonic()
         self._said = 0
@@ -74,6 +75,11 @@ class Service:
         finally:
             self.engine.close()
 
+    @property
+    def exit_code(self) -> int:
+        """0 where all that was admitted is on disk and nothing failed, else 1."""
+        return 1 if self.failure is not None or self.engine.unsettled else 0
+
     def _serve(self, session: zenoh.Session, stop: threading.Event, address: str) -> None:
         with (
             session,
@@ -82,9 +88,14 @@ class Service:
         ):
             self._session = session
             self._say(f"ready: {self._config.name}, {self.engine.fusion.size} cells from the archive{address}")
-            while not stop.is_set():
-                self._turn(session, stop)
-            self._leave(session)
+            try:
+                while not stop.is_set():
+                    self._turn(session, stop)
+                self._leave(session)
+            except BaseException as error:
+                self.failure = error
+                stop.set()
+                raise
 
     def _seen(self) -> AbstractContextManager[str | None]:
         """Metrics and health, where the settings want them."""

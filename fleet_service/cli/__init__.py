@@ -7,18 +7,22 @@ from __future__ import annotations
 
 import argparse
 import gc
-import os
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fleet_service.cli import analyze as analytics_cli
 from fleet_service.cli import archive as archive_cli
 from fleet_service.cli import certs
 from schemas.errors import InputError
-from schemas.runtime.process import limit_memory, line_logger, log_as
+from schemas.runtime.process import end_now, limit_memory, line_logger, log_as
+
+if TYPE_CHECKING:
+    from fleet_service.app.service import Service
 
 SWITCH_S = 0.0005  # after which a busy worker lets an answer go first; ten times that is Python's own
 # 25 MB that a running service's libraries load where they find them: for matrix products in kernels, of which there are
@@ -108,21 +112,24 @@ def _run(arguments: argparse.Namespace) -> int:
     gc.collect()
     gc.freeze()  # what came from the archive stays: looking through it takes longer than an alert may
     gone = threading.Event()
-    threading.Thread(target=_leave_at_last, args=(stop, gone, say), daemon=True).start()
+    threading.Thread(target=_leave_at_last, args=(stop, gone, service, say), daemon=True).start()
     service.run(stop)
     gone.set()
     return 0
 
 
-def _leave_at_last(stop: threading.Event, gone: threading.Event, say: Callable[[str], None]) -> None:
+def _leave_at_last(stop: threading.Event, gone: threading.Event, service: Service, say: Callable[[str], None]) -> None:
     """A session that hangs on a frozen router, or a long compaction, must not keep a stopped service.
 
-    Whatever it was doing may end at any instant: what is not acknowledged its senders keep.
+    Whatever it was doing may end at any instant: what is not acknowledged its senders keep. The exit code is the one
+    that it would have ended with.
     """
     stop.wait()
     if not gone.wait(LEAVE_AT_LAST_S):
         say("left at last: a session or a job did not end in time")
-        os._exit(0)
+        if service.failure is not None:
+            traceback.print_exception(service.failure)
+        end_now(service.exit_code)
 
 
 def _query(arguments: argparse.Namespace) -> int:

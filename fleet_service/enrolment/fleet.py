@@ -11,7 +11,8 @@ from pydantic import AfterValidator, Field, model_validator
 
 from schemas.config import Settings, VehicleName
 
-_HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9-]{0,62}\.?)*")
+_LABEL = r"[A-Za-z0-9](?:[A-Za-z0-9-]{0,61}[A-Za-z0-9])?"  # RFC 1123, section 2.1
+_HOST = re.compile(rf"(?:{_LABEL}\.)*{_LABEL}\.?")  # one way to read each letter, so that a wrong one is seen at once
 
 
 def _checked_host(host: str) -> str:

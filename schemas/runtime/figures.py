@@ -43,19 +43,29 @@ class Figure:
 
 def header(campaign: str, seeds: Sequence[int]) -> dict[str, object]:
     """What a figure depends on besides the code: commit, machine, versions, seeds, date."""
-    try:
-        command = ["git", "rev-parse", "--short", "HEAD"]
-        commit = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        commit = "unknown"
     return {
         "campaign": campaign,
-        "commit": commit,
+        "commit": commit(Path(__file__)),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": f"{platform.machine()}, {platform.system()}, Python {platform.python_version()}",
         "versions": {name: metadata.version(name) for name in PACKAGES},
         "seeds": list(seeds),
     }
+
+
+def commit(source: Path) -> str:
+    """Commit of the repository that a source file belongs to; with `-dirty` where a file that it knows was changed.
+
+    The repository of the working directory may be another, and an installed copy may lie inside one that does not know
+    it: "unknown" then.
+    """
+    git = ["git", "-C", str(source.parent)]
+    describe = [*git, "describe", "--always", "--abbrev=7", "--exclude=*", "--dirty"]
+    try:
+        subprocess.run([*git, "ls-files", "--error-unmatch", source.name], capture_output=True, check=True)
+        return subprocess.run(describe, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
 
 
 def write(path: Path, campaign: str, seeds: Sequence[int], figures: Sequence[Figure]) -> None:

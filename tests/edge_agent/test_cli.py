@@ -23,6 +23,7 @@ from schemas.vehicle import load_vehicle
 from schemas.wire import Kind
 from tests.edge_agent.fakes import BAD_LOGS
 from tests.edge_agent.service import Router, Service
+from tests.faults.processes import Part
 
 COMMAND = (sys.executable, "-c", "import sys; from edge_agent.cli import main; sys.exit(main(sys.argv[1:]))")
 Output = pytest.CaptureFixture[str]
@@ -117,6 +118,38 @@ def test_replay_publishes_observations_and_states_at_the_time_of_the_drive_and_w
     enter = np.concatenate([b.columns["enter_time"] for b in service.batches if b.kind is Kind.OBSERVATION])
     assert np.datetime64(int(enter.min()), "ns") == np.datetime64("2026-01-31T07:00:00")
     assert np.datetime64(int(enter.max()), "ns") < np.datetime64("2026-01-31T07:00:08")
+
+
+IMPATIENT = "import sys; from edge_agent.cli import main, replay; replay.DRAIN_S = .5; sys.exit(main(sys.argv[1:]))"
+
+
+@pytest.mark.parametrize("well", [True, False])
+def test_replay_with_a_session_that_hangs_keeps_its_estimates_and_says_that_nothing_was_acknowledged(
+    drive: Path, tmp_path: Path, well: bool
+) -> None:
+    """A frozen router takes the connection and never answers."""
+    router = Part("router", [sys.executable, "-m", "deploy.router", "--listen", "tcp/127.0.0.1:0"], tmp_path)
+    router.start()
+    try:
+        settings = {"zenoh": {"connect": [router.line_with("router: ").split()[1]]}}
+        router.send(signal.SIGSTOP)
+        (tmp_path / "agent.json").write_text(json.dumps(settings | {"spool": str(tmp_path / "spool.sqlite")}))
+        words = replay(drive, tmp_path / "out", "--publish", "--config", str(tmp_path / "agent.json"))
+        code = (
+            IMPATIENT if well else f"from edge_agent.observe.pipeline import Pipeline as P; P.finish = 0; {IMPATIENT}"
+        )
+        done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=150)
+    finally:
+        router.send(signal.SIGCONT)
+        router.kill()
+    assert "a session did not close" in done.stderr
+    assert json.loads(done.stdout)["unsettled"] > 20
+    assert done.returncode == 1
+    if well:
+        assert pq.read_table(tmp_path / "out").num_rows == pq.read_table(drive / "log.parquet").num_rows
+    else:
+        assert "TypeError: 'int' object is not callable" in done.stderr, "what went wrong is not swallowed"
+        assert not (tmp_path / "out").exists()
 
 
 def test_run_drives_a_log_in_real_time_and_publishes_it(

@@ -89,9 +89,9 @@ class Part:
         self._writer.wait(patience_s)
         return code
 
-    def stop(self) -> int:
-        """SIGTERM; returns the exit code."""
-        self.send(signal.SIGTERM)
+    def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
+        """SIGTERM, or another signal; returns the exit code."""
+        self.send(number)
         return self.wait(STOP_S)
 
     def limit_files(self, size: int) -> None:

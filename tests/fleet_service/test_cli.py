@@ -19,6 +19,7 @@ from fleet_service.cli import main
 from schemas import wire
 from schemas.config import ZenohSettings
 from schemas.runtime.zenoh_session import open_session
+from tests.faults.processes import Part
 from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.conftest import Running, running
 from tests.fleet_service.examples import CELL, SECOND, batch, key
@@ -117,6 +118,36 @@ def test_run_and_watch_as_processes_from_start_to_signal(
             assert process.stderr is not None
             assert process.stderr.read() == ""
         assert "status: 4 observations" in run.stdout.read()
+
+
+HANGS = """
+import sys, threading
+from fleet_service.app import service
+from fleet_service.app.jobs import Job
+from fleet_service.cli import main
+service.archive_jobs = lambda *_: [Job("hangs", .001, lambda _: print("hangs", flush=True) or threading.Event().wait())]
+{more}
+sys.exit(main(sys.argv[1:]))
+"""
+BREAKS = "service.Service._leave = lambda self, session: [][0]"
+
+
+@pytest.mark.parametrize(("more", "code"), [("", 0), (BREAKS, 1)])
+def test_a_service_that_has_to_be_ended_says_with_its_exit_code_whether_all_was_well(
+    tmp_path: Path, router: ZenohSettings, more: str, code: int
+) -> None:
+    config = tmp_path / "service.json"
+    config.write_text(json.dumps({"zenoh": router.model_dump()}))
+    words = ["run", "--config", str(config), "--archive", str(tmp_path / "archive")]
+    service = Part("service", [sys.executable, "-c", HANGS.format(more=more), *words], tmp_path)
+    service.start()
+    try:
+        service.line_with("hangs")
+        assert service.stop() == code
+        assert "left at last: a session or a job did not end in time" in service.lines()
+        assert ("IndexError: list index out of range" in service.lines()) == bool(more)
+    finally:
+        service.kill()
 
 
 def test_the_service_waits_for_a_router_and_survives_its_restart(tmp_path: Path) -> None:

@@ -125,6 +125,23 @@ def test_a_lost_key_of_the_authority_is_said_and_not_replaced(folder: Path) -> N
         at(folder).enrol(enrolment())
 
 
+# A name with a wrong letter near its end: a pattern that can read the letters before in many ways tries them all.
+LONG = "a" * 62 + "_b"
+
+
+@pytest.mark.parametrize(
+    "host", ["a", "r-1.example.org", "127.0.0.1", "::1", "a" * 63 + ".b", "xn--bcher-kva.example."]
+)
+def test_names_and_addresses_of_hosts_are_hosts(host: str) -> None:
+    assert enrolment(routers={"r-1": {"hosts": [host]}}).routers["r-1"].hosts == [host]
+
+
+@pytest.mark.parametrize("host", ["", "-a", "a-", "a..b", ".a", "a_b", "a" * 64, "a b", "a\n", ".".join(["ab"] * 100)])
+def test_what_is_no_host_is_refused(host: str) -> None:
+    with pytest.raises(ValueError, match="is no host name and no address"):
+        enrolment(routers={"r-1": {"hosts": [host]}})
+
+
 @pytest.mark.parametrize(
     ("fleet", "options", "said"),
     [
@@ -136,6 +153,7 @@ def test_a_lost_key_of_the_authority_is_said_and_not_replaced(folder: Path) -> N
             "error: content: value error, 'shard-0' is there",
         ),
         ({"routers": {"r-1": {"hosts": ["a b"]}}}, [], "error: routers.r-1.hosts.0: value error, 'a b' is no host"),
+        ({"routers": {"r-1": {"hosts": [LONG]}}}, [], "error: routers.r-1.hosts.0: value error, 'aaaa"),
         ({"routers": {"r-1": {}}, "cars": []}, [], "error: cars: "),
         ({"routers": {"r-1": {}}}, ["--days", "-1"], "error: days: -1 is no time; "),
         ({"routers": {"r-1": {}}}, ["--days", "nan"], "error: days: nan is no time; "),

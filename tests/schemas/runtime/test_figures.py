@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from pathlib import Path
 
 import pytest
 
-from schemas.runtime.figures import Figure, markdown, write
+from schemas.runtime.figures import Figure, commit, markdown, write
 
 
 @pytest.mark.parametrize(
@@ -24,6 +25,31 @@ from schemas.runtime.figures import Figure, markdown, write
 )
 def test_a_figure_holds_on_the_right_side_of_its_bar_and_never_when_missing(figure: Figure, holds: bool) -> None:
     assert figure.holds is holds
+
+
+def _git(folder: Path, *words: str) -> str:
+    who = ("-c", "user.name=nobody", "-c", "user.email=nobody@example.org")
+    done = subprocess.run(["git", *who, *words], cwd=folder, capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+def test_the_commit_is_that_of_the_source_and_says_whether_it_was_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    source, other = tmp_path / "house" / "room" / "code.py", tmp_path / "house" / "room" / "site-packages.py"
+    source.parent.mkdir(parents=True)
+    source.write_text("1")
+    assert commit(source) == "unknown"
+    _git(source.parent, "init", "-q")
+    _git(source.parent, "add", ".")
+    _git(source.parent, "commit", "-qm", "first")
+    head = _git(source.parent, "rev-parse", "--short=7", "HEAD")
+    assert commit(source) == head
+    other.write_text("installed here, and no part of it")
+    assert commit(other) == "unknown"
+    source.write_text("2")
+    assert commit(source) == f"{head}-dirty"
 
 
 def test_the_file_starts_with_a_header_and_says_what_does_not_hold(tmp_path: Path) -> None:
