@@ -1,9 +1,9 @@
 """From wheels to observations on disk, without a network: what the fusion's campaign needs for the whole way.
 
-    python -m deploy.whole_way --out DIR [--vehicles 200] [--duration 60] [--seed 9]
+    python -m deploy.whole_way --out DIR [--vehicles 200] [--duration 60] [--seed 20000] [--scenario demo] [--rough 0]
 
-Simulated vehicles with the default estimator drive the demo's network; DIR/observations.parquet gets what they would
-have sent, DIR/truth.parquet what they drove over.
+Simulated vehicles with the default estimator drive a scenario; DIR/observations.parquet gets what they would have sent,
+DIR/truth.parquet what they drove over.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.inputs.block import Block, absolute
+from edge_agent.lab.seeds import FIGURES
 from edge_agent.lab.simulation import SimulatedFleet
 from edge_agent.lab.truth_file import TruthRecorder
 from edge_agent.observe.observation_builder import Records
@@ -33,9 +34,9 @@ START_NS = 1_800_000_000 * NS
 TELL_S = 30.0
 
 
-def drive(vehicles: int, duration_s: float, seed: int, truth: Path) -> Columns:
+def drive(fleet: SimulatedFleet, duration_s: float, truth: Path) -> Columns:
     """Columns of all observations, with `vehicle`; writes the truth."""
-    fleet = SimulatedFleet("demo", vehicles, seed, RATE_HZ)
+    vehicles = len(fleet.vehicles)
     config = AgentConfig()
     pipeline = Pipeline(bank_of(config.estimator, fleet.vehicles), vehicles, config)
     recorder = TruthRecorder(tuple(fleet.names))
@@ -62,10 +63,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--vehicles", type=int, default=200)
     parser.add_argument("--duration", type=float, default=60.0, help="[s] of driving")
-    parser.add_argument("--seed", type=int, default=9)
+    parser.add_argument("--seed", type=int, default=FIGURES)
+    parser.add_argument("--scenario", default="demo", help="demo (default), hills; hills-7: drawn by seed 7")
+    parser.add_argument("--rough", type=float, default=0.0, help="share of vehicles as real cars are (default 0)")
     args = parser.parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
-    columns = drive(args.vehicles, args.duration, args.seed, args.out / "truth.parquet")
+    fleet = SimulatedFleet(args.scenario, args.vehicles, args.seed, RATE_HZ, rough=args.rough)
+    columns = drive(fleet, args.duration, args.out / "truth.parquet")
     arrays = {name: pa.array(list(map(bytes, c)) if c.ndim == 2 else c) for name, c in columns.items()}
     pq.write_table(pa.table(arrays), args.out / "observations.parquet")
     print(f"  {len(columns['cell'])} observations of {args.vehicles} vehicles", flush=True)

@@ -69,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     began = time.monotonic()
     shutil.rmtree(FOLDER, ignore_errors=True)
     FOLDER.mkdir()
-    appears_s = scenario_named("demo").events[0].start
+    appears_s = scenario_named(processes.SCENARIO).events[0].start
     print(f"{args.vehicles} vehicles drive for {args.duration:.0f} s; after {appears_s:.0f} s an ice patch appears.")
     with processes.system(FOLDER) as (endpoint, _):
         listener, counts = drive(FOLDER, endpoint, args)

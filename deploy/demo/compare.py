@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_service.archive import reading
+from fleet_service.lab.whole_way import false_ice
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.figures import Figure
 from schemas.thresholds import EXCITED_SHARE, SLIPPERY_MU
@@ -102,11 +103,13 @@ def figures(
     error = comparison.cells["mu"].to_numpy() - comparison.truth
     patch = (visits["mu"].to_numpy() < SLIPPERY_MU) & newly_slippery(visits, changed_ns)
     rows, distinct, vehicles = archived(archive)
+    false, _ = false_ice([alert for _, alert in alerts if alert.raised], visits)
     return [
         Figure("demo.vehicles", vehicles, "", 30, "more"),
         Figure("demo.map.coverage90", _mean(comparison.covered[several]), "", (0.80, 0.99), "within"),
         Figure("demo.map.rmse", float(np.sqrt(_mean(error[value] ** 2))), "", 0.12),
         Figure("demo.alert.delay_passes", delay_passes(visits, patch, alerts, changed_ns), "passes", 8),
+        Figure("demo.alerts.on_dry_roads", false, "alerts", 0),
         Figure("demo.observations.unacknowledged", counts["observations_unsettled"], "", 0),
         Figure("demo.observations.duplicates", rows - distinct, "", 0),
         Figure("demo.wall_s", wall_s, "s", 240),

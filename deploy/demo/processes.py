@@ -13,6 +13,7 @@ from pathlib import Path
 
 START_S = 60.0  # the first start compiles the kernels
 STOP_S = 10.0
+SCENARIO = "hills"
 
 
 class DemoError(RuntimeError):
@@ -107,7 +108,8 @@ def fleet(folder: Path, vehicles: int, duration_s: float, seed: int) -> Part:
     scripts = Path(sys.executable).parent
     options = {
         "--vehicles": vehicles,
-        "--scenario": "demo",
+        "--scenario": SCENARIO,
+        "--rough": 0.5,  # half of them as real cars are
         "--duration": duration_s,
         "--seed": seed,
         "--config": folder / "agent.json",

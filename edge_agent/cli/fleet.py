@@ -10,7 +10,7 @@ from pathlib import Path
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--vehicles", type=int, default=36, help="how many (default 36)")
-    parser.add_argument("--scenario", default="demo", help="where they drive: demo, hills, test (default demo)")
+    parser.add_argument("--scenario", default="demo", help="demo (default), hills, test; hills-7: drawn by seed 7")
     parser.add_argument("--rough", type=float, default=0.0, help="share of them as real cars are (default 0)")
     parser.add_argument("--estimator", help="estimator by name (default: the configuration's)")
     parser.add_argument("--config", type=Path, help="agent configuration (JSON)")

@@ -83,7 +83,9 @@ def _parser() -> argparse.ArgumentParser:
     evaluate = commands.add_parser("evaluate", help="simulated fleets, beside truth and simple rules")
     evaluate.add_argument("--out", metavar="DIR", type=Path, required=True, help="figures, table and plots go there")
     evaluate.add_argument("--quick", action="store_true", help="one seed, to see that it works; judges nothing")
-    evaluate.add_argument("--skip-whole-way", action="store_true", help="leave the vehicles with real estimators out")
+    way = evaluate.add_mutually_exclusive_group()
+    way.add_argument("--skip-whole-way", action="store_true", help="leave the vehicles with real estimators out")
+    way.add_argument("--whole-way", action="store_true", help="those alone, in a level town and on hills")
     evaluate.set_defaults(command=_evaluate)
     return parser
 
@@ -159,9 +161,13 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from fleet_service.lab import campaign
     from schemas.runtime import figures
 
-    drive = None if arguments.skip_whole_way else campaign.whole_way_of(arguments.quick)
+    drives = {} if arguments.skip_whole_way else campaign.whole_ways(arguments.quick)
+
+    def tell(line: str) -> None:
+        print(line, flush=True)
+
     try:
-        found = campaign.run(arguments.out, arguments.quick, drive, lambda line: print(line, flush=True))
+        found = campaign.run(arguments.out, arguments.quick, drives, tell, alone=arguments.whole_way)
     except OSError as error:
         raise InputError("out", f"cannot write {error.filename} ({error.strerror})", "give another folder") from error
     print(f"\n{figures.markdown([figure for figure in found if figure.bar is not None])}\n")

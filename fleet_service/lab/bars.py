@@ -45,6 +45,8 @@ BARS: Final[dict[str, Bar]] = {
     "fusion.replay.max_difference": Bar(1e-6, "less", "probability"),
     "fusion.whole_way.coverage90": Bar((0.85, 0.97), "within", _SHARE),
     "fusion.whole_way.rmse": Bar(0.08, "less", "measured cells"),
+    "fusion.whole_way.hills.coverage90": Bar((0.85, 0.97), "within", _SHARE),
+    "fusion.whole_way.hills.false_ice": Bar(0, "less", "alerts on wet and dry road"),
     "fusion.vs_best_rule.clean": Bar(1, "less", "ratio of interval scores"),
     "fusion.vs_best_rule.mis15": Bar(1, "less", "ratio of interval scores"),
 }

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -14,41 +15,46 @@ from schemas.runtime import figures
 from schemas.runtime.figures import Figure
 
 SEEDS, QUICK_SEEDS = 40, 1
-WHOLE_WAY_VEHICLES, WHOLE_WAY_S = 200, 60.0
+WHOLE_WAYS: Final = {whole_way.LEVEL: (200, 60.0), whole_way.HILLS: (120, 180.0)}  # vehicles, seconds
 EXACT_SEEDS: Final = 8  # drives of 20 minutes; nothing random is averaged there, the largest difference counts
 
 Tell = Callable[[str], None]
+Part = Callable[[], dict[str, float]]
+Drives = Mapping[whole_way.World, whole_way.Drive]
 
 
-def run(folder: Path, quick: bool, drive: whole_way.Drive | None, tell: Tell) -> list[Figure]:
+def run(folder: Path, quick: bool, drives: Drives, tell: Tell, *, alone: bool = False) -> list[Figure]:
     """Run all parts and write `figures.json` and `figures.md` into `folder`.
 
     Args:
         folder: is made.
         quick: one seed, to see that everything works; says nothing about the bars.
-        drive: of the whole way, None to leave it out (its figures are then missing).
+        drives: of the whole way; without one, its figures are missing.
         tell: hears progress lines.
+        alone: the whole way and nothing else; other figures are then not listed.
     """
     folder.mkdir(parents=True, exist_ok=True)
     seeds = range(QUICK_SEEDS if quick else SEEDS)
     found: dict[str, float] = {}
-    for name, part in _parts(seeds, drive, folder, tell):
+    for name, part in ([] if alone else _parts(seeds, tell)) + _ways(drives, folder):
         began = time.perf_counter()
         found |= part()
         tell(f"{name}: {time.perf_counter() - began:.0f} s")
-    judged = bars.judged(found)
+    judged = [figure for figure in bars.judged(found) if not alone or figure.name.startswith(whole_way.LEVEL.prefix)]
     figures.write(folder / "figures.json", "fusion" + (" --quick" if quick else ""), list(seeds), judged)
     barred = [figure for figure in judged if figure.bar is not None]
     shown = [figure for figure in judged if figure.bar is None and not _curve(figure.name)]
     (folder / "figures.md").write_text(f"{figures.markdown(barred)}\n\n{figures.markdown(shown)}\n")
-    for path in plots.draw(judged, folder):
+    for path in [] if alone else plots.draw(judged, folder):
         tell(f"plot {path}")
     return judged
 
 
-def whole_way_of(quick: bool) -> whole_way.Drive:
-    """The drive of the whole way, or a few seconds of it."""
-    return whole_way.command(4, 3.0) if quick else whole_way.command(WHOLE_WAY_VEHICLES, WHOLE_WAY_S)
+def whole_ways(quick: bool) -> Drives:
+    """The drives of the whole way, level and rough, or a few seconds of them."""
+    return {
+        world: whole_way.command(*((4, 3.0) if quick else length), world) for world, length in WHOLE_WAYS.items()
+    }  # fmt: skip
 
 
 def holds(found: Sequence[Figure]) -> bool:
@@ -60,19 +66,21 @@ def _curve(name: str) -> bool:
     return "reliability" in name or "share_after" in name
 
 
-def _parts(
-    seeds: range, drive: whole_way.Drive | None, folder: Path, tell: Tell
-) -> list[tuple[str, Callable[[], dict[str, float]]]]:  # fmt: skip
+def _ways(drives: Drives, folder: Path) -> list[tuple[str, Part]]:
+    return [
+        (f"the whole way, {world.scenario}", partial(whole_way.measure, drive, folder, world))
+        for world, drive in drives.items()
+    ]  # fmt: skip
+
+
+def _parts(seeds: range, tell: Tell) -> list[tuple[str, Part]]:
     few = range(min(EXACT_SEEDS, len(seeds)))
-    parts: list[tuple[str, Callable[[], dict[str, float]]]] = [
+    return [
         ("order, replay, unexcited", lambda: _exact(few)),
         ("ice comes and goes", lambda: changes.measure(seeds)),
         ("fleets and rules", lambda: fleets.measure(seeds, tell)),
         ("attacks", lambda: attacks.measure(seeds)),
     ]
-    if drive is not None:
-        parts.append(("the whole way", lambda: whole_way.measure(drive, folder)))
-    return parts
 
 
 def _exact(seeds: range) -> dict[str, float]:

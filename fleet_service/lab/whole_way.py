@@ -7,9 +7,9 @@ read.
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -18,25 +18,41 @@ import pyarrow.parquet as pq
 from fleet_service.fusion import Fusion, Observations, observations_of
 from fleet_service.lab.drive import LATENESS_S
 from fleet_service.lab.score import Scores, of_beliefs, safe
+from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.map_state import LOWER, UPPER, measured
 from schemas import grid, mugrid, wire
 from schemas.errors import InputError
 from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import EXCITED_SHARE, NS
+from schemas.wire import Alert
 
 OBSERVATIONS, TRUTH = "observations.parquet", "truth.parquet"
 SEVERAL: Final = 2  # vehicles of a cell that counts: the bar is the map's, and one vehicle is no map
 SAME: Final = 0.02  # of friction within a cell of one surface
+SURE_GRIP: Final = 0.45  # snow and ice lie below, wet and dry road above
 
 Drive = Callable[[Path], None]  # drives and writes both files into a folder
 
 
-def command(vehicles: int, seconds: float) -> Drive:
+class World(NamedTuple):
+    """Where whom the vehicles are driven: a scenario of the simulator, and the share of rough vehicles."""
+
+    scenario: str
+    rough: float
+    prefix: str  # of the figures
+
+
+LEVEL: Final = World("demo", 0.0, "fusion.whole_way")
+HILLS: Final = World("hills-20000", 0.5, "fusion.whole_way.hills")  # frictions and hills that nobody tuned on
+
+
+def command(vehicles: int, seconds: float, world: World) -> Drive:
     """A drive by `python -m deploy.whole_way`."""
     import sys
 
     def drive(folder: Path) -> None:
         options = ["--out", str(folder), "--vehicles", str(vehicles), "--duration", str(seconds)]
+        options += ["--scenario", world.scenario, "--rough", str(world.rough)]
         done = subprocess.run([sys.executable, "-m", "deploy.whole_way", *options], check=False)
         if done.returncode:
             raise InputError("whole-way", "the simulated vehicles failed", "see above, or --skip-whole-way")
@@ -44,13 +60,15 @@ def command(vehicles: int, seconds: float) -> Drive:
     return drive
 
 
-def measure(drive: Drive, folder: Path) -> dict[str, float]:
-    """Coverage of cells with SEVERAL vehicles, error of those among them that are measured, and the counts."""
-    drive(folder / "whole_way")
-    columns = read(folder / "whole_way" / OBSERVATIONS)
-    visits = pq.read_table(folder / "whole_way" / TRUTH)
+def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float]:
+    """Coverage of cells with SEVERAL vehicles, error of those among them that are measured, alerts, and the counts."""
+    folder = folder / world.prefix.removeprefix("fusion.")
+    drive(folder)
+    columns = read(folder / OBSERVATIONS)
+    visits = pq.read_table(folder / TRUTH)
     fusion = Fusion(LATENESS_S)
-    fusion.update(observations_in(columns))
+    raised = told(fusion, observations_in(columns))
+    false, beside = false_ice(raised, visits)
     slots, truth = joined(fusion, visits)
     several = fusion.live.vehicles[slots] >= SEVERAL
     slots, truth = slots[several], truth[several]
@@ -59,23 +77,53 @@ def measure(drive: Drive, folder: Path) -> dict[str, float]:
     lower, upper = (mugrid.quantiles(belief, q) for q in (LOWER, UPPER))
     with_value = measured(lower, upper, fusion.live.values[slots])
     pure = with_value & one_surface(fusion, visits)[slots]
-    return _figures(scores, with_value) | {
-        "fusion.whole_way.rmse.one_surface": mean(scores.error[pure] ** 2) ** 0.5,
-        "fusion.whole_way.safe95": safe(scores),
-        "fusion.whole_way.observations": float(len(columns["cell"])),
-    }
+    found = _figures(scores, with_value) | {
+        "rmse.one_surface": mean(scores.error[pure] ** 2) ** 0.5, "safe95": safe(scores),
+        "observations": float(len(columns["cell"])), "alerts": float(len(raised)), "false_ice": float(false),
+        "false_ice.beside": float(beside),
+    }  # fmt: skip
+    return {f"{world.prefix}.{name}": value for name, value in found.items()}
+
+
+def told(fusion: Fusion, o: Observations) -> list[Alert]:
+    """Fuse the observations second by second, as a service would, and return the alerts that were raised."""
+    alerts, raised = Alerts(fusion), []
+    second = (o.time - o.time.min()) // NS
+    for rows in np.split(np.argsort(second, kind="stable"), np.cumsum(np.bincount(second))[:-1]):
+        if len(rows):
+            raised += [alert for alert in alerts.updated(fusion.update(o.take(rows)).slots) if alert.raised]
+    return raised
+
+
+def false_ice(raised: Sequence[Alert], visits: pa.Table) -> tuple[int, int]:
+    """Alerts on wet and dry road: those with no slippery road near, and those in a cell beside one.
+
+    Slippery is what any vehicle truly found below SURE_GRIP there before the alert. A fix is metres off and a cell ten
+    metres wide: who is told of the cell beside the ice is warned rightly.
+    """
+    east, north = grid.deinterleave(visits["cell"].to_numpy())
+    mu, enter = visits["mu"].to_numpy(), visits["enter_time"].cast(pa.int64()).to_numpy()
+    false = beside = 0
+    for alert in raised:
+        x, y = (int(value[0]) for value in grid.deinterleave(np.array([alert.cell])))
+        far = np.maximum(np.abs(east - x), np.abs(north - y))
+        slippery = (mu < SURE_GRIP) & (enter <= alert.time)
+        if not (slippery & (far == 0)).any():
+            near = bool((slippery & (far == 1)).any())
+            false, beside = false + (not near), beside + near
+    return false, beside
 
 
 def _figures(scores: Scores, measured: np.ndarray[Any, Any]) -> dict[str, float]:
     value = scores.taken(measured)
     return {
-        "fusion.whole_way.coverage90": mean(scores.covered),
-        "fusion.whole_way.rmse": mean(value.error**2) ** 0.5,
-        "fusion.whole_way.coverage90.measured": mean(value.covered),
-        "fusion.whole_way.bias.measured": mean(value.error),
-        "fusion.whole_way.rmse.excited3": mean(value.error[value.vehicles >= 3] ** 2) ** 0.5,
-        "fusion.whole_way.cells": float(len(scores.error)),
-        "fusion.whole_way.cells.measured": float(measured.sum()),
+        "coverage90": mean(scores.covered),
+        "rmse": mean(value.error**2) ** 0.5,
+        "coverage90.measured": mean(value.covered),
+        "bias.measured": mean(value.error),
+        "rmse.excited3": mean(value.error[value.vehicles >= 3] ** 2) ** 0.5,
+        "cells": float(len(scores.error)),
+        "cells.measured": float(measured.sum()),
     }
 
 

@@ -17,6 +17,7 @@ from edge_agent.lab.simulation.roads import Network, Road, build_network
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
+DRAWN: Final = "hills-"  # names of drawn scenarios: this and the seed
 DRAWN_STREAM: Final = 21
 
 
@@ -127,7 +128,7 @@ def drawn(seed: int) -> Scenario:
     )
     relief = Relief(waves, crossfall=0.03 * uniform(key, 30), banking=0.5)
     return replace(
-        usual, name=f"hills-{seed}", about="a town on drawn hills", background=now[DRY], patches=patches, relief=relief
+        usual, name=f"{DRAWN}{seed}", about="a town on drawn hills", background=now[DRY], patches=patches, relief=relief
     )
 
 
@@ -150,13 +151,16 @@ SCENARIOS: Final = {scenario.name: scenario for scenario in (demo(), hills(), ti
 
 
 def scenario_named(name: str | Scenario) -> Scenario:
-    """The scenario of that name.
+    """The scenario of that name; "hills-7" is the one `drawn` by the seed 7.
 
     Raises:
         InputError: there is none.
     """
     if isinstance(name, Scenario):
         return name
+    if name.startswith(DRAWN) and name[len(DRAWN) :].isdecimal():
+        return drawn(int(name[len(DRAWN) :]))
     if name not in SCENARIOS:
-        raise InputError("scenario", f"there is no scenario {name!r}", f"choose one of {', '.join(SCENARIOS)}")
+        choices = f"choose one of {', '.join(SCENARIOS)}, {DRAWN}SEED"
+        raise InputError("scenario", f"there is no scenario {name!r}", choices)
     return SCENARIOS[name]

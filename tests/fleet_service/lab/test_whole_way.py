@@ -12,18 +12,23 @@ import pytest
 from deploy.whole_way import main
 from fleet_service.fusion import Fusion
 from fleet_service.lab import whole_way
+from schemas import grid
+from schemas.thresholds import NS
+from schemas.wire import Alert
 from tests.fleet_service.examples import CELL, START, observations, value
 
 
 @pytest.mark.timeout(600)  # compiles the estimator where nobody did before
 def test_what_the_vehicles_write_is_joined_with_their_truth(tmp_path: Path) -> None:
     def drive(folder: Path) -> None:
-        assert main(["--out", str(folder), "--vehicles", "4", "--duration", "20", "--seed", "3"]) == 0
+        world = ["--scenario", whole_way.HILLS.scenario, "--rough", "0.5"]
+        assert main(["--out", str(folder), "--vehicles", "4", "--duration", "20", "--seed", "3", *world]) == 0
 
-    figures = whole_way.measure(drive, tmp_path)
-    assert figures["fusion.whole_way.observations"] > 4
-    columns = whole_way.read(tmp_path / "whole_way" / whole_way.OBSERVATIONS)
-    truth = pq.read_table(tmp_path / "whole_way" / whole_way.TRUTH)
+    figures = whole_way.measure(drive, tmp_path, whole_way.HILLS)
+    assert figures["fusion.whole_way.hills.observations"] > 4
+    assert figures["fusion.whole_way.hills.false_ice"] <= figures["fusion.whole_way.hills.alerts"]
+    columns = whole_way.read(tmp_path / "whole_way.hills" / whole_way.OBSERVATIONS)
+    truth = pq.read_table(tmp_path / "whole_way.hills" / whole_way.TRUTH)
     told = set(zip(columns["cell"].tolist(), columns["sector"].tolist(), strict=True))
     true = set(zip(truth["cell"].to_pylist(), truth["sector"].to_pylist(), strict=True))
     assert len(told & true) > 0.5 * len(told)
@@ -45,6 +50,7 @@ def visits(*rows: tuple[int, float, float]) -> pa.Table:
     return pa.table({
         "cell": CELL + cell.astype(np.int64), "sector": np.zeros(len(rows), np.int8),
         "leave_time": pa.array(START + (seconds * 1e9).astype(np.int64), pa.timestamp("ns", "UTC")), "mu": mu,
+        "enter_time": pa.array(START + (seconds * 1e9).astype(np.int64) - NS, pa.timestamp("ns", "UTC")),
         "utilisation": np.where(mu > 0.5, 0.9, 0.1), "vehicle": [f"v{k % 2}" for k in range(len(rows))],
     })  # fmt: skip
 
@@ -57,6 +63,26 @@ def test_the_truth_of_a_cell_is_that_of_its_last_half_minute_and_of_all_visits_w
     )
     found = dict(zip(fusion.cell[slots].tolist(), mu.tolist(), strict=True))
     assert found == {CELL: pytest.approx(0.3), CELL + 1: pytest.approx(0.7)}
+
+
+def test_an_alert_is_false_where_nothing_near_was_slippery_before_it() -> None:
+    east, north = (int(value[0]) for value in grid.deinterleave(np.array([CELL])))
+
+    def alert(cells_east: int, seconds: float) -> Alert:
+        cell = int(grid.interleave(np.array([east + cells_east]), np.array([north]))[0])
+        return Alert(cell, 0, True, START + int(seconds * NS), 0.2, 0.1, 0.3, 0.95, 2, 57.7, 11.97, "test")
+
+    rows = visits((0, 10.0, 0.2), (0, 2.0, 0.9))
+    assert whole_way.false_ice([alert(0, 20.0)], rows) == (0, 0)
+    assert whole_way.false_ice([alert(0, 5.0)], rows) == (1, 0)  # the ice came later
+    assert whole_way.false_ice([alert(1, 20.0), alert(2, 20.0)], rows) == (1, 1)
+    assert whole_way.false_ice([], rows) == (0, 0)
+
+
+def test_alerts_are_those_of_a_service_that_hears_second_by_second() -> None:
+    fusion = Fusion(120.0)
+    raised = whole_way.told(fusion, observations(list(range(1, 9)), [1, 2] * 4, value([0.15] * 8)))
+    assert [alert.cell for alert in raised] == [CELL]
 
 
 def test_excited_vehicles_are_counted_once_per_cell() -> None:

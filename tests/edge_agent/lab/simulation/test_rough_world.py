@@ -23,6 +23,7 @@ from edge_agent.lab.simulation.misaligned import DEVICE_OF, DEVICES, WIDE, M, Mi
 from edge_agent.lab.simulation.plant import INPUTS, STATES, U, W, X, advance, command, held, start_at, wheel_forces
 from edge_agent.lab.simulation.relief import STEEPEST, gradient, tilt
 from edge_agent.lab.simulation.roads import L
+from edge_agent.lab.simulation.scenarios import scenario_named
 from edge_agent.lab.simulation.sensors import ROUGH_FLEET, Sensors
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
@@ -281,6 +282,17 @@ def test_a_rough_fleet_on_hills_is_the_same_whatever_its_blocks_and_its_number()
 def test_torque_is_missing_in_about_half_of_a_rough_fleet() -> None:
     missing = [misalignment_row(ROUGH_FLEET.mounted, 2, k)[M.TORQUELESS] for k in range(300)]
     assert 0.4 < np.mean(missing) < 0.6
+
+
+def test_a_town_by_number_is_the_drawn_one_and_another_number_another_town() -> None:
+    one, other = scenario_named("hills-20000"), scenario_named("hills-20001")
+    assert one == scenario_named("hills-20000")
+    assert one.background != other.background
+    assert one.relief != other.relief
+    ice = min(one.patches, key=lambda patch: patch.mu)
+    assert 0.1 <= ice.mu < 0.2 < 0.78 <= one.background
+    with pytest.raises(InputError, match="^scenario: .*hills-SEED"):
+        scenario_named("hills-x")
 
 
 def test_unknown_roads_and_slopes_no_road_has_are_refused() -> None:
