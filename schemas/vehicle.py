@@ -37,6 +37,10 @@ class Vehicle(BaseModel):
     drive_split_front: Annotated[
         float | None, Field(ge=0.0, le=1.0, description="share of the driving torque at the front axle, where known")
     ] = None
+    steering_ratio: Annotated[
+        float | None,
+        Field(gt=1.0, lt=60.0, description="angle of the steering wheel over the road wheels', where known"),
+    ] = None
 
 
 def load_vehicle(path: Path | str) -> Vehicle:

@@ -40,9 +40,14 @@ SIMULATE = {
 }  # fmt: skip
 LIVE, REPLAYED = "test_seed_rate_and_scenario_of_a_live_drive", "test_log_vehicle_estimator_and_configuration"
 # what the other options of the commands do is told by the tests named here
+REAL = "test_the_real_minute_becomes_a_log"
 ELSEWHERE = {
     "simulate": {"--list": "test_simulate_lists_the_manoeuvres", "--out": "test_simulate_writes",
                  "--vehicle-out": "test_simulate_writes"},
+    "import": {"source": REAL, "--profile": REAL, "--vehicle": REAL, "--out": REAL,
+               "--list": "test_the_shipped_profiles",
+               "--dbc": "test_another_database", "--draft": "test_another_database",
+               "--clock": "test_clocks_that_do_not_meet"},
     "replay": {"log": REPLAYED, "--vehicle": REPLAYED, "--estimator": REPLAYED, "--out": REPLAYED, "--config": REPLAYED,
                "--publish": "test_replay_publishes", "--name": "test_replay_publishes",
                "--start": "test_replay_publishes", "--jobs": "test_two_jobs_write"},
@@ -66,7 +71,8 @@ OBSERVED = {
 }  # fmt: skip
 NUMBERS = [
     (estimator, name) for name in Vehicle.model_fields for estimator in ("aco-fckf", "compensated-wckf")
-    if name != "name" and (estimator, name) != ("compensated-wckf", "drive_split_front")
+    if name not in ("name", "steering_ratio")  # which only `import` reads: test_a_measurement_file_and_a_bag
+    and (estimator, name) != ("compensated-wckf", "drive_split_front")
 ]  # fmt: skip
 SENT = {"zenoh", "spool", "spool_mb", "resend_s", "flush_s", "batch_rows", "estimator"}
 WATCHED = {"metrics_port", "metrics_host", "log"}  # shown by tests/schemas/test_monitor.py

@@ -1,0 +1,78 @@
+"""`edge-agent import`: any car's recording to a signal log, by a profile; a profile is drafted where none is named."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "source", type=Path, nargs="*", help="CSV, Parquet, BLF, ASC, candump, TRC, MF4, ROS bag, MCAP, NMEA, gpsd JSON"
+    )
+    parser.add_argument("--profile", help="which signal is which channel: a file, or a shipped one (--list)")
+    parser.add_argument("--list", action="store_true", help="list the shipped profiles and leave")
+    parser.add_argument("--dbc", type=Path, help="CAN database (default: the profile's)")
+    parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON): radius of the wheels, steering ratio")
+    parser.add_argument("--draft", type=Path, help="where to write a drafted profile (default: beside the log)")
+    parser.add_argument(
+        "--clock", action="append", default=[], metavar="FILE=SECONDS", help="add to the clock of a source"
+    )
+    parser.add_argument("--out", type=Path, help="signal log to write (Parquet)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Import; 0 when the log was written."""
+    from edge_agent.app.estimates_file import writable
+    from edge_agent.inputs.bring_in import database_of, read_source, write_log
+    from edge_agent.inputs.merge import merge
+    from edge_agent.inputs.names import draft
+    from edge_agent.inputs.profile import load_profile, shipped
+    from schemas.errors import InputError
+    from schemas.vehicle import load_vehicle
+
+    if args.list:
+        for name in shipped():
+            print(f"{name:<16} {load_profile(name)[0].about}")
+        return 0
+    if not args.source or args.out is None:
+        raise InputError("source", "sources and --out are needed", "name recordings, and the log to write")
+    if any(args.out.resolve() == source.resolve() for source in args.source):
+        raise InputError("out", f"would replace the recording {args.out}", "name another file")
+    out = writable("out", args.out)
+    profile, folder = load_profile(args.profile) if args.profile else (None, Path())
+    vehicle = load_vehicle(args.vehicle) if args.vehicle else None
+    database = database_of(profile, folder, args.dbc)
+    recordings = [read_source(path, profile, database) for path in args.source]
+    if profile is None:
+        units = {name: series.unit for one in reversed(recordings) for name, series in one.signals.items()}
+        profile = draft(units, args.out.stem)
+        target = writable("draft", args.draft or out.with_suffix(".profile.json"))
+        target.write_text(profile.text(), encoding="utf-8")
+        print(f"{target}: drafted from names, {len(profile.channels)} channels; look it over")
+    merged = merge(
+        recordings, profile, wheel_radius=vehicle.wheel_radius if vehicle else None,
+        steering_ratio=vehicle.steering_ratio if vehicle else None, shifts=_shifts(args.clock),
+    )  # fmt: skip
+    write_log(out, merged, profile, [source.name for source in args.source])
+    for note in merged.notes:
+        print(f"note: {note}")
+    lacking = [name for name in ("ax", "ay", "yaw_rate", "omega_fl", "delta_fl") if name not in merged.columns]
+    if lacking:
+        print(f"note: no {', '.join(lacking)}: replay needs them; add a source, or name them in the profile")
+    print(f"{out}: {len(merged.t)} rows, {merged.t[-1]:.1f} s, {', '.join(merged.columns)}")
+    return 0
+
+
+def _shifts(given: list[str]) -> dict[str, float]:
+    from schemas.errors import InputError
+
+    shifts = {}
+    for text in given:
+        name, _, seconds = text.rpartition("=")
+        try:
+            shifts[Path(name).name] = float(seconds)
+        except ValueError as error:
+            raise InputError("clock", f"{text!r} is no shift", "write it like drive.nmea=-0.4") from error
+    return shifts

@@ -1,0 +1,90 @@
+"""Sources to a signal log: which reader for which file, then the profile, then Parquet with its provenance."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from edge_agent.inputs.merge import Merged
+from edge_agent.inputs.profile import Profile
+from edge_agent.inputs.readers import can_log, gnss, mdf, rosbag, tabular
+from edge_agent.inputs.readers.dbc import Database, read_dbc
+from edge_agent.inputs.recording import Recording, foreign
+from schemas.errors import InputError
+from schemas.thresholds import NS
+
+PROVENANCE = b"gripmap.import"
+
+
+def read_source(path: Path, profile: Profile | None, database: Database | None) -> Recording:
+    """A recording of any kind: what the profile asks for, or everything where there is none yet.
+
+    Raises:
+        InputError: the file is unknown, broken, needs a database, or needs a library that is not installed.
+    """
+    wanted = None if profile is None else profile.needs()
+    suffix = path.suffix.lower()
+    if not path.exists():
+        raise InputError("source", f"{path} does not exist", "give the path of a recording")
+    if rosbag.is_bag(path):
+        with rosbag.open_bag(path) as reader:
+            if rosbag.has_frames(reader):
+                return _decoded(lambda ids: rosbag.bag_frames(reader, path, ids), path, profile, database)
+            return rosbag.read_bag(reader, path, wanted)
+    if suffix in mdf.SUFFIXES:
+        identifiers = None if database is None else {message.identifier for message in database.values()}
+        content = mdf.read_isolated(path, identifiers, wanted)
+        if content.recording is not None:
+            return content.recording
+        return _decoded(lambda _: content.frames or ({}, 0.0), path, profile, database)
+    if suffix in can_log.SUFFIXES:
+        return _decoded(lambda ids: can_log.log_frames(path, ids), path, profile, database)
+    if suffix in gnss.SUFFIXES:
+        return gnss.read_gnss(path)
+    if suffix in tabular.SUFFIXES:
+        time, unit = (profile.time, profile.time_unit) if profile else (None, None)
+        return tabular.read_table(path, time, unit)
+    known = sorted({*can_log.SUFFIXES, *gnss.SUFFIXES, *mdf.SUFFIXES, *rosbag.SUFFIXES, *tabular.SUFFIXES})
+    raise InputError("source", f"{path} is of no known kind", f"give one of {' '.join(known)}, or a bag's folder")
+
+
+def _decoded(frames: can_log.Taker, path: Path, profile: Profile | None, database: Database | None) -> Recording:
+    if database is None:
+        raise can_log.no_database(path)
+    every = {f"{message.name}.{signal}" for message in database.values() for signal in message.signals}
+    wanted = every if profile is None else profile.needs()
+    buses = {c.message: c.bus for c in profile.channels.values() if c.message and c.bus is not None} if profile else {}
+    with foreign(path, "CAN log"):
+        return can_log.decoded(frames, path.name, database, wanted, buses)
+
+
+def database_of(profile: Profile | None, folder: Path, given: Path | None) -> Database | None:
+    """The CAN database that is named on the command line, else the profile's."""
+    if given is not None:
+        return read_dbc(given)
+    return read_dbc(folder / profile.dbc) if profile is not None and profile.dbc is not None else None
+
+
+def write_log(path: Path, merged: Merged, profile: Profile, sources: Sequence[str]) -> None:
+    """The log as Parquet; where the date is known as `timestamp`, else as `t`; what was done stands in its metadata."""
+    columns: dict[str, Any] = {}
+    if merged.start_ns is not None:
+        whole = merged.start_ns + np.rint(merged.t * NS).astype(np.int64)
+        columns["timestamp"] = pa.array(whole, pa.int64()).cast(pa.timestamp("ns", tz="UTC"))
+    else:
+        columns["t"] = pa.array(merged.t)
+    columns |= {name: pa.array(values, from_pandas=True) for name, values in merged.columns.items()}
+    told: Mapping[str, object] = {
+        "profile": json.loads(profile.text()), "sources": list(sources), "channels": merged.told, "notes": merged.notes,
+    }  # fmt: skip
+    table = pa.table(columns).replace_schema_metadata({PROVENANCE: json.dumps(told).encode()})
+    try:
+        pq.write_table(table, path, compression="zstd")
+    except OSError as error:
+        raise InputError("out", f"cannot write {path} ({error})", "name a file in a writable folder") from error

@@ -1,0 +1,292 @@
+"""Recordings, each with its own clock, to one signal log by a profile.
+
+Clocks: the log's time is that of the source with the wheel speeds; a source with a date is put where its date says,
+and one without begins when the first does. Loggers write local time without saying so: dates that do not meet are
+tried in other time zones, in quarters of an hour.
+Rows: those of the table where all comes from one; else a fixed rate, linear between readings that are near enough, and
+positions only at the row next to their fix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from edge_agent.inputs.profile import Channel, Profile
+from edge_agent.inputs.recording import Recording, Series
+from edge_agent.inputs.units import QUANTITY, to_si, understood
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+from schemas.signals import CHANNELS
+from schemas.thresholds import NS
+
+GNSS: Final = {  # channels that a receiver's recording fills by itself
+    "latitude": Channel(signal="latitude"), "longitude": Channel(signal="longitude"),
+    "yaw": Channel(signal="course", unit="deg", course=True),
+}  # fmt: skip
+EXTRA_SPEED: Final = "gnss_speed"  # column [m/s] beside the channels: what the doctor holds against the wheels
+SPARSE: Final = ("latitude", "longitude", "yaw", EXTRA_SPEED)
+COURSE_SPEED: Final = 3.0  # [m/s] below it a receiver's course is noise
+RATES: Final = (10.0, 20.0, 25.0, 50.0, 100.0)
+FEWEST: Final = 20  # readings from which on a period means something
+GAP_PERIODS, GAP_S = 3.0, 0.1  # readings further apart than the larger of the two are not joined
+ZONE_S: Final = 900.0
+LARGEST_ZONE: Final = 56  # quarters of an hour
+SMOOTH: Final = 50  # readings to either side over which bursts of arrival are straightened
+
+
+@dataclass
+class Merged:
+    """A signal log: t (T,) [s] from 0, columns by name, ns UTC of t = 0 where a source knew it, and what was done."""
+
+    t: FloatArray
+    columns: dict[str, FloatArray]
+    start_ns: int | None
+    notes: list[str] = field(default_factory=list)
+    told: dict[str, dict[str, object]] = field(default_factory=dict)  # per channel: source, rate, missing, jitter
+
+
+def merge(
+    recordings: Sequence[Recording],
+    profile: Profile,
+    *,
+    wheel_radius: float | None = None,
+    steering_ratio: float | None = None,
+    shifts: Mapping[str, float] | None = None,
+) -> Merged:
+    """One log of all recordings.
+
+    Args:
+        recordings: what the sources gave.
+        profile: which signal is which channel.
+        wheel_radius: of the vehicle file [m]; goes before the profile's.
+        steering_ratio: of the vehicle file; likewise.
+        shifts: source name -> seconds to add to its clock.
+
+    Raises:
+        InputError: no signal of the profile is there, dates do not meet, or a radius or ratio is missing.
+    """
+    radius, ratio = wheel_radius or profile.wheel_radius, steering_ratio or profile.steering_ratio
+    notes = [note for recording in recordings for note in recording.notes]
+    found = _found(recordings, profile)
+    if not found:
+        names = ", ".join(sorted(profile.needs())[:6])
+        raise InputError("profile", f"no recording has any of its signals ({names}, …)", "choose another profile")
+    reference = next((place for name, place in found.items() if name.startswith("omega")), next(iter(found.values())))
+    offsets, start_ns = _clocks(recordings, reference, shifts or {}, notes)
+    series: dict[str, Series] = {}
+    told: dict[str, dict[str, object]] = {}
+    for name, place in found.items():
+        channel = profile.channels.get(name, GNSS.get(name, Channel(signal="speed", unit="m/s")))
+        recording = recordings[place]
+        try:
+            made, jitter = _made(name, channel, recording, radius, ratio)
+        except _MissingError as error:
+            raise InputError(f"{name} ({', '.join(channel.signals)})", str(error), error.fix) from None
+        series[name] = Series(made.t + offsets[place] - channel.delay_s, made.values)
+        told[name] = {"source": recording.name, "signals": channel.signals, **_rates(made), "jitter_s": jitter}
+    _still_courses(series)
+    merged = _rows(series, profile, recordings, found)
+    shift = merged.t[0]
+    merged.t = merged.t - shift
+    merged.start_ns = None if start_ns is None else start_ns + round(shift * NS)
+    merged.notes, merged.told = notes, told
+    return merged
+
+
+class _MissingError(Exception):
+    """A number of the car that a unit needs."""
+
+    def __init__(self, problem: str, fix: str) -> None:
+        super().__init__(problem)
+        self.fix = fix
+
+
+def _found(recordings: Sequence[Recording], profile: Profile) -> dict[str, int]:
+    """Channel -> the recording that has its signals."""
+    found: dict[str, int] = {}
+    wanted = {name: GNSS[name] for name in GNSS} | {EXTRA_SPEED: Channel(signal="speed")} | profile.channels
+    for name in (*CHANNELS, EXTRA_SPEED):
+        if name not in wanted:
+            continue
+        for place, recording in enumerate(recordings):
+            channel = wanted[name]
+            if name not in profile.channels and not {"latitude", "speed"} <= recording.signals.keys():
+                continue  # a receiver's recording fills what the profile leaves out
+            if channel.source in (None, recording.name) and set(channel.signals) <= recording.signals.keys():
+                found[name] = place
+                break
+    return found
+
+
+def _clocks(
+    recordings: Sequence[Recording], reference: int, shifts: Mapping[str, float], notes: list[str]
+) -> tuple[list[float], int | None]:
+    """Seconds to add to each recording's times, and the ns UTC of time 0."""
+    spans = [_span(recording) for recording in recordings]
+    base = recordings[reference].start_ns
+    dated = next((r.start_ns for r in recordings if {"latitude", "course"} <= r.signals.keys()), None)
+    offsets, start_ns = [], base
+    for place, recording in enumerate(recordings):
+        shift = shifts.get(recording.name, 0.0)
+        if place == reference or base is None or recording.start_ns is None:
+            if place != reference and base is None and recording.start_ns is not None:
+                start_ns = recording.start_ns
+            if place != reference:
+                shift += spans[reference][0] - spans[place][0]
+                notes.append(f"{recording.name}: no common date; taken to begin when {recordings[reference].name} does")
+            offsets.append(shift)
+            continue
+        lead = (recording.start_ns - base) / NS
+        zones = sorted(range(-LARGEST_ZONE, LARGEST_ZONE + 1), key=abs)
+        meets = [zone for zone in zones if _meet(spans[place], lead + shift + zone * ZONE_S, spans[reference])]
+        if not meets:
+            raise InputError(
+                recording.name, f"its clock is {lead:.0f} s from that of {recordings[reference].name}",
+                f"give --clock {recording.name}=SECONDS, what to add to it",
+            )  # fmt: skip
+        if meets[0]:
+            hours = meets[0] * ZONE_S / 3600.0
+            notes.append(f"{recording.name}: its date is {-hours:g} h from the others', as of another time zone")
+            if dated is not None and recording.start_ns == dated:
+                start_ns = base - round(meets[0] * ZONE_S * NS)  # the receiver is right
+        offsets.append(lead + shift + meets[0] * ZONE_S)
+    return offsets, start_ns
+
+
+def _span(recording: Recording) -> tuple[float, float]:
+    ends = [(series.t[0], series.t[-1]) for series in recording.signals.values() if len(series.t)]
+    return (min(first for first, _ in ends), max(last for _, last in ends)) if ends else (0.0, 0.0)
+
+
+def _meet(span: tuple[float, float], shift: float, other: tuple[float, float]) -> bool:
+    common = min(span[1] + shift, other[1]) - max(span[0] + shift, other[0])
+    return common > 0.5 * min(span[1] - span[0], other[1] - other[0])
+
+
+def _made(
+    name: str, channel: Channel, recording: Recording, radius: float | None, ratio: float | None
+) -> tuple[Series, float]:
+    """A channel in SI on its own times, and how unsteady its stamps were [s]."""
+    parts = [recording.signals[signal] for signal in channel.signals]
+    first = parts[0]
+    values = first.values.copy()
+    for part in parts[1:]:
+        values = values + np.interp(first.t, part.t, part.values)
+    if channel.wrap is not None:
+        values = np.mod(values, channel.wrap)
+    factor = 1.0
+    if name != EXTRA_SPEED:
+        unit = channel.unit or understood(name, first.unit) or next(iter(QUANTITY[name]))
+        made = to_si(name, unit, radius)
+        if made is None:
+            raise _MissingError(
+                f"is a speed in {unit}", "give the wheel's radius: --vehicle, or wheel_radius in the profile"
+            )
+        factor = made
+    if channel.at == "steering wheel":
+        if ratio is None:
+            raise _MissingError(
+                "is the steering wheel's angle", "give steering_ratio in the profile or the vehicle file"
+            )
+        factor /= ratio
+    values = values * (factor * channel.scale)
+    if channel.sign is not None:
+        flag = recording.signals.get(channel.whole(channel.sign.signal))
+        if flag is None:
+            raise _MissingError(f"its sign {channel.sign.signal} is not there", "name the signal of the sign")
+        values = np.where(_held(flag, first.t) == channel.sign.negative, -values, values)
+    values = values + channel.offset
+    for gate, good in channel.gates.items():
+        if gate in recording.signals:
+            values = np.where(np.isin(_held(recording.signals[gate], first.t), good), values, np.nan)
+    if channel.course:
+        values = np.mod(np.pi / 2.0 - values + np.pi, 2.0 * np.pi) - np.pi
+    t, jitter = (first.t, 0.0) if recording.rows else steady(first.t)
+    return Series(t, values), jitter
+
+
+def _held(series: Series, t: FloatArray) -> FloatArray:
+    """The last reading at or before each time."""
+    return series.values[np.clip(np.searchsorted(series.t, t, side="right") - 1, 0, len(series.t) - 1)]
+
+
+def _rates(series: Series) -> dict[str, object]:
+    steps = np.diff(series.t)
+    period = float(np.median(steps)) if len(steps) else 0.0
+    missing = float(np.mean(~np.isfinite(series.values)))
+    return {"readings": len(series.t), "period_s": round(period, 6), "missing": round(missing, 4)}
+
+
+def steady(t: FloatArray) -> tuple[FloatArray, float]:
+    """Times of a periodic signal whose stamps come in bursts, straightened; and how far they were off (std) [s].
+
+    Arrival wanders about a line through the count of readings, which a running mean over SMOOTH readings to either
+    side follows. Times that are not periodic (off by more than a period), or already even, come back as they are.
+    """
+    if len(t) < FEWEST:
+        return t, 0.0
+    count = np.arange(len(t))
+    period = (t[-1] - t[0]) / (len(t) - 1)
+    away = t - t[0] - period * count
+    total = np.concatenate([[0.0], np.cumsum(away)])
+    half = np.minimum(np.minimum(count, count[::-1]), SMOOTH)
+    smooth = (total[count + half + 1] - total[count - half]) / (2 * half + 1)
+    jitter = float(np.std(away - smooth))
+    uneven = 0.05 * period < jitter < period and float(np.max(np.diff(t))) < 10.0 * period
+    return (np.asarray(t[0] + period * count + smooth), jitter) if uneven else (t, jitter)
+
+
+def _still_courses(series: dict[str, Series]) -> None:
+    """A receiver's course at walking speed is none."""
+    if "yaw" in series and EXTRA_SPEED in series and len(series["yaw"].t) == len(series[EXTRA_SPEED].t):
+        yaw, speed = series["yaw"], series[EXTRA_SPEED].values
+        series["yaw"] = Series(yaw.t, np.where(speed > COURSE_SPEED, yaw.values, np.nan))
+
+
+def _rows(
+    series: dict[str, Series], profile: Profile, recordings: Sequence[Recording], found: Mapping[str, int]
+) -> Merged:
+    sources = set(found.values())
+    late = {profile.channels[name].delay_s for name in found if name in profile.channels}
+    if len(sources) == 1 and recordings[min(sources)].rows and len(late) == 1 and profile.rate_hz is None:
+        t = next(iter(series.values())).t
+        return Merged(t, {name: one.values for name, one in series.items()}, None)
+    dense = {name: one for name, one in series.items() if name not in SPARSE and len(one.t) > 1}
+    if not dense:
+        raise InputError("source", "no channel has two readings", "record longer, or choose another profile")
+    first, last = max(one.t[0] for one in dense.values()), min(one.t[-1] for one in dense.values())
+    rate = profile.rate_hz or _rate(dense)
+    if not last - first > 1.0 / rate:
+        raise InputError("source", "its channels have no common time", "record them together, or give --clock")
+    t = first + np.arange(int((last - first) * rate + 1e-6) + 1) / rate
+    return Merged(t, {name: _sampled(one, t, name in SPARSE) for name, one in series.items()}, None)
+
+
+def _rate(dense: Mapping[str, Series]) -> float:
+    """The rate of the fastest channel, rounded up to a usual one."""
+    fastest = max(1.0 / max(float(np.median(np.diff(one.t))), 1e-3) for one in dense.values())
+    return next((rate for rate in RATES if rate >= 0.95 * fastest), RATES[-1])
+
+
+def _sampled(series: Series, t: FloatArray, sparse: bool) -> FloatArray:
+    """The series at the rows' times; NaN where no reading is near enough."""
+    good = np.isfinite(series.values)
+    known, values = series.t[good], series.values[good]
+    out = np.full(len(t), np.nan)
+    if not len(known):
+        return out
+    if sparse:
+        row = np.searchsorted(t, known - 0.5 * (t[1] - t[0]))
+        inside = (row < len(t)) & (known >= t[0] - 0.5 * (t[1] - t[0]))
+        out[row[inside]] = values[inside]
+        return out
+    place = np.searchsorted(known, t)
+    before, after = known[np.clip(place - 1, 0, None)], known[np.clip(place, None, len(known) - 1)]
+    period = float(np.median(np.diff(series.t))) if len(series.t) > 1 else 0.0
+    near = (after - before <= max(GAP_PERIODS * period, GAP_S)) & (known[0] <= t) & (t <= known[-1])
+    out[near] = np.interp(t[near], known, values)
+    return out

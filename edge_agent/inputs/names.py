@@ -1,0 +1,115 @@
+"""A profile drafted from the names of signals: what is likely which channel, for a person to look over.
+
+Names are cut into words at case, digits and signs. A wheel is told by its two letters or words, in English or German
+(VL VR HL HR: vorn and hinten, links and rechts). Units come from the recording where it tells them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Final, TypeAlias
+
+from edge_agent.inputs.profile import Channel, Profile
+from edge_agent.inputs.units import QUANTITY, understood
+from schemas.signals import WHEELS
+
+_WORDS: Final = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+")
+PLACES: Final = {
+    "fl": ("fl", "lf", "vl", "frontleft", "leftfront", "front left"), "fr": ("fr", "rf", "vr", "front right"),
+    "rl": ("rl", "lr", "hl", "bl", "rear left"), "rr": ("rr", "hr", "br", "rear right"),
+}  # fmt: skip
+# channel -> what its name must contain (any of), and must not (any of); the first that fits is taken
+# a name fits when the first is found in it and the second is not; the first channel that fits is taken
+Rule: TypeAlias = tuple[str, str]
+STATES: Final = "stat|diag|valid|q bit|fault|counter|check|alive|cov|std|v z|sta$"
+ROLLS: Final = r"omega|wheel.*(speed|spd|vel|rot)|whl.*(spd|speed)|rad.*geschw|(speed|spd).*w(hee|h)l|velocity"
+SHORT: Final = r"wspd|w spd|^v .*w(hee|h)l|^(v|w(hee|h)l) (fl|fr|rl|rr)$"
+SPEED: Final[Rule] = (rf"{ROLLS}|{SHORT}", rf"{STATES}|dir|torque")
+RULES: Final[dict[str, Rule]] = {
+    "yaw_rate": (r"yaw.*(rate|vel|rt)|gierrate|gyro.*z|angular.*velocity.*z|omega.*z|yawrt", STATES),
+    "ax": (
+        r"^a x$|long.*acc|acc.*long|acc.*x$|laengsbeschl|linear.*acceleration.*x|^ax$",
+        rf"{STATES}|ang|jerk|target|desired",
+    ),
+    "ay": (
+        r"^a y$|lat.*acc|acc.*lat|acc.*y$|querbeschl|linear.*acceleration.*y|^ay$",
+        rf"{STATES}|ang|jerk|target|desired",
+    ),
+    "latitude": (r"^lat$|latitude|gps.*lat|breite", rf"{STATES}|acc|err|rate"),
+    "longitude": (r"^lon$|^lng$|^long$|longitude|gps.*(lon|lng)|laenge$", rf"{STATES}|acc|err"),
+    "yaw": (r"^yaw$|heading|course|track$", rf"{STATES}|rate|acc|err"),
+}
+STEERING: Final[Rule] = (
+    r"^delta|steer|lenk.*winkel|sas.*angle|lwi",
+    rf"{STATES}|rate|speed|geschw|torque|req|cmd|target|desired|init|fraction|crc|qual|override|driver|cal|^sensor",
+)
+COURSE: Final = re.compile(r"heading|course|track")
+
+
+def words(name: str) -> str:
+    """A name in lower-case words with a blank between."""
+    return " ".join(_WORDS.findall(name)).lower()
+
+
+def place_of(plain: str) -> str | None:
+    """The wheel that the words of a name tell, fl to rr."""
+    tokens = plain.split()
+    for wheel, spellings in PLACES.items():
+        for spelling in spellings:
+            if spelling in tokens or (" " in spelling and all(part in plain for part in spelling.split())):
+                return wheel
+    return None
+
+
+def draft(signals: Mapping[str, str], name: str) -> Profile:
+    """A profile of what the names say.
+
+    Args:
+        signals: name -> unit as recorded, "" where it is not told.
+        name: of the profile.
+    """
+    channels: dict[str, Channel] = {}
+    for signal, unit in signals.items():
+        field = signal.partition(".")[2]
+        plain = words(signal if field in ("", "data") else field)
+        if (channel := _channel(plain, signal)) and channel not in channels:
+            channels[channel] = _entry(channel, signal, unit, plain)
+    if "delta_fl" in channels and "delta_fr" not in channels and channels["delta_fl"].at == "steering wheel":
+        channels["delta_fr"] = channels["delta_fl"]
+    about = "Drafted from names: look at every signal, unit and sign, then let `edge-agent check` do it again."
+    order = {channel: channels[channel] for channel in QUANTITY if channel in channels}
+    return Profile(name=re.sub(r"\W+", "-", name)[:64] or "drafted", about=about, channels=order)
+
+
+def _channel(plain: str, signal: str) -> str | None:
+    if signal in QUANTITY:
+        return signal
+    place = place_of(plain)
+    if place is not None and _fits(plain, SPEED):
+        return f"omega_{place}"
+    if place is not None and "torque" in plain:
+        return f"torque_{place}"
+    for channel, rule in RULES.items():
+        if _fits(plain, rule):
+            return channel
+    if _fits(plain, STEERING):
+        return f"delta_{place}" if place in WHEELS else "delta_fl"
+    return None
+
+
+def _fits(plain: str, rule: Rule) -> bool:
+    return bool(re.search(rule[0], plain)) and not re.search(rule[1], plain)
+
+
+def _entry(channel: str, signal: str, unit: str, plain: str) -> Channel:
+    message, dot, short = signal.partition(".")
+    bus = bool(dot) and not signal.startswith("/")
+    wheel = channel.startswith("delta") and place_of(plain) is None and not re.search(r"^delta|road|front", plain)
+    return Channel(
+        signal=short if bus else signal,
+        message=message if bus else None,
+        unit=understood(channel, unit),
+        at="steering wheel" if wheel else "road wheel",
+        course=channel == "yaw" and bool(COURSE.search(plain)),
+    )

@@ -1,0 +1,128 @@
+"""A profile: which signal of a recording is which channel of the signal log, as checked JSON.
+
+    value of a channel = scale · (sum of its signals, in SI) · sign + offset,     at the time stamped − delay_s
+
+A speed at the rim becomes a wheel speed by `wheel_radius`, an angle of the steering wheel a road wheel's by
+`steering_ratio`; the vehicle file's radius and ratio go before those of the profile.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Final, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from edge_agent.inputs.units import QUANTITY
+from schemas.config import explain
+from schemas.errors import InputError
+
+FOLDER: Final = Path(__file__).parent / "profiles"
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Text = Annotated[str, Field(min_length=1, max_length=200)]
+
+
+class Part(BaseModel):
+    """Base of the parts of a profile: unknown names are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Sign(Part):
+    """A sign that has a signal of its own: the value is negative where `signal` equals `negative`."""
+
+    signal: Text
+    negative: Finite = 1.0
+
+
+class Channel(Part):
+    """Where a channel comes from, and what makes SI of it."""
+
+    signal: Annotated[list[Text] | Text, Field(description="name, or names that are added")]
+    message: Annotated[Text | None, Field(description="CAN message; else the signal's name is whole")] = None
+    source: Annotated[Text | None, Field(description="file name it must come from, where several have it")] = None
+    bus: Annotated[int | None, Field(ge=0, le=255, description="CAN bus; else the one that has the messages")] = None
+    unit: Annotated[str | None, Field(description="of the recorded value; SI if not given")] = None
+    at: Literal["road wheel", "steering wheel"] = "road wheel"
+    scale: Annotated[Finite, Field(description="beside the unit's; negative for a flipped sign")] = 1.0
+    offset: Annotated[Finite, Field(description="added at the end, SI")] = 0.0
+    delay_s: Annotated[Finite, Field(ge=-10.0, le=10.0, description="[s] that its time stamps are late")] = 0.0
+    sign: Sign | None = None
+    valid: Annotated[dict[Text, list[Finite]], Field(description="signal -> values at which to believe it")] = {}
+    wrap: Annotated[float | None, Field(gt=0.0, description="recorded values count modulo this (status bits)")] = None
+    course: Annotated[bool, Field(description="a heading, clockwise from north")] = False
+
+    @property
+    def signals(self) -> list[str]:
+        """Whole names of the signals that are added."""
+        names = [self.signal] if isinstance(self.signal, str) else self.signal
+        return [self.whole(name) for name in names]
+
+    @property
+    def gates(self) -> dict[str, list[float]]:
+        """Whole names of the signals that vouch for it."""
+        return {self.whole(name): values for name, values in self.valid.items()}
+
+    def whole(self, name: str) -> str:
+        """The name under which readers give a signal of this channel's message."""
+        return name if self.message is None else f"{self.message}.{name}"
+
+    def needs(self) -> list[str]:
+        """Every signal that it reads."""
+        return [*self.signals, *self.gates, *([self.whole(self.sign.signal)] if self.sign else [])]
+
+
+class Profile(Part):
+    """One car's or one recorder's signals."""
+
+    version: Literal[1] = 1
+    name: Annotated[str, Field(min_length=1, max_length=64)]
+    about: str = ""
+    dbc: Annotated[Text | None, Field(description="CAN database, beside the profile")] = None
+    time: Annotated[Text | None, Field(description="column that holds the time of a table")] = None
+    time_unit: Literal["s", "ms", "us", "ns"] | None = None
+    rate_hz: Annotated[float | None, Field(gt=0.0, le=1000.0, description="rows a second of the log")] = None
+    wheel_radius: Annotated[float | None, Field(gt=0.05, lt=2.0, description="[m]")] = None
+    steering_ratio: Annotated[float | None, Field(gt=1.0, lt=60.0, description="steering wheel over road wheel")] = None
+    channels: dict[str, Channel]
+
+    @model_validator(mode="after")
+    def _known(self) -> Self:
+        for name, channel in self.channels.items():
+            if name not in QUANTITY:
+                raise ValueError(f"there is no channel {name}; choose of {', '.join(QUANTITY)}")
+            if channel.unit is not None and channel.unit not in QUANTITY[name]:
+                raise ValueError(f"{name} in {channel.unit}; choose of {', '.join(QUANTITY[name])}")
+        return self
+
+    def needs(self) -> set[str]:
+        """Every signal that it reads."""
+        return {name for channel in self.channels.values() for name in channel.needs()}
+
+    def text(self) -> str:
+        """As JSON, without what is not said."""
+        return json.dumps(self.model_dump(exclude_defaults=True) | {"version": self.version}, indent=1) + "\n"
+
+
+def shipped() -> list[str]:
+    """Names of the profiles that come with the package."""
+    return sorted(path.stem for path in FOLDER.glob("*.json"))
+
+
+def load_profile(name: str) -> tuple[Profile, Path]:
+    """A profile by path or by the name of a shipped one, and the folder that its DBC is looked for in.
+
+    Raises:
+        InputError: it cannot be read, or a field is missing, unknown or out of range.
+    """
+    path = FOLDER / f"{name}.json" if name in shipped() else Path(name)
+    try:
+        return Profile.model_validate_json(path.read_bytes()), path.parent
+    except OSError as error:
+        known = ", ".join(shipped())
+        raise InputError(
+            "profile", f"cannot read {path} ({error.strerror})", f"name a file, or one of {known}"
+        ) from error
+    except ValidationError as error:
+        raise explain(error, f"profile {path}") from error

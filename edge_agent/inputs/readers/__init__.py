@@ -1,0 +1,1 @@
+"""Readers of foreign recordings: each gives a `Recording`; libraries are imported when they are used."""

@@ -1,0 +1,126 @@
+"""CAN logs (BLF, ASC, candump, TRC, bus-logging MF4) to series, by way of a CAN database.
+
+Times are those of arrival, counted from the log's first frame in whole microseconds, so that one drive is one drive
+in every format. Buses are numbered as python-can does; of a message that several buses carry, that bus is taken which
+has most of what is asked for, unless it is named.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+
+from edge_agent.inputs.readers.dbc import LONGEST, Bytes, Database, Message
+from edge_agent.inputs.recording import Recording, Series, library
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+from schemas.thresholds import NS
+
+SUFFIXES: Final = (".blf", ".asc", ".log", ".trc")
+MICRO: Final = 1_000_000
+DATED_S: Final = 946_684_800.0  # the year 2000; a smaller time is counted from the start of the log
+Key: TypeAlias = tuple[int, int, bool]  # bus, identifier, extended
+
+
+@dataclass
+class Frames:
+    """Frames of one identifier on one bus: time of arrival [s as logged], and their bytes, filled up to LONGEST."""
+
+    times: list[float] = field(default_factory=list)
+    data: bytearray = field(default_factory=bytearray)
+    shortest: int = LONGEST
+
+    def add(self, time: float, data: bytes | bytearray) -> None:
+        """One frame more."""
+        self.times.append(time)
+        self.shortest = min(self.shortest, len(data))
+        self.data += data[:LONGEST].ljust(LONGEST, b"\0")
+
+    def columns(self) -> tuple[FloatArray, Bytes]:
+        """Times (n,) and bytes (n, LONGEST)."""
+        return np.array(self.times), np.frombuffer(bytes(self.data), np.uint8).reshape(-1, LONGEST)
+
+
+Log: TypeAlias = dict[Key, Frames]
+
+
+Taker: TypeAlias = Callable[[set[int]], tuple[Log, float]]
+"""Frames of the wanted identifiers, and the time of the log's first frame [s since 1970 UTC, or since its start]."""
+
+
+def decoded(
+    take: Taker, name: str, database: Database, wanted: Iterable[str], buses: dict[str, int] | None = None
+) -> Recording:
+    """The signals `MESSAGE.SIGNAL` of a log.
+
+    Args:
+        take: gives the log's frames.
+        name: of the log.
+        database: how to decode it.
+        wanted: whole names; what the database or the log does not have is left out.
+        buses: the bus of a message, where it is told.
+    """
+    messages: dict[str, list[str]] = defaultdict(list)
+    for whole in wanted:
+        message, _, signal = whole.partition(".")
+        if message in database and signal in database[message].signals:
+            messages[message].append(signal)
+    log, first = take({database[message].identifier for message in messages})
+    recording = Recording(name, {}, round(first * NS) if first > DATED_S else None)
+    for message, key in _placed(log, [database[message] for message in messages], buses or {}).items():
+        times, data = log[key].columns()
+        how = database[message]
+        names = [s for s in messages[message] if how.signals[s].last_byte < max(log[key].shortest, 1)]
+        t = np.rint((times - first) * MICRO) / MICRO
+        order = np.argsort(t, kind="stable")
+        for signal, values in how.decode(data, names).items():
+            recording.signals[f"{message}.{signal}"] = Series(t[order], values[order], how.signals[signal].unit)
+    return recording
+
+
+def no_database(path: Path) -> InputError:
+    """The error of frames that nothing can decode."""
+    return InputError("dbc", f"{path} holds CAN frames", "name their database: --dbc, or dbc in the profile")
+
+
+def log_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
+    """Frames of the wanted identifiers by python-can, and the time of the log's first frame [s]."""
+    log: Log = defaultdict(Frames)
+    first = np.inf
+    with library("can").LogReader(path) as reader:
+        for message in reader:
+            time = message.timestamp
+            first = min(first, time)
+            if message.arbitration_id in wanted and not message.is_error_frame and not message.is_remote_frame:
+                log[bus_of(message.channel), message.arbitration_id, message.is_extended_id].add(time, message.data)
+    return log, float(first) if np.isfinite(first) else 0.0
+
+
+def bus_of(channel: Any) -> int:  # noqa: ANN401 python-can gives a number, a name or None
+    """Number of a bus: can1 and 1 are 1, what has no number is 0."""
+    if isinstance(channel, int):
+        return channel
+    digits = "".join(c for c in str(channel or "") if c.isdigit())
+    return int(digits[-3:]) if digits else 0
+
+
+def _placed(log: Log, messages: list[Message], buses: dict[str, int]) -> dict[str, Key]:
+    """Which frames are which message."""
+    counts: dict[int, int] = defaultdict(int)
+    for message in messages:
+        for (bus, identifier, extended), frames in log.items():
+            if (identifier, extended) == (message.identifier, message.extended):
+                counts[bus] += len(frames.times)
+    likely = sorted(counts, key=lambda bus: (-counts[bus], bus))
+    found: dict[str, Key] = {}
+    for message in messages:
+        for bus in [buses[message.name]] if message.name in buses else likely:
+            if (key := (bus, message.identifier, message.extended)) in log:
+                found[message.name] = key
+                break
+    return found

@@ -1,0 +1,159 @@
+"""CAN databases, read tolerantly, and frames decoded a column at a time.
+
+Only `BO_` and `SG_` lines are read: names with blanks, doubled messages and unknown attributes, over which strict
+parsers stumble, do no harm. Multiplexed signals are decoded where their switch says so.
+Bit numbers are those of a DBC: little endian counts up from the start bit; big endian starts at the most significant
+bit and counts down within a byte, then on to the next byte.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+
+EXTENDED: Final = 1 << 31  # flag of a 29-bit identifier in a DBC
+LONGEST: Final = 64  # bytes of a CAN FD frame
+MOST_BYTES: Final = 16_000_000  # of a database; the largest public one has 2 MB
+
+_MESSAGE: Final = re.compile(r"^\s*BO_\s+(\d+)\s+([^:\s]+)\s*:\s*(\d+)")
+_SIGNAL: Final = re.compile(
+    r"^\s*SG_\s+(?P<name>[^:]*?)(?:\s+(?P<mux>M|m\d+M?))?\s*:\s*(?P<start>\d+)\|(?P<size>\d+)@(?P<order>[01])(?P<sign>[+-])"
+    r"\s*\(\s*(?P<factor>[^,]+),(?P<offset>[^)]+)\)\s*(?:\[[^\]]*\])?\s*(?:\"(?P<unit>[^\"]*)\")?"
+)
+Bytes: TypeAlias = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Signal:
+    """Where a signal lies in a frame: start and size [bit], byte order, and what makes a physical value of it."""
+
+    name: str
+    start: int
+    size: int
+    little: bool
+    signed: bool
+    factor: float
+    offset: float
+    unit: str
+    switch: int | None = None  # value of the multiplexer at which it is present
+
+    def decode(self, data: Bytes) -> FloatArray:
+        """Physical values (n,) of the frames (n, LONGEST)."""
+        raw = self._raw(data)
+        number: NDArray[np.int64] | NDArray[np.uint64] = raw.view(np.int64) if self.size < 64 or self.signed else raw
+        if self.signed and self.size < 64:
+            top = np.int64(1) << np.int64(self.size - 1)
+            number = (number ^ top) - top
+        return np.asarray(number * self.factor + self.offset, dtype=np.float64)
+
+    def _raw(self, data: Bytes) -> NDArray[np.uint64]:
+        raw = np.zeros(len(data), np.uint64)
+        if self.little:
+            first, last = self.start // 8, (self.start + self.size - 1) // 8
+            for place, byte in enumerate(range(first, last + 1)):
+                shift = 8 * place - self.start % 8
+                part = data[:, byte].astype(np.uint64)
+                raw |= part << np.uint64(shift) if shift >= 0 else part >> np.uint64(-shift)
+        else:
+            left, byte, top = self.size, self.start // 8, self.start % 8
+            while left > 0:
+                taken = min(left, top + 1)
+                part = (data[:, byte] >> np.uint8(top + 1 - taken)) & np.uint8((1 << taken) - 1)
+                raw = (raw << np.uint64(taken)) | part.astype(np.uint64)
+                left, byte, top = left - taken, byte + 1, 7
+        return raw if self.size == 64 else raw & np.uint64((1 << self.size) - 1)
+
+    @property
+    def last_byte(self) -> int:
+        """The last byte that it touches."""
+        if self.little:
+            return (self.start + self.size - 1) // 8
+        return self.start // 8 + max(0, -(-(self.size - self.start % 8 - 1) // 8))
+
+
+@dataclass(frozen=True)
+class Message:
+    """A message of a database: identifier with its extended flag taken off, length [byte] and signals by name."""
+
+    name: str
+    identifier: int
+    extended: bool
+    length: int
+    signals: dict[str, Signal]
+    multiplexer: str | None = None
+
+    def decode(self, data: Bytes, names: list[str]) -> dict[str, FloatArray]:
+        """Physical values by signal; NaN where a multiplexed signal is not in the frame."""
+        found = {name: self.signals[name].decode(data) for name in names}
+        switched = [name for name in names if self.signals[name].switch is not None]
+        if switched and self.multiplexer is not None:
+            now = self.signals[self.multiplexer].decode(data)
+            for name in switched:
+                found[name][now != self.signals[name].switch] = np.nan
+        return found
+
+
+Database: TypeAlias = dict[str, Message]
+
+
+def read_dbc(path: Path) -> Database:
+    """The messages of a database by name.
+
+    Raises:
+        InputError: the file cannot be read, is too large, or holds no message with a signal.
+    """
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError("dbc", f"{path} has more than {MOST_BYTES} bytes", "name a CAN database")
+        text = path.read_bytes().decode("utf-8", errors="replace")
+    except OSError as error:
+        raise InputError("dbc", f"cannot read {path} ({error.strerror})", "name a CAN database") from error
+    database = parse_dbc(text)
+    if not any(message.signals for message in database.values()):
+        raise InputError("dbc", f"{path} holds no message with signals", "name a CAN database (DBC)")
+    return database
+
+
+def parse_dbc(text: str) -> Database:
+    """The messages of a database's text; lines that make no sense are left out, and of two alike the last holds."""
+    database: Database = {}
+    message: Message | None = None
+    for line in text.splitlines():
+        if found := _MESSAGE.match(line):
+            number, length = int(found[1]), int(found[3])
+            message = Message(found[2], number & (EXTENDED - 1), bool(number & EXTENDED), length, {})
+            database[message.name] = message
+        elif message is not None and (found := _SIGNAL.match(line)):
+            signal = _signal(found)
+            if signal is None or signal.last_byte >= min(max(message.length, 1), LONGEST):
+                continue
+            message.signals[signal.name] = signal
+            if found["mux"] == "M":
+                message = Message(**{**vars(message), "multiplexer": signal.name})
+                database[message.name] = message
+        elif line.strip() and not line.lstrip().startswith("SG_"):
+            message = None
+    return database
+
+
+def _signal(found: re.Match[str]) -> Signal | None:
+    mux = found["mux"] or ""
+    try:
+        signal = Signal(
+            name=re.sub(r"\W", "_", found["name"]), start=int(found["start"]), size=int(found["size"]),
+            little=found["order"] == "1", signed=found["sign"] == "-", factor=float(found["factor"]),
+            offset=float(found["offset"]), unit=found["unit"] or "",
+            switch=int(mux[1:].rstrip("M")) if mux.startswith("m") else None,
+        )  # fmt: skip
+    except ValueError:
+        return None
+    sound = signal.name and 0 < signal.size <= 64 and signal.start < 8 * LONGEST
+    return signal if sound and np.isfinite([signal.factor, signal.offset]).all() else None

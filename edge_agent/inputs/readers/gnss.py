@@ -1,0 +1,120 @@
+"""Positions as NMEA 0183 sentences or gpsd's JSON, one a line; lines that are broken are left out and counted.
+
+Of NMEA, RMC is read: time with date, place, speed, course. A sentence whose checksum is wrong counts as broken.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from edge_agent.inputs.recording import Recording, Series, foreign
+from schemas.errors import InputError
+from schemas.thresholds import NS
+
+SUFFIXES: Final = (".nmea", ".gpsd", ".jsonl", ".json")
+LONGEST_LINE: Final = 100_000
+KNOT: Final = 1852.0 / 3600.0  # [m/s]
+UNITS: Final = {"latitude": "deg", "longitude": "deg", "speed": "m/s", "course": "deg"}
+
+
+class Fix(NamedTuple):
+    """A position: ns UTC, degrees, speed [m/s], and course [deg clockwise from north]; NaN where not told."""
+
+    time: int
+    latitude: float
+    longitude: float
+    speed: float
+    course: float
+
+
+def parse_nmea(line: str) -> Fix | None:
+    """The fix of an RMC sentence; None for every other line and for a receiver without position.
+
+    Raises:
+        ValueError: the sentence is broken.
+    """
+    line = line.strip()
+    if not line.startswith("$") or line[3:6] != "RMC":
+        return None
+    body, star, checksum = line[1:].partition("*")
+    total = 0
+    for byte in body.encode("ascii", "replace"):
+        total ^= byte
+    if not star or int(checksum[:2], 16) != total:
+        raise ValueError("wrong checksum")
+    parts = body.split(",")
+    if len(parts) < 10:
+        raise ValueError("too short")
+    if parts[2] != "A":
+        return None
+    clock, day = parts[1], parts[9]
+    whole = datetime.strptime(day + clock[:6], "%d%m%y%H%M%S").replace(tzinfo=UTC)
+    time = int(whole.timestamp()) * NS + round(float(f"0{clock[6:]}") * NS)
+    latitude = _degrees(parts[3], 2) * (-1.0 if parts[4] == "S" else 1.0)
+    longitude = _degrees(parts[5], 3) * (-1.0 if parts[6] == "W" else 1.0)
+    return _sound(Fix(time, latitude, longitude, _number(parts[7]) * KNOT, _number(parts[8])))
+
+
+def parse_gpsd(line: str) -> Fix | None:
+    """The fix of a TPV report; None for every other object and for one without position.
+
+    Raises:
+        ValueError: the line is no JSON object, or a field is no number.
+    """
+    report = json.loads(line)
+    if not isinstance(report, dict):
+        raise ValueError("no object")
+    if report.get("class") != "TPV" or report.get("mode", 0) < 2 or "time" not in report:
+        return None
+    moment = datetime.fromisoformat(str(report["time"])).astimezone(UTC)
+    since = moment - datetime(1970, 1, 1, tzinfo=UTC)
+    time = (since.days * 86_400 + since.seconds) * NS + since.microseconds * 1_000
+    place = (float(report.get(key, math.nan)) for key in ("lat", "lon", "speed", "track"))
+    return _sound(Fix(time, *place))
+
+
+def _degrees(text: str, whole: int) -> float:
+    return float(text[:whole]) + float(text[whole:]) / 60.0
+
+
+def _number(text: str) -> float:
+    return float(text) if text else math.nan
+
+
+def _sound(fix: Fix) -> Fix:
+    if not (abs(fix.latitude) <= 90.0 and abs(fix.longitude) <= 180.0):
+        raise ValueError("no place on earth")
+    return fix
+
+
+def read_gnss(path: Path) -> Recording:
+    """Signals latitude, longitude, speed and course of a file of sentences or reports.
+
+    Raises:
+        InputError: the file cannot be read, or holds no position with a time.
+    """
+    fixes: list[Fix] = []
+    broken = 0
+    with foreign(path, "GNSS"), path.open("rb") as file:
+        while line := file.readline(LONGEST_LINE):
+            text = line.decode("ascii", errors="replace").strip()
+            try:
+                fix = parse_gpsd(text) if text.startswith("{") else parse_nmea(text)
+            except (ValueError, RecursionError, OverflowError, TypeError):
+                broken += 1
+                continue
+            if fix is not None and (not fixes or fix.time > fixes[-1].time):
+                fixes.append(fix)
+    if not fixes:
+        raise InputError("source", f"{path} holds no position with a time", "record RMC sentences, or gpsd's TPV")
+    start = fixes[0].time
+    t = np.array([(fix.time - start) / NS for fix in fixes])
+    signals = {name: Series(t, np.array([getattr(fix, name) for fix in fixes]), unit) for name, unit in UNITS.items()}
+    notes = [f"{path.name}: {broken} broken lines left out"] if broken else []
+    return Recording(path.name, signals, start, notes=notes)

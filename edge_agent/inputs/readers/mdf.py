@@ -1,0 +1,164 @@
+"""ASAM MDF 4: measured channels, or a logged bus, by asammdf; its blocks are walked first.
+
+A block that points to itself or out of the file would keep a reader busy for ever: the chains of data groups, channel
+groups and channels, and the data lists, are followed once here, each address at most once.
+"""
+
+from __future__ import annotations
+
+import resource
+import struct
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, BinaryIO, Final, NamedTuple
+
+import numpy as np
+
+from edge_agent.inputs.readers.can_log import Frames, Log, no_database
+from edge_agent.inputs.recording import Recording, Series, foreign, library
+from schemas.errors import InputError
+from schemas.thresholds import NS
+
+SUFFIXES: Final = (".mf4", ".mdf")
+MOST_BLOCKS: Final = 1_000_000
+MOST_MEMORY: Final = 16 << 30  # bytes of the process that reads
+MOST_CPU_S: Final = 600  # a file of 10 GB takes less
+HEADER: Final = 64  # bytes of the identification block
+# block -> places of its links that lead on (next first, then what hangs on it)
+LINKS: Final = {
+    b"##HD": (0,), b"##DG": (0, 1, 2), b"##CG": (0, 1), b"##CN": (0, 1), b"##DL": (0,), b"##HL": (0,), b"##CA": (0,),
+}  # fmt: skip
+
+
+def check_blocks(path: Path) -> None:
+    """Follow the chains of blocks.
+
+    Raises:
+        InputError: a link leads out of the file or into a circle, or a group counts more records than the file holds.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        if file.read(3) != b"MDF":
+            raise InputError("source", f"{path} is not an MDF file", "give a measurement of version 4")
+        file.seek(28)
+        version = struct.unpack("<H", file.read(2).ljust(2, b"\0"))[0]
+        if version < 400:
+            raise InputError("source", f"{path} is MDF {version / 100:.2f}", "convert it to version 4")
+        seen: set[int] = set()
+        waiting = [HEADER]
+        while waiting:
+            address = waiting.pop()
+            if address in seen:
+                raise InputError("source", f"{path} has blocks in a circle at byte {address}", "record it anew")
+            if address + 24 > size or len(seen) > MOST_BLOCKS:
+                raise InputError("source", f"{path} points beyond its end, to byte {address}", "record it anew")
+            seen.add(address)
+            waiting += _onward(file, address, size, path)
+
+
+def _onward(file: BinaryIO, address: int, size: int, path: Path) -> list[int]:
+    file.seek(address)
+    kind, _, length, count = struct.unpack("<4sIQQ", file.read(24))
+    if not kind.startswith(b"##") or length > size or count > (length - 24) // 8:
+        raise InputError("source", f"{path} has no sound block at byte {address}", "record it anew")
+    links = struct.unpack(f"<{count}Q", file.read(8 * count).ljust(8 * count, b"\0"))
+    if kind == b"##CG":
+        _, cycles = struct.unpack("<QQ", file.read(16).ljust(16, b"\0"))
+        if cycles > 1000 * size:  # deflate makes at most a thousand bytes of one
+            raise InputError("source", f"{path} counts {cycles} records in {size} bytes", "record it anew")
+    return [links[place] for place in LINKS.get(kind, ()) if place < count and links[place]]
+
+
+class Content(NamedTuple):
+    """What a file holds: frames and the time of the first [s since 1970 UTC], or the channels of a measurement."""
+
+    frames: tuple[Log, float] | None
+    recording: Recording | None
+
+
+def read_isolated(path: Path, identifiers: set[int] | None, names: set[str] | None) -> Content:
+    """Read a file in a process of its own: asammdf's compiled parts crash on some broken files.
+
+    Args:
+        path: the file.
+        identifiers: of the frames that are wanted, if it holds frames; None where nothing can decode them.
+        names: of the channels that are wanted, if it is a measurement; None for all.
+
+    Raises:
+        InputError: the file is broken, or asammdf is missing.
+    """
+    with foreign(path, "MDF 4"):
+        check_blocks(path)
+    library("asammdf")
+    with foreign(path, "MDF 4"), ProcessPoolExecutor(1, get_context("spawn"), _limited) as pool:
+        return pool.submit(_content, path, identifiers, names).result()
+
+
+def _limited() -> None:
+    resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY, MOST_MEMORY))
+    resource.setrlimit(resource.RLIMIT_CPU, (MOST_CPU_S, MOST_CPU_S))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def _content(path: Path, identifiers: set[int] | None, names: set[str] | None) -> Content:
+    with library("asammdf").MDF(path) as file:
+        if not has_frames(file):
+            return Content(None, read_mdf(file, path, names))
+        if identifiers is None:
+            raise no_database(path)
+        return Content(mdf_frames(file, identifiers), None)
+
+
+def has_frames(mdf: Any) -> bool:  # noqa: ANN401
+    """Whether a bus was logged in it."""
+    return any("CAN_DataFrame" in name for name in mdf.channels_db)
+
+
+def mdf_frames(mdf: Any, wanted: set[int]) -> tuple[Log, float]:  # noqa: ANN401
+    """Frames of the wanted identifiers, and the time of the first one [s since 1970 UTC]."""
+    log: Log = {}
+    first = np.inf
+    start = float(mdf.header.start_time.timestamp())
+    for group, index in mdf.channels_db["CAN_DataFrame"]:
+        channel = mdf.get("CAN_DataFrame", group=group, index=index, raw=True)
+        if not len(channel.timestamps):
+            continue
+        first = min(first, float(channel.timestamps.min()))
+        rows = channel.samples
+        identifiers = rows["CAN_DataFrame.ID"].astype(np.int64)
+        extended = identifiers & (1 << 31) != 0
+        if "CAN_DataFrame.IDE" in rows.dtype.names:
+            extended |= rows["CAN_DataFrame.IDE"].astype(bool)
+        identifiers &= (1 << 29) - 1
+        buses = rows["CAN_DataFrame.BusChannel"].astype(np.int64)
+        lengths = rows["CAN_DataFrame.DataLength"].astype(np.int64)
+        data = rows["CAN_DataFrame.DataBytes"]
+        for row in np.flatnonzero(np.isin(identifiers, list(wanted))):
+            key = int(buses[row]), int(identifiers[row]), bool(extended[row])
+            frame = bytes(data[row][: lengths[row]])
+            log.setdefault(key, Frames()).add(float(channel.timestamps[row]), frame)
+    first = first if np.isfinite(first) else 0.0
+    for frames in log.values():
+        frames.times = [start + (time - first) for time in frames.times]
+    return log, start
+
+
+def read_mdf(mdf: Any, path: Path, wanted: set[str] | None) -> Recording:  # noqa: ANN401
+    """Channels of a measurement by name, all where none is asked for; of one name the first with samples."""
+    start = mdf.header.start_time.timestamp()
+    recording = Recording(path.name, {}, round(start * NS) if start > 0 else None)
+    with foreign(path, "MDF 4"):
+        for name, places in mdf.channels_db.items():
+            if wanted is not None and name not in wanted:
+                continue
+            for group, index in places:
+                if index == mdf.masters_db.get(group):
+                    continue
+                channel = mdf.get(name, group=group, index=index)
+                values = np.asarray(channel.samples)
+                if values.ndim == 1 and values.dtype.kind in "fiub" and len(values):
+                    t = np.asarray(channel.timestamps, dtype=np.float64)
+                    recording.signals[name] = Series(t, values.astype(np.float64), str(channel.unit or ""))
+                    break
+    return recording

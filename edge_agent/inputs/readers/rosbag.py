@@ -1,0 +1,141 @@
+"""ROS bags (version 2 folders and MCAP files, and version 1) by rosbags, no ROS installed.
+
+A signal is called `/topic.field.field`; elements of short arrays `/topic.field[0]`, joints `/topic.velocity[NAME]`.
+Its time is the message's own stamp where it has one, else that of the recorder. Topics of can_msgs/Frame are a CAN log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from edge_agent.inputs.readers.can_log import Frames, Log
+from edge_agent.inputs.recording import Recording, Series, foreign, library
+from schemas.thresholds import NS
+
+SUFFIXES: Final = (".mcap", ".db3", ".bag")
+FRAME: Final = "can_msgs/msg/Frame"
+LONGEST_ARRAY: Final = 36  # elements that are taken apart; longer ones are images and scans
+DEEPEST: Final = 5
+SKIPPED: Final = ("header", "covariance")
+Leaf = tuple[str, Callable[[Any], Any]]
+
+
+def is_bag(path: Path) -> bool:
+    """Whether it is a bag: by its ending, or a folder with a bag's metadata."""
+    return path.suffix in SUFFIXES or (path / "metadata.yaml").is_file()
+
+
+@contextmanager
+def open_bag(path: Path) -> Iterator[Any]:
+    """A reader, opened and in the end closed; the folder is taken for a database file that lies in it."""
+    highlevel, typesys = library("rosbags.highlevel"), library("rosbags.typesys")
+    inside = path.parent if path.suffix == ".db3" or (path.parent / "metadata.yaml").is_file() else path
+    with foreign(path, "ROS bag"):
+        types = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+        reader = highlevel.AnyReader([inside], default_typestore=types)
+        try:
+            with reader:
+                yield reader
+        finally:
+            for part in reader.readers:  # a bag that could not be opened leaves its file open
+                for held in (part, *getattr(part, "storages", ()), getattr(part, "storage", None)):
+                    if (file := getattr(held, "bio", None)) is not None:
+                        file.close()
+
+
+def has_frames(reader: Any) -> bool:  # noqa: ANN401
+    """Whether a topic of it is a CAN log."""
+    return any(connection.msgtype == FRAME for connection in reader.connections)
+
+
+def bag_frames(reader: Any, path: Path, wanted: set[int]) -> tuple[Log, float]:  # noqa: ANN401
+    """Frames of the wanted identifiers, and the time of the first one [s since 1970 UTC]; a topic is a bus."""
+    log: Log = {}
+    first = np.inf
+    topics = [connection for connection in reader.connections if connection.msgtype == FRAME]
+    with foreign(path, "ROS bag"):
+        for connection, _, time, message in _messages(reader, topics):
+            first = min(first, time)
+            if message.id in wanted and not message.is_error and not message.is_rtr:
+                key = topics.index(connection), int(message.id), bool(message.is_extended)
+                log.setdefault(key, Frames()).add(time / NS, bytes(message.data)[: message.dlc])
+    return log, first / NS if np.isfinite(first) else 0.0
+
+
+def read_bag(reader: Any, path: Path, wanted: set[str] | None) -> Recording:  # noqa: ANN401
+    """Signals of a bag by name, all of them where none is asked for."""
+    topics = [c for c in reader.connections if wanted is None or any(name.startswith(f"{c.topic}.") for name in wanted)]
+    times: dict[str, list[int]] = {}
+    values: dict[str, list[float]] = {}
+    first: int | None = None
+    with foreign(path, "ROS bag"):
+        leaves: dict[str, list[Leaf]] = {}
+        for connection, stored, time, message in _messages(reader, topics):
+            first = stored if first is None else min(first, stored)
+            topic = connection.topic
+            if topic not in leaves:
+                found = [(f"{topic}{name}", take) for name, take in leaves_of(message)]
+                leaves[topic] = [leaf for leaf in found if wanted is None or leaf[0] in wanted]
+            for name, take in leaves[topic]:
+                times.setdefault(name, []).append(time)
+                values.setdefault(name, []).append(float(take(message)))
+    recording = Recording(path.name, {}, first)
+    for name, stamps in times.items():
+        t = (np.array(stamps, dtype=np.int64) - (first or 0)) / NS
+        order = np.argsort(t, kind="stable")
+        recording.signals[name] = Series(t[order], np.array(values[name])[order])
+    return recording
+
+
+def _messages(reader: Any, connections: list[Any]) -> Iterator[tuple[Any, int, int, Any]]:  # noqa: ANN401
+    """Connection, time of the recorder, time of the message [ns], message."""
+    if not connections:
+        return
+    for connection, stored, raw in reader.messages(connections=connections):
+        message = reader.deserialize(raw, connection.msgtype)
+        yield connection, stored, stamp_of(message) or stored, message
+
+
+def stamp_of(message: Any) -> int:  # noqa: ANN401
+    """The message's own time [ns], 0 where it has none."""
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    return 0 if stamp is None else int(stamp.sec) * NS + int(stamp.nanosec)
+
+
+def leaves_of(message: Any, prefix: str = "", depth: int = 0) -> Iterator[Leaf]:  # noqa: ANN401
+    """The numbers in a message: their names behind the topic's, and how to take them out of one of its kind."""
+    for name in getattr(message, "__dataclass_fields__", {}):
+        if name.startswith("__") or any(name.endswith(word) for word in SKIPPED):
+            continue
+        path, value = f"{prefix}.{name}", getattr(message, name)
+        take = attrgetter(path[1:])
+        if isinstance(value, bool | int | float | np.number):
+            yield path, take
+        elif isinstance(value, np.ndarray | list | tuple):
+            yield from _elements(message, path, value, prefix)
+        elif depth < DEEPEST:
+            yield from leaves_of(value, path, depth + 1)
+
+
+def _elements(message: Any, path: str, value: Any, prefix: str) -> Iterator[Leaf]:  # noqa: ANN401
+    if not 0 < len(value) <= LONGEST_ARRAY or not all(isinstance(v, int | float | np.number) for v in value):
+        return
+    labels = getattr(message, "name", None) if not prefix else None
+    named = isinstance(labels, list) and len(labels) == len(value)
+    take = attrgetter(path[1:])
+    for index in range(len(value)):
+        yield f"{path}[{labels[index] if named else index}]", _at(take, index)  # type: ignore[index]
+
+
+def _at(take: Callable[[Any], Any], index: int) -> Callable[[Any], Any]:
+    def element(message: Any) -> Any:  # noqa: ANN401
+        values = take(message)
+        return values[index] if index < len(values) else float("nan")
+
+    return element

@@ -1,0 +1,120 @@
+"""Tables, CSV and Parquet, one row per sample: every column that is a number becomes a series.
+
+The time is the column `t` [s], `timestamp`, or one whose name says time; a unit may stand in the name, `speed [km/h]`.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv as pc_csv
+import pyarrow.parquet as pq
+
+from edge_agent.inputs.recording import Recording, Series, foreign
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+from schemas.thresholds import NS
+
+SUFFIXES: Final = (".csv", ".tsv", ".txt", ".parquet")
+TIMES: Final = ("t", "timestamp", "time", "time_s", "time_ms", "t_ms", "timestamp_ns", "zeit", "sec", "seconds")
+TIME_UNITS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_UNIT: Final = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
+
+
+def read_table(path: Path, time: str | None = None, time_unit: str | None = None) -> Recording:
+    """The columns of a table.
+
+    Args:
+        path: a CSV or Parquet file.
+        time: name of the column that holds the time; else it is looked for.
+        time_unit: of numbers in it: s, ms, us, ns; else the name or their size tells.
+
+    Raises:
+        InputError: the file is broken or empty, has no time, or its time goes back.
+    """
+    kind = "Parquet" if path.suffix == ".parquet" else "CSV"
+    with foreign(path, kind):
+        return _recording(path, kind, time, time_unit)
+
+
+def _recording(path: Path, kind: str, time: str | None, time_unit: str | None) -> Recording:
+    table = pq.ParquetFile(path).read() if kind == "Parquet" else _csv(path)
+    if not table.num_rows:
+        raise InputError("source", f"{path} has no rows", "give a recording with at least one sample")
+    named = {_UNIT.sub(r"\g<name>", name).strip() or name: name for name in table.column_names}
+    column = _time_column(path, named, time)
+    told = _UNIT.match(named[column])
+    t, start_ns = _seconds(table[named[column]], column, time_unit or (told["unit"] if told else None))
+    back = np.flatnonzero(~(np.diff(t) >= 0.0))
+    if len(back) or not np.isfinite(t[:1]).all():
+        row = int(back[0]) + 1 if len(back) else 0
+        raise InputError(column, f"is missing or goes back at row {row}", "sort the recording by time")
+    recording = Recording(path.name, {}, start_ns, rows=True)
+    for name, whole in named.items():
+        if name != column and (values := _numbers(table[whole])) is not None:
+            unit = _UNIT.match(whole)
+            recording.signals[name] = Series(t, values, unit["unit"] if unit else "")
+    return recording
+
+
+def _csv(path: Path) -> pa.Table:
+    with path.open("rb") as file:
+        head = file.readline(65_536).decode("utf-8", errors="replace")
+    mark = max(",;\t", key=head.count)
+    table = pc_csv.read_csv(path, parse_options=pc_csv.ParseOptions(delimiter=mark))
+    if mark == ";":  # decimal commas go with semicolons
+        for index, name in enumerate(table.column_names):
+            if pa.types.is_string(table[name].type):
+                text = pc.replace_substring(table[name], ",", ".")
+                try:
+                    table = table.set_column(index, name, pc.cast(text, pa.float64()))
+                except pa.ArrowInvalid:
+                    continue
+    return table
+
+
+def _time_column(path: Path, named: dict[str, str], given: str | None) -> str:
+    if given is not None:
+        if given not in named:
+            raise InputError("time", f"{path} has no column {given}", f"choose of {', '.join(list(named)[:20])}")
+        return given
+    lower = {name.lower(): name for name in reversed(named)}
+    for name in TIMES:
+        if name in lower:
+            return lower[name]
+    raise InputError("time", f"{path} has no column that is called t or time", 'name it in the profile as "time"')
+
+
+def _seconds(column: Any, name: str, unit: str | None) -> tuple[FloatArray, int | None]:  # noqa: ANN401 Arrow columns are not generic
+    """Seconds since the first row, and its ns UTC where the time is a date."""
+    if pa.types.is_timestamp(column.type):
+        ns = pc.cast(pc.cast(column, pa.timestamp("ns", tz=column.type.tz)), pa.int64())
+        values = np.asarray(ns.to_numpy(zero_copy_only=False))
+        if ns.null_count:
+            raise InputError(name, "is missing in a row", "give every sample its time")
+        return (values - values[0]) / NS, int(values[0])
+    if not (pa.types.is_integer(column.type) or pa.types.is_floating(column.type)):
+        raise InputError(name, f"is {column.type}, not a time", "write seconds, or a time stamp")
+    if unit not in TIME_UNITS:
+        unit = next((u for u in ("ms", "us", "ns") if name.lower().endswith(f"_{u}")), None)
+    raw = np.asarray(column.to_numpy(zero_copy_only=False))
+    if unit is None and name == "timestamp":
+        unit = "ns" if pa.types.is_integer(column.type) else "s"
+    factor = TIME_UNITS[unit or "s"]
+    first = float(raw[0]) * factor
+    exact = (raw - raw[0]) * factor if factor != 1.0 or abs(first) > NS / 10 else raw * 1.0
+    dated = 946_684_800.0 < first < 4_102_444_800.0  # between 2000 and 2100, counted from 1970
+    start = int(raw[0]) if dated and unit == "ns" and pa.types.is_integer(column.type) else round(first * NS)
+    t: FloatArray = np.asarray(exact, dtype=np.float64)
+    return (t - t[0] if dated else t), start if dated else None
+
+
+def _numbers(column: Any) -> FloatArray | None:  # noqa: ANN401 Arrow columns are not generic
+    if not (pa.types.is_integer(column.type) or pa.types.is_floating(column.type) or pa.types.is_boolean(column.type)):
+        return None
+    return np.array(pc.cast(column, pa.float64()).to_numpy(zero_copy_only=False), dtype=np.float64)

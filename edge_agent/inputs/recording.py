@@ -1,0 +1,74 @@
+"""What a reader gives: named series on one clock, and the same cut to what a profile asks for."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+
+
+@dataclass(frozen=True)
+class Series:
+    """One recorded signal: times t (n,) [s] since its recording's start, values (n,), and the unit if it is told."""
+
+    t: FloatArray
+    values: FloatArray
+    unit: str = ""
+
+
+@dataclass
+class Recording:
+    """Signals of one source by name, all on one clock.
+
+    Attributes:
+        name: of the file, to speak of it.
+        start_ns: ns UTC of t = 0, None where the source has no date.
+        rows: whether all signals share their times, as the columns of a table do.
+        notes: what a reader has to say about it.
+    """
+
+    name: str
+    signals: dict[str, Series]
+    start_ns: int | None = None
+    rows: bool = False
+    notes: list[str] = field(default_factory=list)
+
+
+@contextmanager
+def foreign(path: Path, kind: str) -> Iterator[None]:
+    """Turn whatever a library raises over a broken file into one line that names it.
+
+    Raises:
+        InputError: the file cannot be read as `kind`.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except FileNotFoundError as error:
+        raise InputError("source", f"{path} does not exist", "give the path of a recording") from error
+    except Exception as error:  # a reader of others may raise anything over a hostile file
+        reason = (str(error) or type(error).__name__).splitlines()[0][:200]
+        raise InputError(
+            "source", f"{path} is not a sound {kind} file ({reason})", "record or convert it anew"
+        ) from error
+
+
+def library(name: str, extra: str = "inputs") -> Any:  # noqa: ANN401 modules of optional libraries have no common type
+    """An optional library, imported now.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    logging.getLogger("numexpr").setLevel(logging.WARNING)  # which tells at INFO how many threads it has
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise InputError("source", f"needs {name}, which is not installed", f"install gripmap[{extra}]") from error

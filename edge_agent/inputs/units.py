@@ -1,0 +1,57 @@
+"""Units that recordings come in, and what they are in those of the signal log."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Final
+
+from schemas.signals import CHANNELS, per_wheel
+from schemas.thresholds import GRAVITY
+
+DEG: Final = math.pi / 180.0
+# quantity -> unit -> factor to SI; the first is SI itself
+ACCELERATION: Final = {"m/s^2": 1.0, "g": GRAVITY}
+TURN_RATE: Final = {"rad/s": 1.0, "deg/s": DEG, "rpm": 2.0 * math.pi / 60.0}
+ANGLE: Final = {"rad": 1.0, "deg": DEG}
+SPEED: Final = {"m/s": 1.0, "km/h": 1.0 / 3.6, "mph": 0.44704, "kn": 1852.0 / 3600.0}
+TORQUE: Final = {"N*m": 1.0, "kN*m": 1000.0}
+DEGREES: Final = {"deg": 1.0}
+# as written by others, in lower case without blanks -> ours
+SPELLINGS: Final = {
+    "m/s2": "m/s^2", "m/s²": "m/s^2", "m/s/s": "m/s^2", "ms-2": "m/s^2", "mps2": "m/s^2", "m/s**2": "m/s^2",
+    "unit_meterperseconsquar": "m/s^2", "unit_forceofgravi": "g", "°/s": "deg/s", "º/s": "deg/s", "dps": "deg/s",
+    "degps": "deg/s", "degree/s": "deg/s", "unit_degreofarcpersecon": "deg/s", "radps": "rad/s", "1/min": "rpm",
+    "°": "deg", "degree": "deg", "degrees": "deg", "unit_degreofarc": "deg", "radian": "rad", "radians": "rad",
+    "kph": "km/h", "kmh": "km/h", "km^h": "km/h", "kmph": "km/h", "unit_kilometerperhour": "km/h", "mps": "m/s",
+    "kt": "kn", "knot": "kn", "nm": "N*m", "n.m": "N*m", "n*m": "N*m", "unit_newtometer": "N*m",
+}  # fmt: skip
+
+QUANTITY: Final[dict[str, dict[str, float]]] = {
+    "ax": ACCELERATION, "ay": ACCELERATION, "yaw_rate": TURN_RATE,
+    **dict.fromkeys(per_wheel("delta"), ANGLE),
+    **dict.fromkeys(per_wheel("omega"), TURN_RATE | SPEED),
+    **dict.fromkeys(per_wheel("torque"), TORQUE),
+    "latitude": DEGREES, "longitude": DEGREES, "yaw": ANGLE,
+}  # fmt: skip
+assert set(QUANTITY) == set(CHANNELS)
+
+
+def spelled(text: str) -> str:
+    """A unit as we write it; what is unknown comes back in lower case."""
+    plain = re.sub(r"\s", "", text.lower())
+    return SPELLINGS.get(plain, plain)
+
+
+def understood(channel: str, text: str) -> str | None:
+    """The unit of a channel as a recording tells it; None where it tells none that fits."""
+    unit = spelled(text)
+    return unit if unit in QUANTITY[channel] else None
+
+
+def to_si(channel: str, unit: str, wheel_radius: float | None) -> float | None:
+    """Factor to the signal log's unit; None where a rim's speed needs a radius that is not known."""
+    factor = QUANTITY[channel][unit]
+    if channel.startswith("omega") and unit in SPEED:
+        return None if wheel_radius is None else factor / wheel_radius
+    return factor
