@@ -22,7 +22,7 @@ from edge_agent.inputs.block import Block, absolute
 from edge_agent.lab.seeds import FIGURES
 from edge_agent.lab.simulation import SimulatedFleet
 from edge_agent.lab.truth_file import TruthRecorder
-from edge_agent.observe.observation_builder import Records
+from edge_agent.observe.observation_builder import RecordBlock
 from edge_agent.observe.pipeline import Pipeline
 from schemas.config import AgentConfig
 from schemas.thresholds import NS
@@ -40,7 +40,7 @@ def drive(fleet: SimulatedFleet, duration_s: float, truth: Path) -> Columns:
     config = AgentConfig()
     pipeline = Pipeline(bank_of(config.estimator, fleet.vehicles), vehicles, config)
     recorder = TruthRecorder(tuple(fleet.names))
-    parts: list[Records] = []
+    parts: list[RecordBlock] = []
     for block in range(int(duration_s * RATE_HZ / BLOCK)):
         t, signals = fleet.step(BLOCK)
         samples = Block(t, absolute(t, START_NS), signals)

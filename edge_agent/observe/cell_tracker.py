@@ -3,19 +3,19 @@
 A visit begins with a fix in a new cell or heading sector. Fixes jitter, and a road may run along a border, so a visit
 is left only when a fix lies clearly outside: CELL_MARGIN beyond the cell, SECTOR_KEEP beyond the sector.
 Without a fix for FIX_HELD_S the vehicle is nowhere (cell -1). Without yaw the course over ground serves.
-Pure; what must be carried between blocks is a `Track`, and any split of the samples gives the same result.
+Pure; what must be carried between blocks is a `CellTrack` per vehicle. Any split of the samples gives the same result.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from schemas import grid
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.jit import compiled
+from schemas.runtime.records import RecordArray, Records, records
 from schemas.signals import S
 from schemas.thresholds import METRES_PER_DEGREE
 
@@ -25,28 +25,40 @@ SECTOR_KEEP: Final = np.radians(5.0)  # beyond the sector's edge
 COURSE_BASE_M: Final = 3.0  # a course is taken between fixes this far apart: some 8 degrees of noise
 NOWHERE: Final = -1  # cell of a vehicle without position
 
-# columns of a Track's float state
-_FIX_TIME, _LATITUDE, _LONGITUDE, _YAW_TIME, _YAW, _FROM_LAT, _FROM_LON, _COURSE = range(8)
-_WEST, _SOUTH, _EAST, _NORTH = range(8, 12)
-_FLOATS: Final = 12
-_CELL, _SECTOR = 0, 1
+
+class CellTrack:
+    """What is carried of one vehicle between blocks, as a record; NaN where nothing was received yet."""
+
+    fix_time: float  # of the last fix [s]
+    latitude: float  # of it [deg]
+    longitude: float
+    yaw_time: float  # of the last yaw [s]
+    yaw: float  # [rad]
+    course_latitude: float  # where the course over ground is taken from [deg]
+    course_longitude: float
+    course: float  # over ground [rad from east]
+    west: float  # borders of the visited cell [deg]
+    south: float
+    east: float
+    north: float
+    cell: int  # that is visited
+    sector: int
 
 
-@dataclass(frozen=True)
-class Track:
-    """State of N vehicles between blocks: last fix, yaw, borders of the visited cell (N, 12); cell, sector (N, 2)."""
+class Fix:
+    """One sample of the satellite receiver, as a record: position [deg], yaw [rad], its cell and the cell's borders."""
 
-    floats: FloatArray
-    integers: IntArray
+    latitude: float
+    longitude: float
+    yaw: float
+    cell: int  # NOWHERE without a position
+    west: float
+    south: float
+    east: float
+    north: float
 
-    @staticmethod
-    def start(vehicles: int) -> Track:
-        """Nothing seen yet."""
-        return Track(np.full((vehicles, _FLOATS), np.nan), np.full((vehicles, 2), NOWHERE, dtype=np.int64))
 
-
-@dataclass(frozen=True)
-class Located:
+class Located(NamedTuple):
     """Per sample, shape (T, N).
 
     closes: True at the first sample of a new visit, or of being nowhere.
@@ -64,92 +76,117 @@ class Located:
     yaw: FloatArray
 
 
-def locate(track: Track, t: FloatArray, signals: FloatArray, *, lost: bool = False) -> tuple[Track, Located]:
-    """Follow N vehicles through a block: t (T, N) [s], signals (T, N, channels) -> what is carried, what was found.
+def new_tracks(vehicles: int) -> RecordArray:
+    """Tracks (N,) of vehicles that have received nothing yet."""
+    tracks = records(CellTrack, vehicles)
+    for name in tracks.dtype.names or ():
+        tracks[name] = NOWHERE if name in ("cell", "sector") else np.nan
+    return tracks
 
-    `lost` gives the held fixes up, which ends every visit.
+
+def locate(
+    tracks: RecordArray, t: FloatArray, signals: FloatArray, *, lost: bool = False
+) -> tuple[RecordArray, Located]:
+    """Follow N vehicles through a block.
+
+    Args:
+        tracks: (N,) of the block before.
+        t: (T, N) [s].
+        signals: (T, N, channels).
+        lost: gives the held fixes up, which ends every visit.
+
+    Returns:
+        the tracks to carry on, and what was found.
     """
-    latitude, longitude, yaw = (np.ascontiguousarray(signals[..., c]) for c in (S.LATITUDE, S.LONGITUDE, S.YAW))
-    fix = (np.abs(latitude) <= grid.MAX_LATITUDE) & (np.abs(longitude) <= 180.0)
-    cells = np.full(t.shape, NOWHERE, dtype=np.int64)
-    cells[fix] = grid.cell_of(latitude[fix], longitude[fix])
-    borders = np.full((*t.shape, 4), np.nan)
-    borders[fix] = np.stack(grid.bounds(cells[fix]), axis=-1)
-    place = np.full((*t.shape, 2), NOWHERE, dtype=np.int64)
-    flags = np.zeros((*t.shape, 2), dtype=np.bool_)
-    pose = np.full((*t.shape, 3), np.nan)
-    after = Track(track.floats.copy(), track.integers.copy())
+    after = tracks.copy()
     if lost:
-        after.floats[:, _FIX_TIME] = np.nan
-    _follow(t, latitude, longitude, yaw, cells, borders, after.floats, after.integers, place, flags, pose)
-    found = (flags[..., i] for i in range(2)), (place[..., i] for i in range(2)), (pose[..., i] for i in range(3))
-    # one memory layout for all shapes, or numba compiles the kernels again for blocks of one sample
-    return after, Located(*(np.ascontiguousarray(column) for group in found for column in group))
+        after["fix_time"] = np.nan
+    shape = t.shape
+    located = Located(
+        np.zeros(shape, np.bool_), np.zeros(shape, np.bool_), np.full(shape, NOWHERE), np.full(shape, NOWHERE),
+        np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan),
+    )  # fmt: skip
+    _follow(t, _fixes(signals), after, located)
+    return after, located
+
+
+def _fixes(signals: FloatArray) -> RecordArray:
+    """The receiver's part of signals (T, N, channels), as records (T, N)."""
+    fixes = records(Fix, *signals.shape[:-1])
+    latitude, longitude = signals[..., S.LATITUDE], signals[..., S.LONGITUDE]
+    fixes["latitude"], fixes["longitude"], fixes["yaw"] = latitude, longitude, signals[..., S.YAW]
+    there = (np.abs(latitude) <= grid.MAX_LATITUDE) & (np.abs(longitude) <= 180.0)
+    fixes["cell"] = NOWHERE
+    fixes["cell"][there] = cell = grid.cell_of(latitude[there], longitude[there])
+    for name, border in zip(("west", "south", "east", "north"), grid.bounds(cell), strict=True):
+        fixes[name][there] = border
+    return fixes
 
 
 @compiled
-def _course(state: FloatArray, latitude: float, longitude: float) -> None:
+def _course(track: CellTrack, latitude: float, longitude: float) -> None:
     """Update the course over ground [rad from east] when the vehicle has moved far enough."""
-    north = (latitude - state[_FROM_LAT]) * METRES_PER_DEGREE
-    east = (longitude - state[_FROM_LON]) * METRES_PER_DEGREE * np.cos(np.radians(latitude))
+    north = (latitude - track.course_latitude) * METRES_PER_DEGREE
+    east = (longitude - track.course_longitude) * METRES_PER_DEGREE * np.cos(np.radians(latitude))
     distance = np.hypot(north, east)
     if distance >= COURSE_BASE_M:
-        state[_COURSE] = np.arctan2(north, east)
+        track.course = np.arctan2(north, east)
     if not distance < COURSE_BASE_M:
-        state[_FROM_LAT], state[_FROM_LON] = latitude, longitude
+        track.course_latitude, track.course_longitude = latitude, longitude
 
 
 @compiled
-def _stays(state: FloatArray, sector: int, latitude: float, longitude: float, yaw: float) -> bool:
+def _stays(track: CellTrack, fix: Fix, yaw: float) -> bool:
     """Whether a fix still belongs to the visit, margins included."""
-    wide = CELL_MARGIN * (state[_EAST] - state[_WEST])
-    high = CELL_MARGIN * (state[_NORTH] - state[_SOUTH])
-    off = np.mod(yaw - sector * (np.pi / 2) + np.pi, 2 * np.pi) - np.pi
+    wide = CELL_MARGIN * (track.east - track.west)
+    high = CELL_MARGIN * (track.north - track.south)
+    off = np.mod(yaw - track.sector * (np.pi / 2) + np.pi, 2 * np.pi) - np.pi
     return bool(
-        state[_WEST] - wide <= longitude <= state[_EAST] + wide
-        and state[_SOUTH] - high <= latitude <= state[_NORTH] + high
+        track.west - wide <= fix.longitude <= track.east + wide
+        and track.south - high <= fix.latitude <= track.north + high
         and abs(off) <= np.pi / 4 + SECTOR_KEEP
     )
 
 
 @compiled
-def _follow(
-    t: FloatArray,
-    latitude: FloatArray,
-    longitude: FloatArray,
-    yaw: FloatArray,
-    cells: IntArray,
-    borders: FloatArray,
-    floats: FloatArray,
-    integers: IntArray,
-    place: IntArray,
-    flags: BoolArray,
-    pose: FloatArray,
-) -> None:
-    """Sequential core of `locate`; writes floats, integers (carried), place, flags and pose (results)."""
+def _receive(track: CellTrack, fix: Fix, now: float) -> None:
+    """Remember what a sample brings."""
+    if np.isfinite(fix.yaw):
+        track.yaw_time, track.yaw = now, fix.yaw
+    if fix.cell != NOWHERE:
+        track.fix_time, track.latitude, track.longitude = now, fix.latitude, fix.longitude
+        _course(track, fix.latitude, fix.longitude)
+
+
+@compiled
+def _begin(track: CellTrack, fix: Fix, heading: float) -> None:
+    """Begin a visit of the fix's cell."""
+    track.cell = fix.cell
+    track.sector = int(np.floor((heading + np.pi / 4) / (np.pi / 2))) % grid.SECTORS
+    track.west, track.south, track.east, track.north = fix.west, fix.south, fix.east, fix.north
+
+
+@compiled
+def _follow(t: FloatArray, fixes: Records[Fix], tracks: Records[CellTrack], located: Located) -> None:
+    """Sequential core of `locate`; moves the tracks on and fills `located`."""
     for k in range(t.shape[0]):
         for n in range(t.shape[1]):
-            state, now = floats[n], t[k, n]
-            if np.isfinite(yaw[k, n]):
-                state[_YAW_TIME], state[_YAW] = now, yaw[k, n]
-            if cells[k, n] != NOWHERE:
-                state[_FIX_TIME], state[_LATITUDE], state[_LONGITUDE] = now, latitude[k, n], longitude[k, n]
-                _course(state, latitude[k, n], longitude[k, n])
-            heading = state[_YAW] if now - state[_YAW_TIME] <= FIX_HELD_S else state[_COURSE]
-            held = now - state[_FIX_TIME] <= FIX_HELD_S
+            track, fix, now = tracks[n], fixes[k, n], t[k, n]
+            _receive(track, fix, now)
+            heading = track.yaw if now - track.yaw_time <= FIX_HELD_S else track.course
+            held = now - track.fix_time <= FIX_HELD_S
             if held:
-                pose[k, n, 0], pose[k, n, 1], pose[k, n, 2] = state[_LATITUDE], state[_LONGITUDE], heading
-            if not held and integers[n, _CELL] != NOWHERE:
-                integers[n, _CELL], integers[n, _SECTOR] = NOWHERE, NOWHERE
-                flags[k, n, 0] = True
-            elif cells[k, n] != NOWHERE and np.isfinite(heading):
-                here = integers[n, _CELL] != NOWHERE and _stays(
-                    state, integers[n, _SECTOR], latitude[k, n], longitude[k, n], heading
-                )
-                if not here:
-                    integers[n, _CELL] = cells[k, n]
-                    integers[n, _SECTOR] = np.int64(np.floor((heading + np.pi / 4) / (np.pi / 2))) % grid.SECTORS
-                    state[_WEST : _NORTH + 1] = borders[k, n]
-                    flags[k, n, 0] = True
-            flags[k, n, 1] = cells[k, n] != NOWHERE and cells[k, n] == integers[n, _CELL]
-            place[k, n, 0], place[k, n, 1] = integers[n, _CELL], integers[n, _SECTOR]
+                located.latitude[k, n], located.longitude[k, n] = track.latitude, track.longitude
+                located.yaw[k, n] = heading
+            if not held and track.cell != NOWHERE:
+                track.cell, track.sector = NOWHERE, NOWHERE
+                located.closes[k, n] = True
+            elif (
+                fix.cell != NOWHERE
+                and np.isfinite(heading)
+                and not (track.cell != NOWHERE and _stays(track, fix, heading))
+            ):
+                _begin(track, fix, heading)
+                located.closes[k, n] = True
+            located.inside[k, n] = fix.cell != NOWHERE and fix.cell == track.cell
+            located.cell[k, n], located.sector[k, n] = track.cell, track.sector

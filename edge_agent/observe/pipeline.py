@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from edge_agent.inputs.block import Block
-from edge_agent.observe.cell_tracker import Track, locate
-from edge_agent.observe.observation_builder import Open, Records, observe
+from edge_agent.observe.cell_tracker import locate, new_tracks
+from edge_agent.observe.observation_builder import OpenVisits, RecordBlock, observe
 from edge_agent.observe.trip_privacy import TripEnds
 from schemas.thresholds import NS
 
@@ -27,20 +27,20 @@ class Pipeline:
 
     def __init__(self, bank: EstimatorBank, vehicles: int, config: AgentConfig) -> None:
         self._bank, self._config = bank, config
-        self._track, self._open = Track.start(vehicles), Open.start(vehicles)
+        self._tracks, self._open = new_tracks(vehicles), OpenVisits.start(vehicles)
         self._ends = TripEnds(vehicles, config.trip_end_m, config.trip_end_s)
         self._last: Block | None = None
 
-    def step(self, block: Block) -> tuple[Estimates, Records, Records]:
+    def step(self, block: Block) -> tuple[Estimates, RecordBlock, RecordBlock]:
         """Estimates, observations and states of a block of at least one sample, the latter two without trip ends."""
-        self._track, located = locate(self._track, block.t, block.signals)
+        self._tracks, located = locate(self._tracks, block.t, block.signals)
         estimates = self._bank.advance(block.t, block.signals, located.closes)
         self._open, observations, states = observe(self._open, block.time, located, estimates, self._config)
         self._last = block
         self._ends.drive(block.time, estimates.vx)
         return estimates, self._ends.cut(observations), self._ends.cut(states)
 
-    def finish(self) -> Records | None:
+    def finish(self) -> RecordBlock | None:
         """Close the open visits and return their observations; None when there was no sample.
 
         A visit's evidence is told at the sample that follows it, so one sample without readings is added, with the
@@ -50,8 +50,8 @@ class Pipeline:
             return None
         t, time = self._last.t[-1:] + FINAL_STEP_S, self._last.time[-1:] + round(FINAL_STEP_S * NS)
         empty = np.full((1, *self._last.signals.shape[1:]), np.nan)
-        track, located = locate(self._track, t, empty, lost=True)
+        tracks, located = locate(self._tracks, t, empty, lost=True)
         estimates = self._bank.advance(t, empty, located.closes)
-        self._track = track
+        self._tracks = tracks
         self._open, observations, _ = observe(self._open, time, located, estimates, self._config)
         return self._ends.cut(observations)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge_agent.observe.observation_builder import Records
+from edge_agent.observe.observation_builder import RecordBlock
 from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import NS
 from schemas.wire import Kind
@@ -31,7 +31,7 @@ class TripEnds:
         self._times: list[IntArray] = []
         self._odometers: list[FloatArray] = []
         self._began: IntArray | None = None
-        self._held: dict[Kind, Records] = {}
+        self._held: dict[Kind, RecordBlock] = {}
 
     @property
     def _off(self) -> bool:
@@ -52,7 +52,7 @@ class TripEnds:
         self._odometers.append(odometer[-1:])
         self._forget()
 
-    def cut(self, records: Records) -> Records:
+    def cut(self, records: RecordBlock) -> RecordBlock:
         """Those of the records, and of the earlier ones that waited, that may be told now."""
         if self._off or self._began is None:
             return records
@@ -84,12 +84,12 @@ class TripEnds:
         return out
 
 
-def _taken(records: Records, rows: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Records:
+def _taken(records: RecordBlock, rows: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> RecordBlock:
     columns = {name: column[rows] for name, column in records.columns.items()}
-    return Records(records.kind, columns, records.vehicle[rows], records.urgent[rows])
+    return RecordBlock(records.kind, columns, records.vehicle[rows], records.urgent[rows])
 
 
-def _joined(first: Records, second: Records) -> Records:
+def _joined(first: RecordBlock, second: RecordBlock) -> RecordBlock:
     columns = {name: np.concatenate([first.columns[name], second.columns[name]]) for name in first.columns}
     vehicle, urgent = (np.concatenate([getattr(r, n) for r in (first, second)]) for n in ("vehicle", "urgent"))
-    return Records(first.kind, columns, vehicle, urgent)
+    return RecordBlock(first.kind, columns, vehicle, urgent)

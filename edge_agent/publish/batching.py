@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edge_agent.observe.observation_builder import Records
+from edge_agent.observe.observation_builder import RecordBlock
 from edge_agent.publish.outbox import Draft
 from schemas import grid
 from schemas.wire import Batch, Columns, Kind, encode
@@ -45,7 +45,7 @@ class Batcher:
         """Records that wait for their batch."""
         return sum(group.rows for group in self._groups.values())
 
-    def add(self, records: Records, now: float) -> None:
+    def add(self, records: RecordBlock, now: float) -> None:
         """Take records in; rows of one vehicle and region keep their order."""
         if not len(records.vehicle):
             return

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from edge_agent.observe.observation_builder import Records
+from edge_agent.observe.observation_builder import RecordBlock
 from edge_agent.publish.batching import Batcher
 from edge_agent.publish.outbox import Draft, Spool, Stream
 from edge_agent.publish.zenoh_link import Link
@@ -61,7 +61,7 @@ class Publisher:
         self._names = dict.fromkeys(names)
         self._spool, self._config, self._clock = spool, config, clock
         self._batcher = Batcher(names, spool.boot, estimator, flush_s=config.flush_s, rows=config.batch_rows)
-        self._offered: queue.Queue[Records] = queue.Queue(QUEUE_LIMIT)
+        self._offered: queue.Queue[RecordBlock] = queue.Queue(QUEUE_LIMIT)
         self._acks: queue.SimpleQueue[tuple[str, bytes]] = queue.SimpleQueue()
         self._links: dict[str, Link] = {}
         self._connected: dict[str, bool] = {}
@@ -99,7 +99,7 @@ class Publisher:
         """Records given up for want of room, in the queue or in the spool."""
         return sum(self.counts.dropped.values()) + sum(self._spool.counts.evicted.values())
 
-    def offer(self, *blocks: Records) -> None:
+    def offer(self, *blocks: RecordBlock) -> None:
         """Hand records over; never blocks. What does not fit is dropped and counted."""
         for records in blocks:
             if not len(records.vehicle):

@@ -63,6 +63,15 @@ class _Layout(NamedTuple):
     needed: BoolArray
 
 
+class _Scan(NamedTuple):
+    """What a walk reads and fills: all bytes, the kind's layout, whether a name must be plain ASCII, the result."""
+
+    data: ByteArray
+    layout: _Layout
+    strict: bool
+    out: Walked
+
+
 @cache
 def _layout(kind: Kind) -> _Layout:
     fields = MESSAGES[kind].DESCRIPTOR.fields_by_name
@@ -93,7 +102,7 @@ def walk(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True) -> Wa
         np.zeros((k, columns), np.int64), np.zeros((k, columns), np.int64), np.zeros(k, np.int64),
     )  # fmt: skip
     first = list(column_types(kind)).index(NEEDED[kind][0])
-    _walk(data, ends, layout, first, strict, out)
+    _walk(_Scan(data, layout, strict, out), ends, first)
     return out
 
 
@@ -124,7 +133,9 @@ def _varint(data: ByteArray, at: int, end: int) -> tuple[int, int]:
 
 
 @refcount_free
-def _walk(data: ByteArray, ends: IntArray, layout: _Layout, first: int, strict: bool, out: Walked) -> None:
+def _walk(scan: _Scan, ends: IntArray, first: int) -> None:
+    """Fill the result for all messages; `first`: the column that says how many records a message has."""
+    data, layout, out = scan.data, scan.layout, scan.out
     at = 0
     for k in range(len(ends)):
         end, seen, fine = ends[k], 0, True
@@ -134,7 +145,7 @@ def _walk(data: ByteArray, ends: IntArray, layout: _Layout, first: int, strict: 
             fine = at >= 0 and 0 < number < _FIELDS and layout.roles[number] != _UNKNOWN and not (seen >> number) & 1
             if fine:
                 seen |= 1 << number
-                at = _field(data, at, end, layout.roles[number], wire, layout, strict, out, k)
+                at = _field(scan, k, at, end, layout.roles[number], wire)
                 fine = at >= 0
         n = out.counts[k, first]
         fine = fine and 1 <= n <= MAX_ROWS
@@ -145,10 +156,9 @@ def _walk(data: ByteArray, ends: IntArray, layout: _Layout, first: int, strict: 
 
 
 @refcount_free
-def _field(
-    data: ByteArray, at: int, end: int, role: int, wire: int, layout: _Layout, strict: bool, out: Walked, k: int
-) -> int:  # fmt: skip
-    """Note one field; returns where it ends, or -1 where it is not as we write it."""
+def _field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) -> int:
+    """Note one field of message k; returns where it ends, or -1 where it is not as we write it."""
+    data, out = scan.data, scan.out
     if role == 0:  # boot
         if wire != _FIXED64 or end - at < 8:
             return -1
@@ -166,11 +176,11 @@ def _field(
     if role < _COLUMN:
         out.texts[k, role - _TEXT, 0], out.texts[k, role - _TEXT, 1] = at, at + length
         for place in range(at, at + length):
-            if strict and data[place] >= 128:
+            if scan.strict and data[place] >= 128:
                 return -1
         return at + length
     column = role - _COLUMN
-    width, count = layout.widths[column], 0
+    width, count = scan.layout.widths[column], 0
     if width > 0:
         count = length // width
         if count * width != length:

@@ -10,6 +10,7 @@ of them; what belongs to one vehicle lies together; and sizes are constants, so 
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Annotated, Any, Protocol, TypeAlias, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -46,7 +47,12 @@ class Records(Protocol[R_co]):
         """The row, which is part of the array."""
         ...
 
+    def __setitem__(self, place: int | tuple[int, int], row: object, /) -> None:
+        """Copy another row there."""
+        ...
 
+
+@cache
 def record_type(kind: type) -> np.dtype[np.void]:
     """The structured type whose fields are the annotations of `kind`, those of its bases first."""
     fields = []

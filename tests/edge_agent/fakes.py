@@ -13,11 +13,12 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from edge_agent.inputs.block import Block, absolute
-from edge_agent.observe.cell_tracker import Located, Track, locate
-from edge_agent.observe.observation_builder import Open, Records, observe
+from edge_agent.observe.cell_tracker import Located, locate, new_tracks
+from edge_agent.observe.observation_builder import OpenVisits, RecordBlock, observe
 from schemas import mugrid
 from schemas.config import AgentConfig
 from schemas.numeric import FloatArray
+from schemas.runtime.records import RecordArray
 from schemas.signals import CHANNELS, S
 
 if TYPE_CHECKING:
@@ -89,20 +90,20 @@ def wanderers(samples: int, vehicles: int, seed: int = 0) -> Block:
 
 @dataclass
 class Watch:
-    """Track and open visits of a test's vehicles."""
+    """Tracks and open visits of a test's vehicles."""
 
-    track: Track
-    open: Open
+    tracks: RecordArray
+    open: OpenVisits
     config: AgentConfig
 
     @staticmethod
     def of(vehicles: int, config: AgentConfig | None = None) -> Watch:
         """Nothing seen yet."""
-        return Watch(Track.start(vehicles), Open.start(vehicles), config or AgentConfig())
+        return Watch(new_tracks(vehicles), OpenVisits.start(vehicles), config or AgentConfig())
 
-    def step(self, block: Block, told: MadeUp) -> tuple[Located, Records, Records]:
+    def step(self, block: Block, told: MadeUp) -> tuple[Located, RecordBlock, RecordBlock]:
         """One block."""
-        self.track, located = locate(self.track, block.t, block.signals)
+        self.tracks, located = locate(self.tracks, block.t, block.signals)
         said = cast("Estimates", told)  # which has more, of what nobody reads here
         self.open, observations, states = observe(self.open, block.time, located, said, self.config)
         return located, observations, states

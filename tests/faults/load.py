@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from edge_agent.app.live_loop import STOPPED_DRAIN_S
-from edge_agent.observe.observation_builder import Records
+from edge_agent.observe.observation_builder import RecordBlock
 from edge_agent.publish.outbox import Draft, Held, Spool, Stream
 from edge_agent.publish.publisher import Publisher
 from schemas import grid, mugrid
@@ -68,7 +68,7 @@ class WatchedSpool(Spool):
         return super().settle(stream, told)
 
 
-def visits(rng: np.random.Generator, vehicle: IntArray, now: int, cells_across: int) -> Records:
+def visits(rng: np.random.Generator, vehicle: IntArray, now: int, cells_across: int) -> RecordBlock:
     """One made-up visit per element of `vehicle` (n,), all just left; now [ns]."""
     n = len(vehicle)
     columns: Columns = {}
@@ -83,7 +83,7 @@ def visits(rng: np.random.Generator, vehicle: IntArray, now: int, cells_across: 
     columns["enter_time"] = columns["leave_time"] - rng.integers(300_000_000, 900_000_000, n)
     seen = -0.5 * np.square((mugrid.CENTRES - columns["mu"][:, None]) / 0.1)
     columns["log_likelihood"] = mugrid.encode_log_likelihood(seen)
-    return Records(Kind.OBSERVATION, columns, vehicle, np.zeros(n, bool))
+    return RecordBlock(Kind.OBSERVATION, columns, vehicle, np.zeros(n, bool))
 
 
 def drive(plan: Plan, publisher: Publisher, quiet: threading.Event) -> tuple[int, float]:

@@ -17,9 +17,14 @@ from edge_agent.lab.simulation.presets import PRESETS, TrueVehicle, car, matched
 SLOPES: Final = ("longitudinal_stiffness", "cornering_stiffness")
 SEDAN: Final = PRESETS["sedan"]  # paper 004, table 1
 # papers 000 and 001, table 2
-LIGHT: Final = TrueVehicle(car("light", 830.0, 1110.0, (1.17, 1.17), (1.416, 1.416), 0.54, 0.278, 0.5), power=60e3)
+LIGHT: Final = TrueVehicle(
+    car("light", 830.0, 1110.0, (1.17, 1.17), (1.416, 1.416), cg_height=0.54, radius=0.278, drive_front=0.5), power=60e3
+)
 # paper 002, table 1; the height of the centre of gravity is not given
-SMALL: Final = TrueVehicle(car("in-wheel", 710.0, 1000.0, (0.795, 0.975), (1.55, 1.55), 0.50, 0.245, 0.5), power=60e3)
+SMALL: Final = TrueVehicle(
+    car("in-wheel", 710.0, 1000.0, (0.795, 0.975), (1.55, 1.55), cg_height=0.50, radius=0.245, drive_front=0.5),
+    power=60e3,
+)
 STRONG: Final = replace(SEDAN, power=400e3)  # .6 g at 25 m/s
 LOOSE: Final = replace(STRONG, slip_limit=math.inf)  # no slip control: wheels spin
 

@@ -55,6 +55,7 @@ def car(
     yaw_inertia: float,
     axles: tuple[float, float],
     tracks: tuple[float, float],
+    *,
     cg_height: float,
     radius: float,
     drive_front: float,
@@ -70,13 +71,15 @@ def car(
 
 PRESETS: Final = {
     "small": TrueVehicle(  # a front-driven hatchback
-        car("small", 1180.0, 1420.0, (1.02, 1.53), (1.48, 1.48), 0.52, 0.305, 1.0), shape=1.45, power=65e3
+        car("small", 1180.0, 1420.0, (1.02, 1.53), (1.48, 1.48), cg_height=0.52, radius=0.305, drive_front=1.0),
+        shape=1.45, power=65e3,
     ),
     "sedan": TrueVehicle(  # paper 004, table 1; stiffnesses and wheel inertia are not given there; four driven wheels
-        car("sedan", 1643.0, 1954.0, (1.287, 1.403), (1.581, 1.586), 0.545, 0.359, 0.5), shape=1.55, power=120e3
+        car("sedan", 1643.0, 1954.0, (1.287, 1.403), (1.581, 1.586), cg_height=0.545, radius=0.359, drive_front=0.5),
+        shape=1.55, power=120e3,
     ),
     "van": TrueVehicle(  # a rear-driven, half-laden delivery van
-        car("van", 2350.0, 4600.0, (1.55, 1.75), (1.70, 1.68), 0.74, 0.345, 0.0),
+        car("van", 2350.0, 4600.0, (1.55, 1.75), (1.70, 1.68), cg_height=0.74, radius=0.345, drive_front=0.0),
         shape=1.40, curvature=0.0, roll_leak=0.10, drag=0.75, power=100e3,
     ),
 }  # fmt: skip

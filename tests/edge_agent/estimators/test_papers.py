@@ -12,8 +12,8 @@ from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates, adaptive_federated_ckf, compensated_wckf, create, paper_aco_fckf
 from edge_agent.estimators.estimates import COLUMNS
 from edge_agent.estimators.paper_aco_fckf import Setting
-from edge_agent.observe.cell_tracker import Track, locate
-from edge_agent.observe.observation_builder import Open, observe
+from edge_agent.observe.cell_tracker import locate, new_tracks
+from edge_agent.observe.observation_builder import OpenVisits, observe
 from schemas.config import AgentConfig
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
@@ -93,9 +93,9 @@ def test_slow_sampling_and_standing_still_are_survived(name: str, rate: int) -> 
 def test_without_evidence_the_observer_tells_friction_with_its_interval(name: str) -> None:
     t, signals, vehicle = drive("slalom", 0.8, seconds=6.0)
     t, signals = t[:, None], signals[:, None]
-    _, located = locate(Track.start(1), t, signals)
+    _, located = locate(new_tracks(1), t, signals)
     said = bank_of(name, [vehicle]).advance(t, signals, located.closes)
-    _, told, _ = observe(Open.start(1), (t * 1e9).astype(np.int64), located, said, AgentConfig())
+    _, told, _ = observe(OpenVisits.start(1), (t * 1e9).astype(np.int64), located, said, AgentConfig())
     assert len(told.vehicle) > 0
     assert told.columns["log_likelihood"].shape == (len(told.vehicle), 0)
     assert (told.columns["mu_lower"] < told.columns["mu_upper"]).all()

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from edge_agent.observe.cell_tracker import NOWHERE
-from edge_agent.observe.observation_builder import Records
+from edge_agent.observe.observation_builder import RecordBlock
 from schemas import grid, mugrid
 from schemas.config import AgentConfig
 from schemas.wire import Kind, column_types
 from tests.edge_agent.fakes import START_NS, Watch, estimates, ground, part, wanderers
 
 
-def joined(records: list[Records]) -> dict[str, np.ndarray]:
+def joined(records: list[RecordBlock]) -> dict[str, np.ndarray]:
     """Columns of several blocks, one after the other, with vehicle and urgent."""
     columns = {name: np.concatenate([r.columns[name] for r in records]) for name in records[0].columns}
     whose = {name: np.concatenate([getattr(r, name) for r in records]) for name in ("vehicle", "urgent")}

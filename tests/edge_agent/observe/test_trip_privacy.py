@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edge_agent.observe.observation_builder import Records
+from edge_agent.observe.observation_builder import RecordBlock
 from edge_agent.observe.trip_privacy import TripEnds
 from schemas.numeric import IntArray
 from schemas.thresholds import NS
@@ -14,9 +14,9 @@ from schemas.wire import Kind
 SPEED = 10.0
 
 
-def states(time: IntArray, vehicle: int = 0) -> Records:
+def states(time: IntArray, vehicle: int = 0) -> RecordBlock:
     n = len(time)
-    return Records(Kind.STATE, {"time": time}, np.full(n, vehicle), np.zeros(n, bool))
+    return RecordBlock(Kind.STATE, {"time": time}, np.full(n, vehicle), np.zeros(n, bool))
 
 
 def told(ends: TripEnds, seconds: int, block_s: float = 0.5) -> list[float]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from edge_agent.observe.observation_builder import Records
+from edge_agent.observe.observation_builder import RecordBlock
 from edge_agent.publish.batching import Batcher
 from edge_agent.publish.outbox import Spool
 from edge_agent.publish.publisher import Publisher
@@ -24,7 +24,7 @@ NAMES = ("car-a", "car-b", "car-c")
 Make = Callable[..., Publisher]
 
 
-def drive(seed: int = 0, samples: int = 200) -> tuple[Records, Records]:
+def drive(seed: int = 0, samples: int = 200) -> tuple[RecordBlock, RecordBlock]:
     """Observations and states of a random drive of three vehicles."""
     _, observations, states = Watch.of(3).step(wanderers(samples, 3, seed), estimates(samples, 3, seed, mu=0.8))
     return observations, states
@@ -236,14 +236,14 @@ def batches_of(batcher: Batcher, now: float, everything: bool = False) -> list[t
     return sorted((d.vehicle, d.records) for d in batcher.due(now, everything=everything))
 
 
-def one_vehicle(records: int, urgent: bool = False) -> Records:
+def one_vehicle(records: int, urgent: bool = False) -> RecordBlock:
     """The first records of one drive, of the first vehicle and in one region."""
     observations, _ = drive(samples=3000)
     chosen = np.flatnonzero(observations.vehicle == 0)[:records]
     assert len(chosen) == records
     columns = {name: column[chosen] for name, column in observations.columns.items()}
     columns["cell"] = np.full(records, columns["cell"][0])
-    return Records(Kind.OBSERVATION, columns, observations.vehicle[chosen], np.full(records, urgent))
+    return RecordBlock(Kind.OBSERVATION, columns, observations.vehicle[chosen], np.full(records, urgent))
 
 
 def test_a_batch_waits_for_its_time_or_for_fifty_records() -> None:
