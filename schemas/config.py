@@ -32,7 +32,7 @@ class ZenohSettings(Settings):
     )
 
 
-class Watched(Settings):
+class MonitoringSettings(Settings):
     """How a running part shows itself."""
 
     metrics_port: int | None = Field(
@@ -42,7 +42,7 @@ class Watched(Settings):
     log: Literal["text", "json"] = Field(default="text", description="lines for people, or JSON lines for programs")
 
 
-class AgentConfig(Watched):
+class AgentConfig(MonitoringSettings):
     """Settings of an edge agent."""
 
     zenoh: ZenohSettings = ZenohSettings()
@@ -67,7 +67,7 @@ class AgentConfig(Watched):
     tyre_season: int = Field(default=0, ge=0, le=3, description="0 unknown, 1 summer, 2 winter, 3 all-season")
 
 
-class ServiceConfig(Watched):
+class ServiceConfig(MonitoringSettings):
     """Settings of a fleet service."""
 
     zenoh: ZenohSettings = ZenohSettings()

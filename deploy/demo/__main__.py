@@ -45,7 +45,7 @@ def drive(folder: Path, endpoint: str, args: argparse.Namespace) -> tuple[Listen
     return listener, fleet.report()
 
 
-def show(folder: Path, endpoint: str, comparison: compare.Comparison) -> None:
+def show(folder: Path, endpoint: str, comparison: compare.MapComparison) -> None:
     """One query by a client that uses nothing of ours, and how to read the Parquet."""
     sides = [comparison.cells[side].to_numpy() for side in ("west", "south", "east", "north")]
     bbox = ",".join(f"{value:.6f}" for value in (sides[0].min(), sides[1].min(), sides[2].max(), sides[3].max()))

@@ -22,7 +22,7 @@ from schemas.wire import Alert, Kind
 
 
 @dataclass(frozen=True)
-class Comparison:
+class MapComparison:
     """Cells of the map that have a truth, row by row; `truth` is the friction when the demo ended."""
 
     cells: pa.Table
@@ -56,12 +56,12 @@ def final_truth(visits: pa.Table, changed_ns: int) -> dict[tuple[int, int], floa
     return {key: float(np.mean(mu[[r for r in rows if after[r]] or rows])) for key, rows in groups.items()}
 
 
-def compare(cells: pa.Table, visits: pa.Table, changed_ns: int) -> Comparison:
+def compare(cells: pa.Table, visits: pa.Table, changed_ns: int) -> MapComparison:
     """Join the map with the truth by (cell, sector)."""
     truth = final_truth(visits, changed_ns)
     found = np.array([truth.get(key, np.nan) for key in _keys(cells)])
     known = np.isfinite(found)
-    return Comparison(cells.filter(pa.array(known)), found[known])
+    return MapComparison(cells.filter(pa.array(known)), found[known])
 
 
 def delay_passes(visits: pa.Table, patch: BoolArray, alerts: list[tuple[int, Alert]], changed_ns: int) -> float:
@@ -95,7 +95,7 @@ def passes(rows: pa.Table) -> int:
 
 
 def figures(
-    comparison: Comparison, visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int,
+    comparison: MapComparison, visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int,
     counts: dict[str, float], archive: Path, wall_s: float,
 ) -> list[Figure]:  # fmt: skip
     """The demo's figures with their bars."""

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.demo.compare import Comparison
+from deploy.demo.compare import MapComparison
 from deploy.demo.picture import quarters
 
 TEMPLATE = Path(__file__).with_name("page.html")
 COLUMNS = ("mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehicles", "observations", "latitude", "longitude")
 
 
-def write(comparison: Comparison, table: str, path: Path) -> None:
+def write(comparison: MapComparison, table: str, path: Path) -> None:
     """Fill the template with the cells and the figures table (text); nothing is loaded from elsewhere."""
     rows = comparison.cells.select(COLUMNS).to_pylist()
     for row, truth, shape in zip(rows, comparison.truth, np.round(quarters(comparison), 2).tolist(), strict=True):

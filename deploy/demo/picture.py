@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
-from deploy.demo.compare import Comparison
+from deploy.demo.compare import MapComparison
 from schemas.numeric import FloatArray
 from schemas.thresholds import METRES_PER_DEGREE
 
@@ -18,7 +18,7 @@ COLOURS = "RdYlGn"  # red is slippery, green is dry
 SURFACES = {0.18: "ice", 0.35: "snow", 0.60: "wet", 0.90: "dry"}
 
 
-def quarters(comparison: Comparison) -> FloatArray:
+def quarters(comparison: MapComparison) -> FloatArray:
     """The triangle of each row's heading sector in its cell, (n, 3, 2) [m from the south-west corner of all]."""
     west, south, east, north = (
         comparison.cells[side].to_numpy() for side in ("west", "south", "east", "north")
@@ -36,7 +36,7 @@ def quarters(comparison: Comparison) -> FloatArray:
     return np.stack([middle, corners[row, first], corners[row, second]], axis=1)
 
 
-def draw(comparison: Comparison, path: Path) -> None:
+def draw(comparison: MapComparison, path: Path) -> None:
     """Three panels: the truth, the map (median), and how wide the map's interval is."""
     shapes = quarters(comparison)
     lower, mu, upper = (comparison.cells[name].to_numpy() for name in ("mu_lower", "mu", "mu_upper"))

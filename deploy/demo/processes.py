@@ -20,7 +20,7 @@ class DemoError(RuntimeError):
     """A part did not start, or ended before its time; says where its log is."""
 
 
-class Part:
+class ManagedProcess:
     """One process of the demo; what it prints goes to `folder/NAME.log`."""
 
     def __init__(self, name: str, command: Sequence[str], folder: Path) -> None:
@@ -80,20 +80,20 @@ class Part:
 
 
 @contextmanager
-def system(folder: Path) -> Iterator[tuple[str, Part]]:
+def system(folder: Path) -> Iterator[tuple[str, ManagedProcess]]:
     """Router and fleet service on a free port of loopback; yields the endpoint and the service.
 
     The agents' configuration is left in `folder/agent.json`.
     """
     scripts = Path(sys.executable).parent
-    router = Part("router", [sys.executable, "-m", "deploy.router", "--listen", "tcp/127.0.0.1:0"], folder)
+    router = ManagedProcess("router", [sys.executable, "-m", "deploy.router", "--listen", "tcp/127.0.0.1:0"], folder)
     try:
         endpoint = router.line_with("router: ").removeprefix("router: ").split()[0]
         zenoh = {"connect": [endpoint]}
         (folder / "service.json").write_text(json.dumps({"zenoh": zenoh, "name": "demo"}))
         (folder / "agent.json").write_text(json.dumps({"zenoh": zenoh, "spool": str(folder / "spool.sqlite")}))
         command = ["run", "--config", str(folder / "service.json"), "--archive", str(folder / "archive")]
-        service = Part("service", [str(scripts / "fleet-service"), *command], folder)
+        service = ManagedProcess("service", [str(scripts / "fleet-service"), *command], folder)
         try:
             service.line_with("ready")
             yield endpoint, service
@@ -103,7 +103,7 @@ def system(folder: Path) -> Iterator[tuple[str, Part]]:
         router.stop()
 
 
-def fleet(folder: Path, vehicles: int, duration_s: float, seed: int) -> Part:
+def fleet(folder: Path, vehicles: int, duration_s: float, seed: int) -> ManagedProcess:
     """The simulated vehicles: one process, a Zenoh session and an identity for each."""
     scripts = Path(sys.executable).parent
     options = {
@@ -116,4 +116,4 @@ def fleet(folder: Path, vehicles: int, duration_s: float, seed: int) -> Part:
         "--truth": folder / "truth.parquet",
     }
     words = [str(word) for option in options.items() for word in option]
-    return Part("fleet", [str(scripts / "edge-agent"), "fleet", *words], folder)
+    return ManagedProcess("fleet", [str(scripts / "edge-agent"), "fleet", *words], folder)

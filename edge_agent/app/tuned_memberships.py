@@ -35,7 +35,7 @@ class Score(Record):
     nis_ratio: Annotated[Finite, Field(description="normalised innovation squared over its expectation [1]")]
 
 
-class Comparison(Record):
+class SplitScores(Record):
     """One row of the table: the drives that were searched on, and drives that were not."""
 
     train: Score
@@ -68,7 +68,7 @@ class Document(Record):
     estimator: str
     memberships: dict[str, list[Finite]]
     objective: str
-    scores: dict[str, Comparison]
+    scores: dict[str, SplitScores]
     provenance: Provenance
 
 

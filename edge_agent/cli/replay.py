@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from edge_agent.app.backfill import Outcome
     from edge_agent.app.estimates_file import EstimatesFile
     from edge_agent.estimators import EstimatorBank
-    from edge_agent.inputs.signal_log import Log
+    from edge_agent.inputs.signal_log import SignalLog
     from schemas.config import AgentConfig
 
 DRAIN_S = 30.0  # for a busy service; what is not settled by then stays in the spool
@@ -86,7 +86,13 @@ def _told(outcomes: Iterator[Outcome], count: int) -> int:
 
 
 def _published(
-    name: str, log: Log, start_ns: int, bank: EstimatorBank, estimator: str, config: AgentConfig, file: EstimatesFile
+    name: str,
+    log: SignalLog,
+    start_ns: int,
+    bank: EstimatorBank,
+    estimator: str,
+    config: AgentConfig,
+    file: EstimatesFile,
 ) -> int:
     from edge_agent.app.live_loop import Progress
     from edge_agent.cli.common import checked_name, leave, publisher_of
@@ -108,7 +114,7 @@ def _published(
     return 1 if publisher.unsettled() else 0
 
 
-def _start(given: str | None, log: Log) -> int:
+def _start(given: str | None, log: SignalLog) -> int:
     """The ns UTC of t = 0."""
     from schemas.errors import InputError
 

@@ -16,9 +16,18 @@ from typing import Final
 import numpy as np
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.app.tuned_memberships import WAYS, Budget, Comparison, Document, Provenance, Score, save
+from edge_agent.app.tuned_memberships import WAYS, Budget, Document, Provenance, Score, SplitScores, save
 from edge_agent.lab.tuning import colony, random_search
-from edge_agent.lab.tuning.objectives import HELD_OUT, OBJECTIVES, TRAIN, Recorded, choices, objective_on, record, worth
+from edge_agent.lab.tuning.objectives import (
+    HELD_OUT,
+    OBJECTIVES,
+    TRAIN,
+    TuningSet,
+    choices,
+    objective_on,
+    record,
+    worth,
+)
 from edge_agent.lab.tuning.search import Iteration, Objective, Progress, Result
 from schemas.errors import InputError
 from schemas.runtime import figures
@@ -64,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     train, held_out = record(TRAIN, duration), record(HELD_OUT, duration)
     results = _search(objective_on(train, ESTIMATOR, args.objective), ants, iterations, args.seed)
     found = {"default": Memberships()} | {way: Memberships.from_vector(r.best) for way, r in results.items()}
-    scores = {way: Comparison(train=_score(found[way], train), held_out=_score(found[way], held_out)) for way in WAYS}
+    scores = {way: SplitScores(train=_score(found[way], train), held_out=_score(found[way], held_out)) for way in WAYS}
     print(table(scores))
     budget = Budget(
         ants=ants, iterations=iterations, evaluations={way: result.evaluations for way, result in results.items()}
@@ -100,7 +109,7 @@ def _study(args: argparse.Namespace, ants: int, iterations: int) -> int:
     (args.study / "study.md").write_text(text, encoding="utf-8")
     study_report.draw(listed, ants, args.study / "convergence.png")
     names = dict(zip(WAYS, ("untuned", "random", "colony"), strict=True))
-    scores = {way: Comparison(**study_report.scores(done, name)) for way, name in names.items()}
+    scores = {way: SplitScores(**study_report.scores(done, name)) for way, name in names.items()}
     evaluations = {way: sum(result.evaluations for result in results) for way, results in done.found.items()}
     command = f"edge-agent tune --seed {args.seed} --ants {ants} --iterations {iterations} --study DIR"
     document = _document(
@@ -150,12 +159,12 @@ def reporter(way: str, iterations: int, clock: Callable[[], float], write: Calla
     return tell
 
 
-def _score(memberships: Memberships, drives: Recorded) -> Score:
+def _score(memberships: Memberships, drives: TuningSet) -> Score:
     return Score(**asdict(worth(memberships, drives, ESTIMATOR)))
 
 
 def _document(
-    memberships: Memberships, objective: str, scores: dict[str, Comparison], budget: Budget, command: str, seed: int,
+    memberships: Memberships, objective: str, scores: dict[str, SplitScores], budget: Budget, command: str, seed: int,
     estimator: str = ESTIMATOR,
 ) -> Document:  # fmt: skip
     header = figures.header("tune", [seed])
@@ -172,7 +181,7 @@ def _document(
     )
 
 
-def table(scores: dict[str, Comparison]) -> str:
+def table(scores: dict[str, SplitScores]) -> str:
     """The comparison as plain text, a row per way and set of drives."""
     lines = [f"{'':<8} {'drives':<9} {'interval score':>15} {'coverage':>9} {'innovations [nat/s]':>20} {'NIS':>6}"]
     for way, row in scores.items():

@@ -32,7 +32,7 @@ BLOCK_ROWS: Final = 16_384  # 2.4 MB of signals: bounds memory, and is long enou
 
 
 @dataclass(frozen=True)
-class Log:
+class SignalLog:
     """A read log: t (T,) [s] as recorded, signals (T, channels), and the ns UTC of t = 0 where the log knows it."""
 
     t: FloatArray
@@ -46,7 +46,7 @@ class Log:
             yield Block(t, absolute(t, start_ns), self.signals[first : first + rows, None])
 
 
-def read_log(path: Path) -> Log:
+def read_log(path: Path) -> SignalLog:
     """Read and check a signal log.
 
     Raises:
@@ -64,7 +64,7 @@ def read_log(path: Path) -> Log:
     signals[np.isinf(signals)] = np.nan
     _check(table, signals)
     _steering(table, signals)
-    return Log(t, signals, start_ns)
+    return SignalLog(t, signals, start_ns)
 
 
 def _table(path: Path) -> pa.Table:

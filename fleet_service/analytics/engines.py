@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fleet_service.archive import layout, snapshots
-from fleet_service.archive.export import Part
+from fleet_service.archive.export import Extract
 from schemas.errors import InputError
 from schemas.thresholds import EXCITED_SHARE, NS
 from schemas.wire import Kind
@@ -30,7 +30,7 @@ NAMES: Final = {"observations": layout.TABLES[Kind.OBSERVATION], "map": snapshot
 
 
 @dataclass
-class Engine:
+class QueryEngine:
     """A connection, and the files of one part of an archive.
 
     Args:
@@ -45,7 +45,7 @@ class Engine:
 
     name: str
     root: Path
-    part: Part
+    part: Extract
     progress: bool = False
 
     def __post_init__(self) -> None:

@@ -14,27 +14,27 @@ from pathlib import Path
 import pyarrow as pa
 
 from fleet_service.analytics import output, synthetic
-from fleet_service.analytics.engines import Engine
+from fleet_service.analytics.engines import QueryEngine
 from fleet_service.analytics.options import Options
 from fleet_service.analytics.questions import QUESTIONS
 from fleet_service.archive import layout
 from fleet_service.archive.compaction import compact
-from fleet_service.archive.export import Part
+from fleet_service.archive.export import Extract
 from schemas.wire import Kind
 
-WORLD = synthetic.World(rows=60_000, days=3, vehicles=60, roads=16, length=80, icy=4)
+WORLD = synthetic.SyntheticFleet(rows=60_000, days=3, vehicles=60, roads=16, length=80, icy=4)
 
 
-def whole(root: Path) -> Part:
+def whole(root: Path) -> Extract:
     """All days of an archive."""
     days = [layout.day_of(folder) for folder in layout.days(root, layout.TABLES[Kind.OBSERVATION])]
-    return Part(min(days) * layout.DAY_NS, (max(days) + 1) * layout.DAY_NS)
+    return Extract(min(days) * layout.DAY_NS, (max(days) + 1) * layout.DAY_NS)
 
 
 def figures(root: Path, folder: Path) -> dict[str, pa.Table]:
     """Ask, draw, and return what was asked."""
     folder.mkdir(parents=True, exist_ok=True)
-    engine = Engine("duckdb", root, whole(root))
+    engine = QueryEngine("duckdb", root, whole(root))
     middle = (engine.part.since + engine.part.until) // 2
     answers = {}
     for name, ending in (

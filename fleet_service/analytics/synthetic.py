@@ -29,7 +29,7 @@ _STD: Final = 0.05
 
 
 @dataclass(frozen=True)
-class World:
+class SyntheticFleet:
     """How much of it: rows, days, vehicles, roads and cells of a road; one road in `icy` freezes at night."""
 
     rows: int
@@ -41,7 +41,7 @@ class World:
     seed: int = 0
 
 
-def write(root: Path, world: World, segment_rows: int = 20_000) -> None:
+def write(root: Path, world: SyntheticFleet, segment_rows: int = 20_000) -> None:
     """Write the inbox of an archive, segment by segment, in order of time.
 
     Raises:
@@ -54,7 +54,7 @@ def write(root: Path, world: World, segment_rows: int = 20_000) -> None:
             writer.write(Kind.OBSERVATION, {name: column[part] for name, column in rows.items()})
 
 
-def chunks(world: World, hours: int = 6) -> Iterator[Rows]:
+def chunks(world: SyntheticFleet, hours: int = 6) -> Iterator[Rows]:
     """Rows of a few hours each, in order of time."""
     rng = np.random.default_rng(world.seed)
     bias = rng.normal(0.0, 0.04, world.vehicles)
@@ -65,7 +65,9 @@ def chunks(world: World, hours: int = 6) -> Iterator[Rows]:
             yield _chunk(world, rng, bias, span * hours * 3600, hours * 3600, rows)
 
 
-def _chunk(world: World, rng: np.random.Generator, bias: FloatArray, since_s: int, span_s: int, rows: int) -> Rows:
+def _chunk(
+    world: SyntheticFleet, rng: np.random.Generator, bias: FloatArray, since_s: int, span_s: int, rows: int
+) -> Rows:
     trips = -(-rows // world.length)
     road, who = rng.integers(0, world.roads, trips), rng.integers(0, world.vehicles, trips)
     begin = since_s + rng.random(trips) * (span_s - world.length * CELL_S)
@@ -119,7 +121,7 @@ def night(seconds: FloatArray) -> FloatArray:
     return np.clip(np.cos(2 * np.pi * (seconds / DAY_S - 4 / 24)), 0.0, 1.0)
 
 
-def truth_of(world: World, road: IntArray, along: IntArray, seconds: FloatArray) -> FloatArray:
+def truth_of(world: SyntheticFleet, road: IntArray, along: IntArray, seconds: FloatArray) -> FloatArray:
     """Friction: dry, and ice on the middle fifth of icy roads in the small hours."""
     middle = np.abs(along - world.length // 2) < world.length // 10
     return np.where((road % world.icy == 0) & middle & (night(seconds) > 0.5), ICE, DRY)

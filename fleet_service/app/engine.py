@@ -22,12 +22,12 @@ import pyarrow as pa
 from fleet_service.app.precompile import warm_up
 from fleet_service.archive.files import lock
 from fleet_service.archive.load import count_set_aside, set_aside
-from fleet_service.archive.log import Log
+from fleet_service.archive.log import SegmentLog
 from fleet_service.archive.pseudonyms import Pseudonyms
 from fleet_service.fusion import Fusion, observations_of
 from fleet_service.fusion.weather import Reports
 from fleet_service.ingest.acks import Acks
-from fleet_service.ingest.dedup import BatchId, Streams
+from fleet_service.ingest.dedup import BatchId, SequenceTrackers
 from fleet_service.ingest.inbox import Admitted, Intake, Message
 from fleet_service.ingest.validation import Clock
 from fleet_service.ingest.weather import WeatherDesk, archived
@@ -87,9 +87,9 @@ class Engine:
         self._guard = threading.Lock()
         self._tiles = Tiles(self.map, self._guard, config.public_vehicles)
         self._acks = Acks()
-        streams = Streams()
+        streams = SequenceTrackers()
         self._intake = Intake(streams, Pseudonyms(root / "keys"), self.counts, self._acks)
-        self._log: Log[BatchId] = Log(root, config.name)
+        self._log: SegmentLog[BatchId] = SegmentLog(root, config.name)
         self.weather = WeatherDesk(root, config.name, self.fusion, self.counts)
         self._heard = since or 0  # when the last report of any kind came [ns]
         self._checkpoint_wanted = threading.Event()

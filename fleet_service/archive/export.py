@@ -22,7 +22,7 @@ from schemas.wire import Kind
 Box = tuple[float, float, float, float]
 
 
-class Part(NamedTuple):
+class Extract(NamedTuple):
     """What is wanted: from, to [ns], the second excluded; west, south, east, north [deg]."""
 
     since: int
@@ -30,7 +30,7 @@ class Part(NamedTuple):
     bbox: Box | None = None
 
 
-def observations(root: Path, part: Part) -> pa.Table:
+def observations(root: Path, part: Extract) -> pa.Table:
     """Rows of observations, inbox included, as points."""
     where = (pc.field("leave_time") >= _time(part.since)) & (pc.field("leave_time") < _time(part.until))
     if part.bbox is not None:
@@ -43,7 +43,7 @@ def observations(root: Path, part: Part) -> pa.Table:
     return geo.with_points(table, table["longitude"].to_numpy(), table["latitude"].to_numpy())
 
 
-def map_then(root: Path, part: Part) -> pa.Table:
+def map_then(root: Path, part: Extract) -> pa.Table:
     """The last snapshot of the map before `until`."""
     path = snapshots.newest(root, part.until)
     if path is None:
@@ -54,7 +54,7 @@ def map_then(root: Path, part: Part) -> pa.Table:
     return geo.with_cells(_inside(table, part.bbox))
 
 
-def cell_hours(root: Path, part: Part) -> pa.Table:
+def cell_hours(root: Path, part: Extract) -> pa.Table:
     """Parts of the roll-up, with the polygons of their cells."""
     hour = pc.field("hour")
     where = (hour >= _time(part.since)) & (hour < _time(part.until))
@@ -66,7 +66,7 @@ def cell_hours(root: Path, part: Part) -> pa.Table:
     return geo.with_cells(_inside(table, part.bbox).sort_by([("cell", "ascending"), ("hour", "ascending")]))
 
 
-WHAT: Final[dict[str, Callable[[Path, Part], pa.Table]]] = {
+WHAT: Final[dict[str, Callable[[Path, Extract], pa.Table]]] = {
     "map": map_then, "observations": observations, "rollup": cell_hours,
 }  # fmt: skip
 

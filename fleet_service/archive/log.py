@@ -45,7 +45,7 @@ class _Load(Generic[Batch]):
         writer.sync()
 
 
-class Log(Generic[Batch]):
+class SegmentLog(Generic[Batch]):
     """The log of one run of one service, for one thread; the disk's work is done in another.
 
     Args:

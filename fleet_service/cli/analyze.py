@@ -42,15 +42,15 @@ def _analyze(arguments: argparse.Namespace) -> int:
     if arguments.out is not None and arguments.out.suffix not in ENDINGS:
         raise InputError("out", f"{arguments.out.name} has no known ending", f"use one of {', '.join(ENDINGS)}")
     from fleet_service.analytics import engines, output
-    from fleet_service.archive.export import Part
+    from fleet_service.archive.export import Extract
     from schemas import query
 
     if arguments.engine not in engines.ENGINES:
         raise InputError("engine", f"{arguments.engine!r} is none", f"use one of {', '.join(engines.ENGINES)}")
     bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
     now = time.time_ns()
-    part = Part(moment(arguments.since, "from", 0), moment(arguments.until, "to", now), bbox)
-    engine = engines.Engine(arguments.engine, arguments.archive, part, progress=sys.stderr.isatty())
+    part = Extract(moment(arguments.since, "from", 0), moment(arguments.until, "to", now), bbox)
+    engine = engines.QueryEngine(arguments.engine, arguments.archive, part, progress=sys.stderr.isatty())
     at = moment(arguments.at, "at", -1)
     options = Options(
         at=None if at < 0 else at, stations=arguments.stations, least_vehicles=arguments.min_vehicles,

@@ -111,7 +111,7 @@ def _export(arguments: argparse.Namespace) -> str:
 
     bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
     until = moment(arguments.until, "to", time.time_ns())
-    part = export.Part(moment(arguments.since, "from", 0), until, bbox)
+    part = export.Extract(moment(arguments.since, "from", 0), until, bbox)
     table = export.WHAT[arguments.what](arguments.archive, part)
     export.write(table, arguments.out)
     return f"{table.num_rows} rows in {arguments.out}"

@@ -28,7 +28,7 @@ SKEW: Final = timedelta(minutes=10)  # clocks of vehicles may be behind the auth
 Key = ec.EllipticCurvePrivateKey
 
 
-class Pair(NamedTuple):
+class KeyPair(NamedTuple):
     """A certificate and its private key."""
 
     certificate: x509.Certificate
@@ -60,7 +60,7 @@ def write(path: Path, data: bytes, mode: int) -> None:
     draft.rename(path)
 
 
-def read(stem: Path) -> Pair | None:
+def read(stem: Path) -> KeyPair | None:
     """The pair at STEM.pem and STEM.key; None where it is missing or its halves do not belong together.
 
     Raises:
@@ -76,7 +76,7 @@ def read(stem: Path) -> Pair | None:
         raise InputError("out", f"{path} is no private key", "move it away; it will be made anew") from error
     if not isinstance(key, Key) or key.public_key() != certificate.public_key():
         return None
-    return Pair(certificate, key)
+    return KeyPair(certificate, key)
 
 
 def read_certificate(path: Path) -> x509.Certificate | None:
@@ -93,7 +93,7 @@ def read_certificate(path: Path) -> x509.Certificate | None:
         raise InputError("out", f"{path} is no certificate", "move it away; it will be made anew") from error
 
 
-def new_authority(days: float, now: datetime) -> Pair:
+def new_authority(days: float, now: datetime) -> KeyPair:
     """An authority that signs itself, and nobody else's authority."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = _subject(f"gripmap authority {now:%Y-%m-%d} {x509.random_serial_number():x}"[:64])
@@ -103,10 +103,10 @@ def new_authority(days: float, now: datetime) -> Pair:
         .add_extension(_usage(signs=True), critical=True)
         .sign(key, hashes.SHA256())
     )
-    return Pair(certificate, key)
+    return KeyPair(certificate, key)
 
 
-def issue(authority: Pair, name: str, hosts: Sequence[str], days: float, now: datetime) -> Pair:
+def issue(authority: KeyPair, name: str, hosts: Sequence[str], days: float, now: datetime) -> KeyPair:
     """A certificate for a name; with `hosts` it may also be that of a server under them.
 
     Raises:
@@ -129,7 +129,7 @@ def issue(authority: Pair, name: str, hosts: Sequence[str], days: float, now: da
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.key.public_key()), critical=False)
         .sign(authority.key, hashes.SHA256())
     )
-    return Pair(certificate, key)
+    return KeyPair(certificate, key)
 
 
 def alternatives(name: str, hosts: Sequence[str]) -> list[x509.GeneralName]:

@@ -89,7 +89,7 @@ class Registry:
             ca.write(self._folder / f"{name}.json5", text.encode() + b"\n", 0o644)
         return done
 
-    def _signer(self, step: Step | None) -> ca.Pair:
+    def _signer(self, step: Step | None) -> ca.KeyPair:
         current, coming = self._authority / "ca", self._authority / "next"
         if step == "next" and ca.read(coming) is None:
             ca.new_authority(self._terms.ca_days, self._now).write(coming)

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from typing import Final
 
-from fleet_service.ingest.dedup import BatchId, Stream
+from fleet_service.ingest.dedup import BatchId, SequenceTracker
 from schemas.wire import Kind, StreamAck, encode_ack
 from schemas.wire.batches import Head
 
@@ -20,7 +20,7 @@ class Acks:
     """What is to be told to whom."""
 
     def __init__(self) -> None:
-        self._durable: dict[Stream, list[int]] = defaultdict(list)
+        self._durable: dict[SequenceTracker, list[int]] = defaultdict(list)
         self._rejected: dict[str, dict[AckedStream, list[tuple[int, int, str]]]] = defaultdict(
             lambda: defaultdict(list)
         )

@@ -20,7 +20,7 @@ _NONE: Final[frozenset[int]] = frozenset()
 StreamKey = tuple[int, int, Kind, int]  # number of the vehicle's pseudonym, boot, kind, region
 
 
-class Stream:
+class SequenceTracker:
     """Which batches of one stream were admitted.
 
     Attributes:
@@ -77,25 +77,25 @@ class Stream:
                 self.seen = _NONE
 
 
-BatchId = tuple[Stream, int]  # and seq
+BatchId = tuple[SequenceTracker, int]  # and seq
 
 
-class Streams:
+class SequenceTrackers:
     """All streams of one service."""
 
     def __init__(self) -> None:
-        self._streams: dict[StreamKey, Stream] = {}
+        self._streams: dict[StreamKey, SequenceTracker] = {}
 
-    def __getitem__(self, key: StreamKey) -> Stream:
+    def __getitem__(self, key: StreamKey) -> SequenceTracker:
         stream = self._streams.get(key)
         if stream is None:
-            stream = self._streams[key] = Stream(key)
+            stream = self._streams[key] = SequenceTracker(key)
         return stream
 
     def __len__(self) -> int:
         return len(self._streams)
 
-    def __iter__(self) -> Iterator[Stream]:
+    def __iter__(self) -> Iterator[SequenceTracker]:
         return iter(self._streams.values())
 
     def forget(self, before: int) -> None:

@@ -20,7 +20,7 @@ from fleet_service.archive.pseudonyms import Pseudonyms, number, texts
 from fleet_service.archive.segments import Rows, stepped
 from fleet_service.ingest import validation
 from fleet_service.ingest.acks import Acks
-from fleet_service.ingest.dedup import BatchId, Stream, Streams
+from fleet_service.ingest.dedup import BatchId, SequenceTracker, SequenceTrackers
 from fleet_service.ingest.rate_limit import Limits
 from fleet_service.ingest.validation import Clock, Refusal
 from schemas.grid import cell_of
@@ -120,10 +120,10 @@ class Intake:
         acks: takes the refusals and what is durable already.
     """
 
-    def __init__(self, streams: Streams, pseudonyms: Pseudonyms, counts: Counter[str], acks: Acks) -> None:
+    def __init__(self, streams: SequenceTrackers, pseudonyms: Pseudonyms, counts: Counter[str], acks: Acks) -> None:
         self._streams, self._pseudonyms, self._counts, self._acks = streams, pseudonyms, counts, acks
         self._pending: set[BatchId] = set()  # admitted, not yet on disk
-        self._known: dict[Kind, dict[tuple[str, int, int, int], Stream]] = {kind: {} for kind in Kind}
+        self._known: dict[Kind, dict[tuple[str, int, int, int], SequenceTracker]] = {kind: {} for kind in Kind}
         self._forgot = 0
 
     def admit(self, messages: Sequence[Message], clock: Clock) -> dict[Kind, Admitted]:
@@ -187,7 +187,7 @@ class Intake:
             self._counts["duplicates"] += again
         return out
 
-    def _look_up(self, kind: Kind, name: tuple[str, int, int, int], time: int) -> Stream | None:
+    def _look_up(self, kind: Kind, name: tuple[str, int, int, int], time: int) -> SequenceTracker | None:
         """The stream of a (vehicle, boot, region, day); None without a key: the vehicle keeps its batch until the disk
         is well again."""
         vehicle, boot, region, _ = name

@@ -25,7 +25,7 @@ from fleet_service.lab import agent, town
 from fleet_service.lab.agent import Errors, Told
 from fleet_service.lab.bars import ATTACKS
 from fleet_service.lab.drive import CELL, watch
-from fleet_service.lab.messages import Sent, clock_of, messages, rebadged
+from fleet_service.lab.messages import SentMessage, clock_of, messages, rebadged
 from fleet_service.lab.score import excited_vehicles
 from fleet_service.lab.town import CELLS, LENGTH, Town, Visits
 from schemas.config import ServiceConfig
@@ -38,7 +38,7 @@ CLEARLY_DRY, CLEARLY_ICY, ENOUGH = 0.5, 0.25, 5
 
 
 @dataclass(frozen=True)
-class Drive:
+class AttackedDrive:
     """A drive before the attack."""
 
     town: Town
@@ -46,11 +46,11 @@ class Drive:
     counted: BoolArray  # (cells,) with ENOUGH excited vehicles when it begins
 
 
-def drive_of(rng: Generator) -> Drive:
+def drive_of(rng: Generator) -> AttackedDrive:
     """The honest part."""
     place = town.build(rng, MINUTES, 0.0)
     visits = town.drive(rng, place, Errors.draw(rng, VEHICLES), MINUTES)
-    return Drive(place, visits, excited_vehicles(visits, place, BEGIN, VEHICLES) >= ENOUGH)
+    return AttackedDrive(place, visits, excited_vehicles(visits, place, BEGIN, VEHICLES) >= ENOUGH)
 
 
 def measure(seeds: range) -> dict[str, float]:
@@ -68,7 +68,7 @@ def measure(seeds: range) -> dict[str, float]:
     return out
 
 
-def differing(drive: Drive, alone: list[BoolArray], attacked: list[BoolArray]) -> int:
+def differing(drive: AttackedDrive, alone: list[BoolArray], attacked: list[BoolArray]) -> int:
     """Cells in which the attack raised or suppressed an alert."""
     raised, suppressed = np.zeros(CELLS, bool), np.zeros(CELLS, bool)
     for minute in range(BEGIN, MINUTES):
@@ -82,7 +82,7 @@ def _attackers(v: Visits, count: int) -> BoolArray:
     return (v.vehicle < count) & (v.seconds >= 60.0 * BEGIN)
 
 
-def random(rng: Generator, drive: Drive) -> Visits:
+def random(rng: Generator, drive: AttackedDrive) -> Visits:
     """Sure values of anything, at every visit."""
     v = drive.visits
     claim = rng.uniform(0.05, 1.2, len(v))
@@ -97,20 +97,20 @@ def _claiming(v: Visits, lying: BoolArray, claim: FloatArray) -> Visits:
     return Visits(v.seconds, v.vehicle, v.place, v.mu, v.excited & ~lying, told)
 
 
-def shifted_pose(rng: Generator, drive: Drive) -> Visits:
+def shifted_pose(rng: Generator, drive: AttackedDrive) -> Visits:
     """What they truly learn, told of a place elsewhere in the town."""
     v = drive.visits
     moved = (v.place + int(rng.integers(CELLS // 4, 3 * CELLS // 4))) % CELLS
     return Visits(v.seconds, v.vehicle, np.where(_attackers(v, ATTACKERS), moved, v.place), v.mu, v.excited, v.told)
 
 
-def victims(drive: Drive) -> IntArray:
+def victims(drive: AttackedDrive) -> IntArray:
     """The driest and the iciest cell that count."""
     mu = np.where(drive.counted, drive.town.mu[BEGIN], np.nan)
     return np.array([np.nanargmax(mu), np.nanargmin(mu)])
 
 
-def flood_one_cell(rng: Generator, drive: Drive) -> Visits:
+def flood_one_cell(rng: Generator, drive: AttackedDrive) -> Visits:
     """Hundreds of visits a minute: ice on the driest cell, dry on the iciest; the values vary, so as to look new."""
     count = FLOODERS * FLOOD
     seconds = rng.uniform(60.0 * BEGIN, 60.0 * MINUTES, count)
@@ -119,7 +119,7 @@ def flood_one_cell(rng: Generator, drive: Drive) -> Visits:
     return _added(drive.visits, seconds, rng.integers(0, FLOODERS, count), victims(drive)[which], claim)
 
 
-def newcomers(rng: Generator, drive: Drive) -> Visits:
+def newcomers(rng: Generator, drive: AttackedDrive) -> Visits:
     """Forty new names that each pass once and agree: ice on the road of the driest cell, dry on that of the iciest."""
     roads = victims(drive) // LENGTH * LENGTH
     who, which, along = (a.ravel() for a in np.meshgrid(np.arange(NAMES), np.arange(2), np.arange(LENGTH)))
@@ -139,12 +139,12 @@ def _added(v: Visits, seconds: FloatArray, vehicle: IntArray, place: IntArray, c
     return town.take(both, np.argsort(both.seconds, kind="stable"))
 
 
-VISITS: Final[dict[str, Callable[[Generator, Drive], Visits]]] = {
+VISITS: Final[dict[str, Callable[[Generator, AttackedDrive], Visits]]] = {
     "random": random, "shifted_pose": shifted_pose, "flood_one_cell": flood_one_cell, "newcomers": newcomers,
 }  # fmt: skip
 
 
-def replayed(rng: Generator, drive: Drive) -> int:
+def replayed(rng: Generator, drive: AttackedDrive) -> int:
     """Every message of the town's first minutes again, as it was, on other keys, and under another name."""
     sent = messages(drive.visits)
     at = drive.visits.seconds[[m.last for m in sent]]
@@ -155,7 +155,7 @@ def replayed(rng: Generator, drive: Drive) -> int:
     return differing(drive, alone, attacked)
 
 
-def _alerted(sent: list[Sent], at: FloatArray, forged: list[Message]) -> list[BoolArray]:
+def _alerted(sent: list[SentMessage], at: FloatArray, forged: list[Message]) -> list[BoolArray]:
     out = []
     with tempfile.TemporaryDirectory() as folder:
         engine = Engine(ServiceConfig(), Path(folder))

@@ -1,6 +1,6 @@
 """Visits through the service's own path: rows as the archive has them → `observations` → `Fusion.fold` → alerts.
 
-Deliveries are as in life: a few rows come late (some beyond the lateness), and some twice; `Streams` drops
+Deliveries are as in life: a few rows come late (some beyond the lateness), and some twice; `SequenceTrackers` drops
 the second ones, as in the service.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.random import Generator
 
 from fleet_service.fusion import Fusion, Observations, observations_of
-from fleet_service.ingest.dedup import Streams
+from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.lab.town import CELLS, START, Visits, cell_numbers
 from fleet_service.serve.alerts import Alerts
 from schemas import grid, mugrid
@@ -60,7 +60,7 @@ def arrivals(rng: Generator, v: Visits) -> tuple[FloatArray, IntArray]:
 
 def novel(rows: dict[str, Any], vehicle: IntArray, which: IntArray) -> IntArray:
     """Those deliveries that the service admits: each identity once."""
-    streams, kept = Streams(), []
+    streams, kept = SequenceTrackers(), []
     region, boot, seq = rows["region"].tolist(), rows["boot"].tolist(), rows["seq"].tolist()
     for k, row in enumerate(which.tolist()):
         stream = streams[int(vehicle[row]), boot[row], Kind.OBSERVATION, region[row]]
@@ -71,7 +71,7 @@ def novel(rows: dict[str, Any], vehicle: IntArray, which: IntArray) -> IntArray:
 
 
 @dataclass
-class Watched:
+class AlertWatch:
     """A fusion with its alerts, asked minute by minute; `beliefs` (minutes, cells, 32), `alerted` (minutes, cells)."""
 
     fusion: Fusion
@@ -97,14 +97,14 @@ def minutes(o: Observations, at: FloatArray, count: int) -> Iterator[Observation
         yield o.take(rows)
 
 
-def watch(rng: Generator, v: Visits, count: int) -> Watched:
+def watch(rng: Generator, v: Visits, count: int) -> AlertWatch:
     """Deliver the visits and ask the map after each of `count` minutes."""
     rows = rows_of(v)
     at, which = arrivals(rng, v)
     kept = novel(rows, v.vehicle, which)
     at, which = at[kept], which[kept]
     fusion = Fusion(LATENESS_S)
-    watched = Watched(fusion, Alerts(fusion))
+    watched = AlertWatch(fusion, Alerts(fusion))
     o = observations_of(rows, v.vehicle).take(which)
     for minute, part in enumerate(minutes(o, at, count), 1):
         if len(part.time):

@@ -18,7 +18,7 @@ from schemas.wire import Batch, Kind, decode
 BATCH_ROWS = 12  # the cells of one road
 
 
-class Sent(NamedTuple):
+class SentMessage(NamedTuple):
     """A message, and the index of its last visit."""
 
     message: Message
@@ -35,7 +35,7 @@ def clock_of(seconds: float) -> int:
     return START + int(seconds * NS) + NS
 
 
-def messages(v: Visits) -> list[Sent]:
+def messages(v: Visits) -> list[SentMessage]:
     """Each vehicle's visits in batches, in order of time per vehicle and region."""
     rows, out = rows_of(v), []
     latitude, longitude = grid.centre(rows["cell"])
@@ -49,7 +49,7 @@ def messages(v: Visits) -> list[Sent]:
 
 def _message(
     v: Visits, rows: dict[str, np.ndarray], latitude: np.ndarray, longitude: np.ndarray, part: IntArray, seq: int
-) -> Sent:  # fmt: skip
+) -> SentMessage:  # fmt: skip
     n = len(part)
     columns: dict[str, np.ndarray] = {
         "enter_time": rows["leave_time"][part] - NS, "leave_time": rows["leave_time"][part],
@@ -62,7 +62,9 @@ def _message(
     name = name_of(vehicle)
     batch = Batch(Kind.OBSERVATION, name, vehicle + 1, region, seq, 1, columns, "synthetic")
     key = keys.observation_key(region, name)
-    return Sent(Message(Kind.OBSERVATION, key, wire.encode(batch), wire.ENCODING[Kind.OBSERVATION]), int(part[-1]))
+    return SentMessage(
+        Message(Kind.OBSERVATION, key, wire.encode(batch), wire.ENCODING[Kind.OBSERVATION]), int(part[-1])
+    )
 
 
 def rebadged(message: Message, thief: int) -> tuple[Message, Message]:

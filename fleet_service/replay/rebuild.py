@@ -18,7 +18,7 @@ from fleet_service.archive.load import Damaged, pass_over
 from fleet_service.archive.pseudonyms import number
 from fleet_service.fusion import Fusion, Updated, observations_of
 from fleet_service.fusion.constants import EPOCH_NS
-from fleet_service.ingest.dedup import Streams
+from fleet_service.ingest.dedup import SequenceTrackers
 from schemas.numeric import IntArray
 from schemas.tables import US, US_STEP
 from schemas.wire import Kind
@@ -32,7 +32,7 @@ COLUMNS: Final = [
 MARGIN_DEG: Final = 0.002  # around a box: over 100 m, more than a visit's position error moves what it tells
 
 
-def restore_streams(root: Path, streams: Streams, damaged: Damaged = pass_over) -> int:
+def restore_streams(root: Path, streams: SequenceTrackers, damaged: Damaged = pass_over) -> int:
     """Note every archived batch as admitted; returns the latest time at which one was received [ns], or 0."""
     seen = 0
     for kind, first in _FIRST_TIME.items():

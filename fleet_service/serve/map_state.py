@@ -102,7 +102,7 @@ def measured(lower: FloatArray, upper: FloatArray, values: Float32Array) -> Bool
     return np.asarray((values > 0) & ((upper < PRIOR_UPPER - MEASURED_DROP) | narrow))
 
 
-class Cells(NamedTuple):
+class CellView(NamedTuple):
     """What a fusion knows of cells: columns (k,) and beliefs (k, 32), read at `now` [ns].
 
     `values` are the votes with a value; None where all is borrowed.
@@ -119,11 +119,11 @@ class Cells(NamedTuple):
     now: int
 
 
-def cells_at(fusion: Fusion, slots: IntArray, now: int) -> Cells:
+def cells_at(fusion: Fusion, slots: IntArray, now: int) -> CellView:
     """The cells of `slots` as they are believed at `now` [ns]; copies, so that the fusion may go on."""
     belief, live = fusion.beliefs(slots, now), fusion.live
     key = live.key[slots]
-    return Cells(
+    return CellView(
         key // grid.SECTORS, key % grid.SECTORS, belief, live.values[slots], live.vehicles[slots],
         live.visits[slots], live.first[slots], live.time[slots], now,
     )  # fmt: skip
@@ -134,7 +134,7 @@ def cell_table(fusion: Fusion, slots: IntArray, now: int) -> pa.Table:
     return pa.Table.from_batches([map_batch(cells_at(fusion, slots, now))])
 
 
-def map_batch(cells: Cells) -> pa.RecordBatch:
+def map_batch(cells: CellView) -> pa.RecordBatch:
     """Cells in the schema of the map."""
     latitude, longitude = grid.centre(cells.cell)
     west, south, east, north = grid.bounds(cells.cell)

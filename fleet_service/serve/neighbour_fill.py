@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_service.fusion import Fusion
-from fleet_service.serve.map_state import Cells, map_batch
+from fleet_service.serve.map_state import CellView, map_batch
 from schemas import grid, mugrid, tables
 from schemas.numeric import IntArray
 
@@ -43,7 +43,7 @@ def borrowed(fusion: Fusion, tile: int, slots: IntArray, route: tuple[IntArray, 
     np.minimum.at(vehicles, group, fusion.live.vehicles[lender])
     np.minimum.at(first, group, fusion.live.first[lender])
     np.maximum.at(last, group, fusion.live.time[lender])
-    cells = Cells(
+    cells = CellView(
         wanted // grid.SECTORS, wanted % grid.SECTORS, belief, None, vehicles,
         np.zeros(len(wanted), np.int64), first, last, now,
     )  # fmt: skip

@@ -19,7 +19,7 @@ from schemas.errors import WireError
 from schemas.numeric import BoolArray, IntArray
 from schemas.runtime.protobuf_scan import NUMBERS, TEXTS, Walked, gather, walk
 from schemas.wire import ENCODING, MAX_BYTES, PLAIN, Columns, Kind, column_types
-from schemas.wire.batches import ABSENT, LIKELIHOOD, Decoded, Heads, Sent, complete, message_of
+from schemas.wire.batches import ABSENT, LIKELIHOOD, Decoded, Heads, PresentColumns, complete, message_of
 
 
 def decode_many(kind: Kind, payloads: Sequence[tuple[bytes, str]]) -> Decoded:
@@ -72,10 +72,12 @@ class _Fields(NamedTuple):
         """Records of each message."""
         return self.walked.sizes
 
-    def sent(self) -> Sent:
+    def sent(self) -> PresentColumns:
         """Which messages come with which column."""
         given = self.walked.counts > 0
-        return Sent(self.kind, self.sizes, {name: given[:, at] for at, name in enumerate(column_types(self.kind))})
+        return PresentColumns(
+            self.kind, self.sizes, {name: given[:, at] for at, name in enumerate(column_types(self.kind))}
+        )
 
     def heads(self) -> Heads:
         """Heads, with the first of all sequence numbers held where the sender does not say which."""

@@ -79,7 +79,7 @@ class Decoded(NamedTuple):
     errors: list[tuple[int, WireError]]
 
 
-class Sent(NamedTuple):
+class PresentColumns(NamedTuple):
     """Which columns the senders of k batches gave.
 
     Attributes:
@@ -117,7 +117,7 @@ def decode(payload: bytes, encoding: str, kind: Kind) -> Batch:
     message = message_of(kind, payload, encoding)
     n = len(getattr(message, NEEDED[kind][0]))
     given = {name: np.array([len(getattr(message, name)) > 0]) for name in column_types(kind)}
-    sent = Sent(kind, np.array([n]), given)
+    sent = PresentColumns(kind, np.array([n]), given)
     columns = {name: _column(message, name, dtype, n) for name, dtype in column_types(kind).items()}
     numbers = (np.array([getattr(message, name)], np.int64) for name in ("boot", "region", "seq", "first_held"))
     boot, region, seq, first_held = numbers
@@ -162,7 +162,7 @@ def _check(message: Any, kind: Kind) -> None:  # noqa: ANN401
             raise WireError(name, f"has {given} records, {first} has {n}", "give every column the same length")
 
 
-def complete(found: Decoded, sent: Sent) -> Decoded:
+def complete(found: Decoded, sent: PresentColumns) -> Decoded:
     """Derive what follows from the pose; drop messages of which a number does not fit, or that have no place."""
     kind, columns = sent.kind, found.columns
     bad: dict[int, WireError] = {}
@@ -199,7 +199,7 @@ def complete(found: Decoded, sent: Sent) -> Decoded:
     )  # fmt: skip
 
 
-def _derive(columns: Columns, sent: Sent, unplaced: BoolArray) -> None:
+def _derive(columns: Columns, sent: PresentColumns, unplaced: BoolArray) -> None:
     """Fill what a sender of observations may leave out. `unplaced`: rows without a cell, at a finite position."""
     without = ~sent.records("leave_time")
     columns["leave_time"] = np.where(without, columns["enter_time"], columns["leave_time"])

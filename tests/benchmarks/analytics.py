@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -22,13 +23,13 @@ import pyarrow as pa
 import pyarrow.csv as pacsv
 
 from fleet_service.analytics import output, synthetic
-from fleet_service.analytics.engines import Engine
+from fleet_service.analytics.engines import QueryEngine
 from fleet_service.analytics.options import Options
 from fleet_service.analytics.questions import QUESTIONS
-from fleet_service.analytics.synthetic import DAY_S, START_NS, World
+from fleet_service.analytics.synthetic import DAY_S, START_NS, SyntheticFleet
 from fleet_service.archive import reading, rollup, segments, snapshots
 from fleet_service.archive.compaction import compact
-from fleet_service.archive.export import Part
+from fleet_service.archive.export import Extract
 from fleet_service.fusion import Fusion
 from fleet_service.replay.rebuild import Since, replay
 from fleet_service.serve.map_state import cell_table
@@ -44,8 +45,8 @@ FOLDER = Path(".analytics")
 ROWS, DAYS, ROUNDS, SEED = 10_000_000, 7, 3, 0
 TIMED = ("grip", "worst", "vehicles", "weather")
 CELLS_ASKED = 30
-SMALL = World(rows=24_000, days=2, vehicles=40, roads=8, length=60, icy=4)
-PART = Part(START_NS, START_NS + DAYS * DAY_S * 10**9)
+SMALL = SyntheticFleet(rows=24_000, days=2, vehicles=40, roads=8, length=60, icy=4)
+PART = Extract(START_NS, START_NS + DAYS * DAY_S * 10**9)
 HALF = START_NS + DAY_S * 10**9
 
 
@@ -82,7 +83,7 @@ def stations(folder: Path) -> Path:
 def archive(root: Path, rows: int) -> list[Figure]:
     """Rows per second of compaction, bytes of an observation."""
     tell(f"writing {rows:,} observations")
-    synthetic.write(root, World(rows, DAYS))
+    synthetic.write(root, SyntheticFleet(rows, DAYS))
     inbox = size_of(segments.paths(root, Kind.OBSERVATION))
     began = time.process_time()
     done = compact(root)
@@ -96,17 +97,22 @@ def archive(root: Path, rows: int) -> list[Figure]:
     ]
 
 
+def _ask(name: str, root: Path, options: Options) -> pa.Table:
+    """A question to an engine of its own."""
+    return QUESTIONS[name].ask(QueryEngine("duckdb", root, PART), options)
+
+
 def questions(root: Path, readings: Path) -> list[Figure]:
     """Seconds of four questions on all rows; milliseconds of the history of one cell."""
     found = []
     for name in TIMED:
         options = Options(stations=readings, say=lambda _: None)
         began = time.process_time()
-        spent = median_s(lambda name=name, options=options: QUESTIONS[name].ask(Engine("duckdb", root, PART), options))  # type: ignore[misc]
+        spent = median_s(partial(_ask, name, root, options))
         busy = (time.process_time() - began) / ROUNDS
         tell(f"{name}: {spent:.2f} s, {busy:.2f} s of CPU")
         found += [Figure(f"analytics.{name}_s", spent, "s", 5), Figure(f"analytics.{name}_cpu_s", busy, "s of CPU")]
-    t = Engine("duckdb", root, PART).observations()
+    t = QueryEngine("duckdb", root, PART).observations()
     cells = np.unique(next(reading.read(root, Kind.OBSERVATION, ["cell"]))["cell"].to_numpy())
     chosen = np.random.default_rng(SEED).choice(cells, CELLS_ASKED)
     columns = ("time", "vehicle", "mu", "mu_lower", "mu_upper", "mu_utilised")
@@ -154,7 +160,7 @@ def _geo_files(root: Path) -> Iterator[Path]:
     yield from (root / "map").rglob("*.parquet")
     for name in ("worst", "spells", "grip"):
         path = root.parent / f"{name}.geo.parquet"
-        answer = QUESTIONS[name].ask(Engine("duckdb", root, PART), Options(say=lambda _: None))
+        answer = QUESTIONS[name].ask(QueryEngine("duckdb", root, PART), Options(say=lambda _: None))
         output.write(answer, QUESTIONS[name], path)
         yield path
 
@@ -178,7 +184,7 @@ def _different(root: Path, readings: Path) -> int:
         if question.name == "replay":  # asks no engine
             continue
         options = Options(at=HALF, stations=readings, say=lambda _: None)
-        one, other = (question.ask(Engine(name, root, PART), options) for name in ("duckdb", "spark"))
+        one, other = (question.ask(QueryEngine(name, root, PART), options) for name in ("duckdb", "spark"))
         said = differs(one, other, question)
         tell(f"{question.name}: {said or 'the engines agree'}")
         count += said is not None

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from fleet_service.analytics import synthetic
-from fleet_service.analytics.synthetic import World
+from fleet_service.analytics.synthetic import SyntheticFleet
 from fleet_service.archive import segments
 from fleet_service.archive.compaction import compact
 from schemas import wire
@@ -18,7 +18,7 @@ from schemas.wire import Batch, Kind
 from tests.benchmarks.fabricated import visits
 from tests.benchmarks.measure import SEED, median_s
 
-WORLD: Final = World(500_000, days=1, seed=SEED)
+WORLD: Final = SyntheticFleet(500_000, days=1, seed=SEED)
 
 
 def contract() -> list[Figure]:

@@ -15,7 +15,7 @@ import zenoh
 
 from deploy.router import open_router
 from fleet_service.analytics import synthetic
-from fleet_service.analytics.synthetic import DAY_S, START_NS, World
+from fleet_service.analytics.synthetic import DAY_S, START_NS, SyntheticFleet
 from fleet_service.app.engine import Engine
 from fleet_service.app.service import Service
 from fleet_service.archive.compaction import compact
@@ -26,7 +26,7 @@ from schemas.runtime.figures import Figure
 from schemas.runtime.zenoh_session import open_session
 from tests.waiting import until
 
-WORLD = World(1_000_000, days=3)
+WORLD = SyntheticFleet(1_000_000, days=3)
 SIDE, QUERIES = 320, 15  # cells of a box's side: a thousand of them were visited
 
 
@@ -34,7 +34,7 @@ def past(root: Path, tell: Callable[[str], None]) -> list[Figure]:
     """Milliseconds of `at=` for a box of a thousand cells; largest change of a probability by a restart."""
     synthetic.write(root, WORLD)
     compact(root)
-    synthetic.write(root, World(20_000, 1, seed=1))  # rows that are not compacted yet
+    synthetic.write(root, SyntheticFleet(20_000, 1, seed=1))  # rows that are not compacted yet
     with closing(Engine(ServiceConfig(), root)) as engine:
         before = _beliefs(engine)
     with closing(Engine(ServiceConfig(), root)) as engine:

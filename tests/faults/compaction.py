@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 
 from fleet_service.archive import layout, reading
 from fleet_service.archive.compaction import compact
-from fleet_service.archive.log import Log
+from fleet_service.archive.log import SegmentLog
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind
 from tests.faults.bars import figure
@@ -39,7 +39,7 @@ class Writing:
 
     def __init__(self, root: Path) -> None:
         self.acknowledged = 0
-        self._log: Log[Batch] = Log(root, "shard")
+        self._log: SegmentLog[Batch] = SegmentLog(root, "shard")
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._write)
         self._thread.start()

@@ -23,9 +23,9 @@ import pyarrow as pa
 
 from fleet_service.archive import layout, load, reading, segments
 from fleet_service.archive.compaction import compact
-from fleet_service.archive.log import Log
+from fleet_service.archive.log import SegmentLog
 from fleet_service.archive.segments import Rows
-from fleet_service.ingest.dedup import Streams
+from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.replay.rebuild import restore_streams
 from schemas import grid
 from schemas.runtime.figures import Figure
@@ -94,8 +94,8 @@ class History:
 
     def _live(self, root: Path, last: bool) -> None:
         with suppress(OSError):  # a service that finds the disk full at its start says so and ends
-            log: Log[Batch] = Log(root, "shard")
-            streams = Streams()
+            log: SegmentLog[Batch] = SegmentLog(root, "shard")
+            streams = SequenceTrackers()
             restore_streams(root, streams)
             for _ in range(STEPS):
                 self._step(root, log, streams)
@@ -103,7 +103,7 @@ class History:
                 self._let_in(log, streams, self.sent)
                 self.acknowledged.update(log.flush())
 
-    def _step(self, root: Path, log: Log[Batch], streams: Streams) -> None:
+    def _step(self, root: Path, log: SegmentLog[Batch], streams: SequenceTrackers) -> None:
         chance = self.random.random()
         if chance < 0.45:
             new = [self._batch() for _ in range(self.random.randint(1, 3))]
@@ -121,7 +121,7 @@ class History:
         self.sent.append(Batch(kind, 1 + sum(batch.kind is kind for batch in self.sent)))
         return self.sent[-1]
 
-    def _let_in(self, log: Log[Batch], streams: Streams, batches: list[Batch]) -> None:
+    def _let_in(self, log: SegmentLog[Batch], streams: SequenceTrackers, batches: list[Batch]) -> None:
         for kind in Kind:
             stream = streams[VEHICLE, 1, kind, 1]
             new = [b for b in dict.fromkeys(batches) if b.kind is kind and not stream.admitted(b.seq)]
@@ -132,7 +132,7 @@ class History:
 
     def _problems(self, root: Path, last: bool) -> list[str]:
         """Of the archive as the next life finds it."""
-        streams = Streams()
+        streams = SequenceTrackers()
         with suppress(FileNotFoundError):
             restore_streams(root, streams)
         found: list[str] = []

@@ -18,7 +18,7 @@ import numpy as np
 from fleet_service.app.engine import Engine
 from fleet_service.archive import load, reading, segments
 from fleet_service.archive.pseudonyms import Pseudonyms, number
-from fleet_service.ingest.dedup import Streams
+from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay.rebuild import restore_streams
 from schemas import wire
@@ -93,7 +93,7 @@ def _expected(batches: Sequence[Batch]) -> set[tuple[int, int, float]]:
 def _lost(root: Path, batches: Sequence[Batch]) -> int:
     """Rows of older segments that are missing, and of the newest that count as held and are not, or are wrong."""
     held = {(seq, row, round(mu, 3)) for seq, row, mu in _rows(root)}
-    streams = Streams()
+    streams = SequenceTrackers()
     restore_streams(root, streams)
     vehicle = number(Pseudonyms(root / "keys").of("sim-001", int(batches[0].columns["enter_time"][0])))
     stream = streams[vehicle, batches[0].boot, Kind.OBSERVATION, batches[0].region]

@@ -18,7 +18,7 @@ from schemas.runtime.figures import Figure
 PRIOR_WIDTH: Final = 0.9 * 1.15  # of the 90 % interval of the uniform prior
 
 
-class Bar(NamedTuple):
+class EstimatorBar(NamedTuple):
     """A figure by name, how it is read from the results (NaN where not measured), its unit and its bar."""
 
     name: str
@@ -77,41 +77,41 @@ def width_ratio(results: Results) -> float:
 M_S, RAD_S, SHARE = "m/s", "rad/s", "1"
 BARS: Final = (
     *(
-        Bar(f"papers.004.{kind}.mae_{name}", noise(kind, f"mae_{name}"), unit, bar, "less")
+        EstimatorBar(f"papers.004.{kind}.mae_{name}", noise(kind, f"mae_{name}"), unit, bar, "less")
         for kind in ("constant", "variable")
         for name, unit, bar in (("vx", M_S, 0.002), ("vy", M_S, 0.007), ("yaw_rate", RAD_S, 0.002))
     ),
-    Bar("default.dlc.mu_error", of("default.dlc", "mu_error"), SHARE, 0.05, "less"),
-    Bar("default.dlc.coverage90", of("default.dlc", "end_coverage90"), SHARE, 0.85, "more"),
-    Bar("papers.001.rmse_vx", of("001.dlc", "rmse_vx"), M_S, 0.02, "less"),
-    Bar("papers.001.rmse_vy", of("001.dlc", "rmse_vy"), M_S, 0.01, "less"),
-    Bar("papers.001.rmse_beta", of("001.dlc", "rmse_beta"), "rad", 0.001, "less"),
-    Bar("papers.002.sine.rmse_vx", of("002.sine", "rmse_vx"), M_S, 0.03, "less"),
-    Bar("papers.002.sine.rmse_vy", of("002.sine", "rmse_vy"), M_S, 0.03, "less"),
-    Bar("papers.002.jturn.rmse_vx", of("002.jturn", "rmse_vx"), M_S, 0.03, "less"),
-    Bar("papers.002.jturn.rmse_vy", of("002.jturn", "rmse_vy"), M_S, 0.03, "less"),
-    Bar("papers.003.accel.mu_error", of("003.accel", "mu_error"), SHARE, 0.08, "less"),
-    Bar("papers.003.turn.mu_error", of("003.turn", "mu_error"), SHARE, 0.05, "less"),
-    Bar("papers.003.split.low_error", of("003.split", "low_error"), SHARE, 0.07, "less"),
-    Bar("papers.003.split.high_coverage90", of("003.split", "high_coverage90"), SHARE, 0.85, "more"),
-    Bar("papers.000.coverage90", of("000.jump", "coverage90"), SHARE, 0.87, "more"),
-    Bar("default.jump.accel_s", of("default.jump.accel", "arrival_s"), "s", 0.1, "less"),
-    Bar("default.jump.brake_s", of("default.jump.brake", "arrival_s"), "s", 0.25, "less"),
-    Bar("default.jump.false_per_hour", false_per_hour, "1/h", 1.0, "less"),
-    Bar("default.straight.width_ratio", width_ratio, SHARE, 0.8, "more"),
-    Bar("default.straight.coverage90", of("default.straight", "coverage90"), SHARE, 0.9, "more"),
-    Bar("default.foreign_tyres.coverage90", on_foreign_tyres, SHARE, 0.85, "more"),
-    Bar("default.abs.coverage90", both_stops, SHARE, 0.80, "more"),
-    Bar("default.spin.coverage90", of("default.spin", "coverage90"), SHARE, 0.80, "more"),
-    Bar("real_world.standing_5pct.v_max", in_the_world("standing_5pct.v_max"), M_S, 0.2, "less"),
-    Bar("real_world.false_ice", in_the_world("false_ice"), SHARE, 0.002, "less"),
-    Bar("real_world.below", in_the_world("below"), SHARE, 0.002, "less"),
-    Bar("real_world.coverage90", in_the_world("coverage90"), SHARE, 0.88, "more"),
+    EstimatorBar("default.dlc.mu_error", of("default.dlc", "mu_error"), SHARE, 0.05, "less"),
+    EstimatorBar("default.dlc.coverage90", of("default.dlc", "end_coverage90"), SHARE, 0.85, "more"),
+    EstimatorBar("papers.001.rmse_vx", of("001.dlc", "rmse_vx"), M_S, 0.02, "less"),
+    EstimatorBar("papers.001.rmse_vy", of("001.dlc", "rmse_vy"), M_S, 0.01, "less"),
+    EstimatorBar("papers.001.rmse_beta", of("001.dlc", "rmse_beta"), "rad", 0.001, "less"),
+    EstimatorBar("papers.002.sine.rmse_vx", of("002.sine", "rmse_vx"), M_S, 0.03, "less"),
+    EstimatorBar("papers.002.sine.rmse_vy", of("002.sine", "rmse_vy"), M_S, 0.03, "less"),
+    EstimatorBar("papers.002.jturn.rmse_vx", of("002.jturn", "rmse_vx"), M_S, 0.03, "less"),
+    EstimatorBar("papers.002.jturn.rmse_vy", of("002.jturn", "rmse_vy"), M_S, 0.03, "less"),
+    EstimatorBar("papers.003.accel.mu_error", of("003.accel", "mu_error"), SHARE, 0.08, "less"),
+    EstimatorBar("papers.003.turn.mu_error", of("003.turn", "mu_error"), SHARE, 0.05, "less"),
+    EstimatorBar("papers.003.split.low_error", of("003.split", "low_error"), SHARE, 0.07, "less"),
+    EstimatorBar("papers.003.split.high_coverage90", of("003.split", "high_coverage90"), SHARE, 0.85, "more"),
+    EstimatorBar("papers.000.coverage90", of("000.jump", "coverage90"), SHARE, 0.87, "more"),
+    EstimatorBar("default.jump.accel_s", of("default.jump.accel", "arrival_s"), "s", 0.1, "less"),
+    EstimatorBar("default.jump.brake_s", of("default.jump.brake", "arrival_s"), "s", 0.25, "less"),
+    EstimatorBar("default.jump.false_per_hour", false_per_hour, "1/h", 1.0, "less"),
+    EstimatorBar("default.straight.width_ratio", width_ratio, SHARE, 0.8, "more"),
+    EstimatorBar("default.straight.coverage90", of("default.straight", "coverage90"), SHARE, 0.9, "more"),
+    EstimatorBar("default.foreign_tyres.coverage90", on_foreign_tyres, SHARE, 0.85, "more"),
+    EstimatorBar("default.abs.coverage90", both_stops, SHARE, 0.80, "more"),
+    EstimatorBar("default.spin.coverage90", of("default.spin", "coverage90"), SHARE, 0.80, "more"),
+    EstimatorBar("real_world.standing_5pct.v_max", in_the_world("standing_5pct.v_max"), M_S, 0.2, "less"),
+    EstimatorBar("real_world.false_ice", in_the_world("false_ice"), SHARE, 0.002, "less"),
+    EstimatorBar("real_world.below", in_the_world("below"), SHARE, 0.002, "less"),
+    EstimatorBar("real_world.coverage90", in_the_world("coverage90"), SHARE, 0.88, "more"),
     *(
-        Bar(f"real_world.coverage90.{name}", in_the_world(f"coverage90.{name}"), SHARE, 0.80, "more")
+        EstimatorBar(f"real_world.coverage90.{name}", in_the_world(f"coverage90.{name}"), SHARE, 0.80, "more")
         for name in SURFACES
     ),
-    Bar("real_world.width", in_the_world("width"), SHARE, 0.5, "less"),
+    EstimatorBar("real_world.width", in_the_world("width"), SHARE, 0.5, "less"),
 )
 
 UNITS: Final = {

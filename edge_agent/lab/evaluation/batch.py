@@ -21,7 +21,7 @@ FINE_HZ = 500.0  # steering is held over a sample of the simulator; a slow senso
 
 
 @dataclass(frozen=True)
-class Scenario:
+class TestDrive:
     """A manoeuvre of a paper, or of the default estimator's bars: vehicle, speed [m/s], friction, rate, length.
 
     road, slope: relief by name and a lasting slope upon it; torque: whether it is recorded.
@@ -40,7 +40,7 @@ class Scenario:
 
 
 @dataclass(frozen=True)
-class Batch:
+class DriveSet:
     """N drives: t (T, N) [s], signals (T, N, 18), truth by name (T, N), nominal vehicles."""
 
     t: FloatArray
@@ -63,18 +63,18 @@ class Batch:
         return slice(int(np.searchsorted(self.t[:, 0], self.t[-1, 0] - seconds)), None)
 
 
-def realistic(scenario: Scenario, seeds: Sequence[int], sensors: str = USUAL) -> Batch:
+def realistic(scenario: TestDrive, seeds: Sequence[int], sensors: str = USUAL) -> DriveSet:
     """One drive per seed with ordinary sensors, of a vehicle known to a few per cent."""
     return joined([_drive(scenario, seed, sensors, 1) for seed in seeds])
 
 
-def ideal(scenario: Scenario) -> Batch:
+def ideal(scenario: TestDrive) -> DriveSet:
     """One drive with sensors without error, of a vehicle known exactly; simulated finely, sampled at the rate."""
     step = max(1, round(FINE_HZ / scenario.rate_hz))
     return joined([_drive(replace(scenario, rate_hz=scenario.rate_hz * step), 0, "ideal", step)])
 
 
-def _drive(scenario: Scenario, seed: int, sensors: str, step: int) -> tuple[pa.Table, Vehicle]:
+def _drive(scenario: TestDrive, seed: int, sensors: str, step: int) -> tuple[pa.Table, Vehicle]:
     log, vehicle = simulate_manoeuvre(
         scenario.manoeuvre, mu=scenario.mu, speed=scenario.speed, seed=seed, rate_hz=scenario.rate_hz,
         duration_s=scenario.duration_s, vehicle=scenario.vehicle, sensors=sensors, road=scenario.road,
@@ -83,7 +83,7 @@ def _drive(scenario: Scenario, seed: int, sensors: str, step: int) -> tuple[pa.T
     return log.take(np.arange(0, len(log), step)), vehicle
 
 
-def joined(drives: Sequence[tuple[pa.Table, Vehicle]]) -> Batch:
+def joined(drives: Sequence[tuple[pa.Table, Vehicle]]) -> DriveSet:
     """Drives of one length side by side."""
 
     def column(name: str) -> FloatArray:
@@ -91,17 +91,17 @@ def joined(drives: Sequence[tuple[pa.Table, Vehicle]]) -> Batch:
 
     names = [name for name in drives[0][0].column_names if name.startswith("true_")]
     signals = np.stack([column(name) for name in CHANNELS], axis=-1)
-    return Batch(column("t"), signals, {name: column(name) for name in names}, [vehicle for _, vehicle in drives])
+    return DriveSet(column("t"), signals, {name: column(name) for name in names}, [vehicle for _, vehicle in drives])
 
 
-def repeated(batch: Batch, count: int) -> Batch:
+def repeated(batch: DriveSet, count: int) -> DriveSet:
     """The one drive of a batch `count` times, for noise to be laid on it."""
     truth = {name: np.repeat(value, count, axis=1) for name, value in batch.truth.items()}
-    return Batch(
+    return DriveSet(
         np.repeat(batch.t, count, axis=1), np.repeat(batch.signals, count, axis=1), truth, batch.vehicles * count
     )
 
 
-def estimates(bank: EstimatorBank, batch: Batch) -> Estimates:
+def estimates(bank: EstimatorBank, batch: DriveSet) -> Estimates:
     """What the bank says of the drives."""
     return bank.advance(batch.t, batch.signals)

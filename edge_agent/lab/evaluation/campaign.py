@@ -10,10 +10,10 @@ import numpy as np
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import ESTIMATORS, Estimates, EstimatorBank, adaptive_federated_ckf, compensated_wckf
 from edge_agent.lab.evaluation import faults, real_world
-from edge_agent.lab.evaluation.batch import Batch, estimates, ideal, realistic, repeated
+from edge_agent.lab.evaluation.batch import DriveSet, estimates, ideal, realistic, repeated
 from edge_agent.lab.evaluation.measures import arrival, consistency, false_changes, measures, sides
 from edge_agent.lab.evaluation.paper_004 import experiments
-from edge_agent.lab.evaluation.real_world import World
+from edge_agent.lab.evaluation.real_world import RealWorldResults
 from edge_agent.lab.evaluation.reliability import watched
 from edge_agent.lab.evaluation.scenarios import FOREIGN, OTHERS, PAPERS, VEHICLES, foreign
 from schemas.numeric import FloatArray
@@ -26,10 +26,10 @@ FAULTY_SEEDS = 4  # drives per manoeuvre under each sensor fault: three manoeuvr
 
 
 @dataclass(frozen=True)
-class Drive:
+class PlottedDrive:
     """The first drive of a scenario and what was said of it, kept for plots."""
 
-    batch: Batch
+    batch: DriveSet
     said: Estimates
 
 
@@ -43,10 +43,10 @@ class Results:
     foreign: dict[str, FloatArray] = field(default_factory=dict)  # coverage of the default, by kind of tyre
     faults: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)  # by (fault, estimator)
     world: dict[str, dict[str, float]] = field(default_factory=dict)  # the rough one: by estimator and "baseline"
-    rough: World | None = None  # its first town, kept for plots
+    rough: RealWorldResults | None = None  # its first town, kept for plots
     ranks: dict[str, list[FloatArray]] = field(default_factory=dict)  # of the truth in the posterior, by estimator
     seeds: int = 0
-    drives: dict[tuple[str, str], Drive] = field(default_factory=dict)
+    drives: dict[tuple[str, str], PlottedDrive] = field(default_factory=dict)
 
 
 def run(seeds: Sequence[int], *, quick: bool, tell: Callable[[str], None]) -> Results:
@@ -55,7 +55,7 @@ def run(seeds: Sequence[int], *, quick: bool, tell: Callable[[str], None]) -> Re
     names = QUICK_ESTIMATORS if quick else tuple(ESTIMATORS)
     results.noise, plotted = experiments(seeds)
     for key, (batch, said) in plotted.items():
-        results.drives[key, "paper-aco-fckf"] = Drive(batch, said)
+        results.drives[key, "paper-aco-fckf"] = PlottedDrive(batch, said)
     tell("paper 004, its two noise experiments")
     for name, scenario in (PAPERS | OTHERS | VEHICLES).items():
         if quick and name not in QUICK_SCENARIOS:
@@ -66,7 +66,7 @@ def run(seeds: Sequence[int], *, quick: bool, tell: Callable[[str], None]) -> Re
             said, ranks = watched(bank_of(estimator, batch.vehicles), batch)
             results.real[name, estimator] = _all(name, batch, said) | consistency(batch, said)
             results.ranks.setdefault(estimator, []).append(ranks.ravel())
-            results.drives[name, estimator] = Drive(batch, said)
+            results.drives[name, estimator] = PlottedDrive(batch, said)
             if exact is not None:
                 results.ideal[name, estimator] = _all(name, exact, estimates(_as_in_paper(estimator, exact), exact))
         tell(f"{name}: {scenario.about or scenario.manoeuvre}, {len(seeds)} drives")
@@ -81,7 +81,7 @@ def run(seeds: Sequence[int], *, quick: bool, tell: Callable[[str], None]) -> Re
     return results
 
 
-def _as_in_paper(estimator: str, batch: Batch) -> EstimatorBank:
+def _as_in_paper(estimator: str, batch: DriveSet) -> EstimatorBank:
     """The bank for a paper's own conditions: where friction is set by hand, it is set to the truth of the start."""
     friction = float(batch.mu[0, 0])
     if estimator == "adaptive-federated-ckf":
@@ -91,7 +91,7 @@ def _as_in_paper(estimator: str, batch: Batch) -> EstimatorBank:
     return bank_of(estimator, batch.vehicles)
 
 
-def _all(name: str, batch: Batch, said: Estimates) -> dict[str, FloatArray]:
+def _all(name: str, batch: DriveSet, said: Estimates) -> dict[str, FloatArray]:
     found = measures(batch, said)
     if "split" in name:
         found |= sides(batch, said)

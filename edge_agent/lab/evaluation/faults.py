@@ -13,7 +13,7 @@ import numpy as np
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates
-from edge_agent.lab.evaluation.batch import Batch, Scenario, estimates, realistic
+from edge_agent.lab.evaluation.batch import DriveSet, TestDrive, estimates, realistic
 from edge_agent.lab.evaluation.measures import covered, errors
 from edge_agent.lab.evaluation.scenarios import SEDAN
 from edge_agent.lab.simulation import Fault
@@ -24,9 +24,9 @@ from schemas.signals import Health
 
 BEGINS, ENDS = 2.0, 5.0  # [s]
 DRIVES: Final = {
-    "slalom": Scenario("slalom", SEDAN, 0.30, kmh(30), duration_s=8.0),
-    "lane change": Scenario("double-lane-change", SEDAN, 0.85, kmh(80), duration_s=8.0),
-    "braking": Scenario("moderate-braking", SEDAN, jump(0.85, 0.50, 60.0), kmh(80), duration_s=6.0),
+    "slalom": TestDrive("slalom", SEDAN, 0.30, kmh(30), duration_s=8.0),
+    "lane change": TestDrive("double-lane-change", SEDAN, 0.85, kmh(80), duration_s=8.0),
+    "braking": TestDrive("moderate-braking", SEDAN, jump(0.85, 0.50, 60.0), kmh(80), duration_s=6.0),
 }
 
 
@@ -103,13 +103,13 @@ CASES: Final = {
 }  # fmt: skip
 
 
-def harmed(batch: Batch, case: Case) -> Batch:
+def harmed(batch: DriveSet, case: Case) -> DriveSet:
     """The drives with the fault in their signals and on their clock."""
     each = [apply_faults(batch.t[:, n], batch.signals[:, n], case.faults) for n in range(batch.t.shape[1])]
     return replace(batch, t=case.clock(batch.t), signals=np.stack(each, axis=1))
 
 
-def outcome(batch: Batch, said: Estimates, case: Case) -> dict[str, FloatArray]:
+def outcome(batch: DriveSet, said: Estimates, case: Case) -> dict[str, FloatArray]:
     """What is measured of a case, per drive: `finite`, `told` (1 or 0), coverage and width from BEGINS on, RMSE."""
     after = batch.t[:, 0] >= BEGINS
     whole = np.isfinite(said.told).all(axis=-1)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from edge_agent.estimators import Estimates
-from edge_agent.lab.evaluation.batch import Batch
+from edge_agent.lab.evaluation.batch import DriveSet
 from schemas.numeric import BoolArray, FloatArray
 
 LAST_S = 1.0  # "the last second"
@@ -20,7 +20,7 @@ SLOWEST_M_S = 1.0
 COMPONENTS = {"nees": 2, "nis": 3}  # independent squares in each; no estimator measures fewer than three rows
 
 
-def errors(batch: Batch, said: Estimates) -> dict[str, FloatArray]:
+def errors(batch: DriveSet, said: Estimates) -> dict[str, FloatArray]:
     """Errors (T, N) of the motion: vx, vy [m/s], yaw_rate [rad/s], beta [rad]."""
     truth = batch.truth
     beta = np.arctan2(truth["true_vy"], np.maximum(truth["true_vx"], SLOWEST_M_S))
@@ -32,12 +32,12 @@ def errors(batch: Batch, said: Estimates) -> dict[str, FloatArray]:
     }
 
 
-def covered(batch: Batch, said: Estimates) -> BoolArray:
+def covered(batch: DriveSet, said: Estimates) -> BoolArray:
     """Whether the 90 % interval holds the mean friction, (T, N)."""
     return np.asarray((said.mu_lower <= batch.mu) & (batch.mu <= said.mu_upper))
 
 
-def measures(batch: Batch, said: Estimates) -> dict[str, FloatArray]:
+def measures(batch: DriveSet, said: Estimates) -> dict[str, FloatArray]:
     """All measures that every drive has."""
     end = batch.last(LAST_S)
     found: dict[str, FloatArray] = {}
@@ -55,7 +55,7 @@ def measures(batch: Batch, said: Estimates) -> dict[str, FloatArray]:
     return found
 
 
-def nees(batch: Batch, said: Estimates) -> FloatArray:
+def nees(batch: DriveSet, said: Estimates) -> FloatArray:
     """Squared error of (v_x, v_y) over its stated variance, per component, (T, N)."""
     off = errors(batch, said)
     return np.asarray(0.5 * ((off["vx"] / said.vx_std) ** 2 + (off["vy"] / said.vy_std) ** 2))
@@ -69,7 +69,7 @@ def bounds(measure: str, drives: int) -> tuple[float, float]:
     return float(chi2.ppf(0.025, count)) / count, float(chi2.ppf(0.975, count)) / count
 
 
-def consistency(batch: Batch, said: Estimates) -> dict[str, FloatArray]:
+def consistency(batch: DriveSet, said: Estimates) -> dict[str, FloatArray]:
     """Share of instants whose mean NEES, and NIS, over the drives lies within its bounds, (1,) each."""
     found = {}
     for name, value in (("nees", nees(batch, said)), ("nis", said.innovation_nis)):
@@ -79,7 +79,7 @@ def consistency(batch: Batch, said: Estimates) -> dict[str, FloatArray]:
     return found
 
 
-def sides(batch: Batch, said: Estimates) -> dict[str, FloatArray]:
+def sides(batch: DriveSet, said: Estimates) -> dict[str, FloatArray]:
     """Of split friction, in the last second: error of the lower side, coverage of the higher."""
     end, truth = batch.last(LAST_S), batch.mu_wheel
     told = said.mu_wheel
@@ -95,7 +95,7 @@ def sides(batch: Batch, said: Estimates) -> dict[str, FloatArray]:
     }
 
 
-def arrival(batch: Batch, said: Estimates) -> FloatArray:
+def arrival(batch: DriveSet, said: Estimates) -> FloatArray:
     """Seconds from the change of friction until mu is within NEAR of it; what never arrives counts to the end."""
     changed = batch.mu == batch.mu[-1]
     seconds = np.empty(batch.t.shape[1])
@@ -107,7 +107,7 @@ def arrival(batch: Batch, said: Estimates) -> FloatArray:
     return seconds
 
 
-def false_changes(batch: Batch, said: Estimates) -> FloatArray:
+def false_changes(batch: DriveSet, said: Estimates) -> FloatArray:
     """How often the interval lies more than NEAR beside an unchanged friction for HOLD_S or longer, per drive."""
     wrong = (said.mu_upper < batch.mu - NEAR) | (said.mu_lower > batch.mu + NEAR)
     hold = max(1, round(HOLD_S / float(batch.t[1, 0] - batch.t[0, 0])))

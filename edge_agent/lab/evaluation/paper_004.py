@@ -15,7 +15,7 @@ from edge_agent.adaptation.memberships import Memberships
 from edge_agent.app.tuned_memberships import shipped
 from edge_agent.estimators import TUNED, Estimates
 from edge_agent.estimators.paper_aco_fckf import AT_THE_TRUTH, bank
-from edge_agent.lab.evaluation.batch import Batch, estimates, ideal, repeated
+from edge_agent.lab.evaluation.batch import DriveSet, estimates, ideal, repeated
 from edge_agent.lab.evaluation.measures import measures
 from edge_agent.lab.evaluation.scenarios import MATCHED, PAPERS, SEDAN
 from edge_agent.lab.simulation import PRESETS
@@ -30,7 +30,7 @@ EXPERIMENTS = {
 STILL = Memberships(outputs=(0.0,) * 5)  # fuzzy sets that leave R as it is
 
 
-def noisy(batch: Batch, variance: FloatArray, seeds: Sequence[int]) -> Batch:
+def noisy(batch: DriveSet, variance: FloatArray, seeds: Sequence[int]) -> DriveSet:
     """One copy of the drive per seed, with white noise of variance (T,) on a_x, a_y and r."""
     copies = repeated(batch, len(seeds))
     for n, seed in enumerate(seeds):
@@ -45,7 +45,7 @@ def variances(t: FloatArray, experiment: str) -> FloatArray:
 
 def experiments(
     seeds: Sequence[int],
-) -> tuple[dict[tuple[str, str], dict[str, FloatArray]], dict[str, tuple[Batch, Estimates]]]:
+) -> tuple[dict[tuple[str, str], dict[str, FloatArray]], dict[str, tuple[DriveSet, Estimates]]]:
     """(measures per drive by experiment and filter, drives for plots by experiment).
 
     "sedan" and "van" are "constant" with the simulator's own plants, and with ".variable" the other. The filters are

@@ -11,9 +11,9 @@ import numpy as np
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.app.tuned_memberships import shipped
 from edge_agent.estimators import TUNED
-from edge_agent.lab.evaluation.campaign import DEFAULT, Drive, Results
+from edge_agent.lab.evaluation.campaign import DEFAULT, PlottedDrive, Results
 from edge_agent.lab.evaluation.measures import bounds, nees
-from edge_agent.lab.evaluation.real_world import SURFACES, World
+from edge_agent.lab.evaluation.real_world import SURFACES, RealWorldResults
 from schemas.runtime.figures import Figure
 from schemas.signals import Health, S
 
@@ -41,7 +41,7 @@ def draw(results: Results, figures: Sequence[Figure], folder: Path) -> list[Path
     ]
 
 
-def _scenario(scenario: str, drives: dict[str, Drive], path: Path) -> Path:
+def _scenario(scenario: str, drives: dict[str, PlottedDrive], path: Path) -> Path:
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(6, 1, figsize=(9, 14), sharex=True, layout="constrained")
@@ -74,7 +74,7 @@ def _scenario(scenario: str, drives: dict[str, Drive], path: Path) -> Path:
     return path
 
 
-def _rough(world: World, path: Path) -> Path:
+def _rough(world: RealWorldResults, path: Path) -> Path:
     """One rough car in a hilly town: speed beside the wheels', slope, friction with the default's interval, health."""
     from matplotlib import pyplot as plt
 

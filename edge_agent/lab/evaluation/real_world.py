@@ -21,7 +21,7 @@ import numpy as np
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates
-from edge_agent.lab.evaluation.batch import USUAL, Batch, Scenario, estimates, realistic
+from edge_agent.lab.evaluation.batch import USUAL, DriveSet, TestDrive, estimates, realistic
 from edge_agent.lab.evaluation.measures import covered, errors
 from edge_agent.lab.simulation import PRESETS, SimulatedFleet
 from edge_agent.lab.simulation.scenarios import drawn
@@ -65,17 +65,17 @@ class Tally:
         }
 
 
-def town(seed: int, cars: int, seconds: float) -> tuple[Batch, FloatArray]:
+def town(seed: int, cars: int, seconds: float) -> tuple[DriveSet, FloatArray]:
     """Rough cars in a town that the seed draws, and the largest share of the grip they use (T, N)."""
     fleet = SimulatedFleet(drawn(seed), cars, seed, RATE_HZ, rough=1.0)
     t, signals = fleet.step(round(seconds * RATE_HZ))
     true = fleet.truth
     truth = {f"true_{name}": getattr(true, name) for name in ("vx", "vy", "yaw_rate", "ax", "ay", "slope")}
     truth |= {name: true.mu_wheel[..., i] for i, name in enumerate(per_wheel("true_mu"))}
-    return Batch(t, signals, truth, fleet.vehicles), true.utilisation.max(axis=-1)
+    return DriveSet(t, signals, truth, fleet.vehicles), true.utilisation.max(axis=-1)
 
 
-def in_use(batch: Batch) -> FloatArray:
+def in_use(batch: DriveSet) -> FloatArray:
     """Grip that the car as a whole uses, smoothed and a little less for noise, (T, N)."""
     used = np.hypot(batch.truth["true_ax"], batch.truth["true_ay"]) / GRAVITY
     width = max(1, round(SMOOTH_S * RATE_HZ))
@@ -95,7 +95,7 @@ def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> F
     return np.asarray(upper - lower + MISS * (np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0)))
 
 
-def count(tally: Tally, batch: Batch, said: Estimates, used: FloatArray) -> None:
+def count(tally: Tally, batch: DriveSet, said: Estimates, used: FloatArray) -> None:
     """Add one town to the tally of an estimator."""
     mu, inside, width = batch.mu, covered(batch, said), said.mu_upper - said.mu_lower
     excited = lately(used) >= EXCITED_SHARE
@@ -116,7 +116,7 @@ def count(tally: Tally, batch: Batch, said: Estimates, used: FloatArray) -> None
     tally.add("lost", np.abs(off["vx"]) > LOST_M_S)
 
 
-def baseline(tally: Tally, batch: Batch) -> None:
+def baseline(tally: Tally, batch: DriveSet) -> None:
     """What the prior scores, and what the mean of four wheels makes of v_x."""
     radius = np.array([vehicle.wheel_radius for vehicle in batch.vehicles])
     off = radius * np.nanmean(batch.signals[:, :, S.OMEGA : S.OMEGA + 4], axis=-1) - batch.truth["true_vx"]
@@ -126,39 +126,39 @@ def baseline(tally: Tally, batch: Batch) -> None:
     tally.add("score", interval_score(lower, upper, batch.mu))
 
 
-def standing(slope: float, seeds: Sequence[int], seconds: float) -> list[Batch]:
+def standing(slope: float, seeds: Sequence[int], seconds: float) -> list[DriveSet]:
     """Cars that stand on the slope: each seed another, with ordinary sensors, and with rough ones without torque."""
     batches = []
     for sensors in (USUAL, "rough"):
         for k, preset in enumerate(PRESETS.values()):
-            drive = Scenario("standing", preset, duration_s=seconds, slope=slope, torque=sensors == USUAL)
+            drive = TestDrive("standing", preset, duration_s=seconds, slope=slope, torque=sensors == USUAL)
             batches.append(realistic(drive, seeds[k :: len(PRESETS)] or seeds[:1], sensors))
     return batches
 
 
-def fastest(estimator: str, batches: Sequence[Batch]) -> float:
+def fastest(estimator: str, batches: Sequence[DriveSet]) -> float:
     """Largest speed [m/s], in any direction, that the estimator gives to any of the cars."""
     said = [estimates(bank_of(estimator, batch.vehicles), batch) for batch in batches]
     return max(float(np.hypot(each.vx, each.vy).max()) for each in said)
 
 
 @dataclass
-class World:
+class RealWorldResults:
     """Figures by estimator, and "baseline" (the wheels' speed, the prior's interval), then by name; a drive to plot."""
 
     found: dict[str, dict[str, float]]
-    batch: Batch
+    batch: DriveSet
     said: dict[str, Estimates]
 
 
-def campaign(seeds: Sequence[int], estimators: Sequence[str], *, quick: bool) -> World:
+def campaign(seeds: Sequence[int], estimators: Sequence[str], *, quick: bool) -> RealWorldResults:
     """Towns of rough cars, and cars that stand on slopes, for every estimator; the first town is kept for plots."""
     cars, seconds, towns = (4, 15.0, 1) if quick else (TOWN_CARS, TOWN_S, TOWNS)
     tallies, world = {name: Tally() for name in (*estimators, "baseline")}, None
     for seed in seeds[:towns]:
         batch, used = town(seed, cars, seconds)
         baseline(tallies["baseline"], batch)
-        world = world or World({}, batch, {})
+        world = world or RealWorldResults({}, batch, {})
         for name in estimators:
             said = estimates(bank_of(name, batch.vehicles), batch)
             count(tallies[name], batch, said, used)

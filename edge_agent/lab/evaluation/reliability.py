@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from edge_agent.estimators import Estimates, EstimatorBank
-from edge_agent.lab.evaluation.batch import Batch
+from edge_agent.lab.evaluation.batch import DriveSet
 from schemas.mugrid import BINS, LOWER, UPPER
 from schemas.numeric import FloatArray
 
@@ -25,7 +25,7 @@ PRIOR_WIDTH: Final = 0.9 * (UPPER - LOWER)  # of its 90 % interval
 EDGES: Final = np.linspace(LOWER, UPPER, BINS + 1)
 
 
-def watched(bank: EstimatorBank, batch: Batch) -> tuple[Estimates, FloatArray]:
+def watched(bank: EstimatorBank, batch: DriveSet) -> tuple[Estimates, FloatArray]:
     """What the bank says of the drives, and the rank of the truth in its posterior once every EVERY_S, (K, N)."""
     samples = len(batch.t)
     step = max(1, round(EVERY_S / float(batch.t[1, 0] - batch.t[0, 0])))
@@ -42,7 +42,7 @@ def joined(parts: list[Estimates]) -> Estimates:
     return Estimates(np.concatenate([part.told for part in parts]))
 
 
-def _rank(bank: EstimatorBank, batch: Batch, now: int, said: Estimates) -> FloatArray:
+def _rank(bank: EstimatorBank, batch: DriveSet, now: int, said: Estimates) -> FloatArray:
     """Share of the posterior below the true friction of the sample before `now`, (N,)."""
     truth = batch.mu[now - 1]
     closes = np.ones((1, len(truth)), np.bool_)

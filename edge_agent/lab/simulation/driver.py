@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from edge_agent.dynamics.parameters import P
 from edge_agent.lab.simulation.chance import uniform
 from edge_agent.lab.simulation.friction import F, look_up
-from edge_agent.lab.simulation.plant import W, X, strongest_pull
+from edge_agent.lab.simulation.plant import Body, W, strongest_pull
 from edge_agent.lab.simulation.roads import L
 from schemas.numeric import FloatArray, IntArray
 from schemas.runtime.jit import compiled
@@ -99,7 +99,7 @@ def follow(x: FloatArray, g: IntArray, lanes: Lanes, key: Key) -> float:
     while True:
         lane, point = g[G.LANE], g[G.POINT]
         row = points[first[lane] + point]
-        along = (x[X.X] - row[L.X]) * row[L.COS] + (x[X.Y] - row[L.Y]) * row[L.SIN]
+        along = (x[Body.X] - row[L.X]) * row[L.COS] + (x[Body.Y] - row[L.Y]) * row[L.SIN]
         if not along > 0.0:
             return float(min(-along, spacing[lane]))
         if point + 1 < size[lane]:
@@ -173,7 +173,7 @@ def wished_acceleration(
     x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float, key: Key
 ) -> float:
     """Longitudinal acceleration [m/s^2] that he asks for."""
-    vx, q = x[X.VX], budget(d)
+    vx, q = x[Body.VX], budget(d)
     reach = max(2.0, 0.5 * vx)
     lane = g[G.LANE]
     row, beyond = ahead(d, g, lanes, reach)
@@ -185,7 +185,7 @@ def wished_acceleration(
         there += (lanes[0][row + 1, L.PROFILE + g[G.WAY]] - there) * beyond / lanes[3][lane]
     aim = min(q * there, cruise(d) ** 2)
     wish = (max(aim, SLOWEST**2) - vx * vx) / (2.0 * reach)
-    across = min(abs(vx * x[X.YAW_RATE]) / q, 1.0)
+    across = min(abs(vx * x[Body.YAW_RATE]) / q, 1.0)
     room = math.sqrt(1.0 - across * across)  # what cornering leaves of the budget
     driven = max(p[P.DRIVE_FRONT], 1.0 - p[P.DRIVE_FRONT])  # share of the pull on an axle that carries half the vehicle
     gas = min(PULL * d[D.BELIEF] * GRAVITY * min(1.0, 0.5 / driven), 0.8 * q, strongest_pull(p, vx) / p[P.MASS])
@@ -209,18 +209,18 @@ def wished_force(p: FloatArray, d: FloatArray, vx: float, acceleration: float, a
 @compiled
 def wished_steer(x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float) -> float:
     """Mean road-wheel angle [rad] of the circle through a point ahead, as far as the front tyres follow."""
-    vx, base = max(x[X.VX], SLOWEST), p[P.TO_FRONT] + p[P.TO_REAR]
+    vx, base = max(x[Body.VX], SLOWEST), p[P.TO_FRONT] + p[P.TO_REAR]
     number, beyond = ahead(d, g, lanes, 2.5 + 0.45 * vx)
     row = lanes[0][number]
     offset = d[D.WOBBLE] * math.sin(2.0 * math.pi * WOBBLE_HZ * t + 1e3 * d[D.WOBBLE])
-    dx = row[L.X] + row[L.COS] * beyond - row[L.SIN] * offset - x[X.X]
-    dy = row[L.Y] + row[L.SIN] * beyond + row[L.COS] * offset - x[X.Y]
-    c, s = math.cos(x[X.YAW]), math.sin(x[X.YAW])
+    dx = row[L.X] + row[L.COS] * beyond - row[L.SIN] * offset - x[Body.X]
+    dy = row[L.Y] + row[L.SIN] * beyond + row[L.COS] * offset - x[Body.Y]
+    c, s = math.cos(x[Body.YAW]), math.sin(x[Body.YAW])
     forward, left = c * dx + s * dy + p[P.TO_REAR], c * dy - s * dx
     if forward < 0.0:  # spun round: turn about, or the point stays straight behind for ever
         return math.copysign(LARGEST_STEER, left)
     steer = math.atan(2.0 * base * left / max(forward * forward + left * left, 1.0))
-    drift = math.atan2(x[X.VY] + p[P.TO_FRONT] * x[X.YAW_RATE], vx)
+    drift = math.atan2(x[Body.VY] + p[P.TO_FRONT] * x[Body.YAW_RATE], vx)
     steer = min(max(steer, drift - LARGEST_SLIP_ANGLE), drift + LARGEST_SLIP_ANGLE)
     return min(max(steer, -LARGEST_STEER), LARGEST_STEER)
 
@@ -239,12 +239,12 @@ def drive(
     lanes, friction = world
     t, dt, along = now
     d[D.SHORT] = follow(x, g, lanes, keys[0])
-    number, _ = ahead(d, g, lanes, max(LOOKING_S * x[X.VX], 0.0))
+    number, _ = ahead(d, g, lanes, max(LOOKING_S * x[Body.VX], 0.0))
     point = lanes[0][number]
     believe(d, look_up(friction, F.LOOKS, t, point[L.X], point[L.Y]), w, dt)
     acceleration = wished_acceleration(x, d, g, lanes, p, t, keys[1])
-    force = wished_force(p, d, x[X.VX], acceleration, along)
-    if x[X.VX] < RESTING and stops(t, d[D.STOPS], keys[1]):
+    force = wished_force(p, d, x[Body.VX], acceleration, along)
+    if x[Body.VX] < RESTING and stops(t, d[D.STOPS], keys[1]):
         force = -p[P.MASS] * (STOPPING * budget(d) + abs(along))
     d[D.FORCE] += (force - d[D.FORCE]) * -math.expm1(-dt / FOOT_S)
     d[D.STEER] += (wished_steer(x, d, g, lanes, p, t) - d[D.STEER]) * -math.expm1(-dt / ARMS_S)

@@ -15,10 +15,10 @@ from edge_agent.lab.simulation.plant import (
     INPUTS,
     RECORD,
     STATES,
+    Body,
     R,
     U,
     W,
-    X,
     advance,
     command,
     gravity,
@@ -83,8 +83,8 @@ def run(
         for k in range(steps):
             t = (first + k) * period
             lane = lanes[0][lanes[1][g[G.LANE]] + g[G.POINT]]
-            east, north = gradient(relief, (x[X.X], x[X.Y]), (lane[L.COS], lane[L.SIN]), lane[L.CURVATURE])
-            u[U.TILT, 0], u[U.TILT, 1] = tilt(east, north, x[X.YAW])
+            east, north = gradient(relief, (x[Body.X], x[Body.Y]), (lane[L.COS], lane[L.SIN]), lane[L.CURVATURE])
+            u[U.TILT, 0], u[U.TILT, 1] = tilt(east, north, x[Body.YAW])
             now = (t, period, gravity(u)[0])
             drive(x, (d, g), (lanes, friction), p, w, now, (keys[0][n], keys[1][n]))
             command(p, u, d[D.STEER], d[D.FORCE])

@@ -49,7 +49,7 @@ BRAKED: Final = 0.1  # [rad/s] below it a brake does, so that it holds a wheel a
 STILL: Final = 0.02  # [m/s, rad/s] slower than this in every direction, brakes hold the vehicle where it is
 
 
-class X(IntEnum):
+class Body(IntEnum):
     """State of one vehicle."""
 
     VX = 0  # [m/s]
@@ -143,12 +143,12 @@ def slip_limit(p: FloatArray, i: int) -> float:
 @compiled
 def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> None:
     """Fill `w` (8, 4) for the state `x` (12,), parameters `p` (26,) and inputs `u` (5, 4)."""
-    loads = wheel_loads(body(p), x[X.AX_LAGGED], x[X.AY_LAGGED])
+    loads = wheel_loads(body(p), x[Body.AX_LAGGED], x[Body.AY_LAGGED])
     at_rest = wheel_loads(body(p), 0.0, 0.0)
     _, _, share = gravity(u)
     for i in range(4):
-        load, omega = share * loads[i], x[X.OMEGA + i]
-        along, across = wheel_velocity(p, i, x[X.VX], x[X.VY], x[X.YAW_RATE], u[U.STEER, i])
+        load, omega = share * loads[i], x[Body.OMEGA + i]
+        along, across = wheel_velocity(p, i, x[Body.VX], x[Body.VY], x[Body.YAW_RATE], u[U.STEER, i])
         slip_x, slip_y = slips(p[P.RADIUS], omega, along, across)
         slope_x = stiffness_per_load(p[P.SLOPE_X], p[Q.DEGRESSION], load, at_rest[i])
         slope_y = stiffness_per_load(p[P.SLOPE_Y], p[Q.DEGRESSION], load, at_rest[i])
@@ -178,7 +178,7 @@ def body_accelerations(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArra
     `w` is filled.
     """
     ax, ay, yaw_acceleration = accelerations(p, w[W.FX], w[W.FY], u[U.STEER])
-    return ax - p[Q.DRAG] * x[X.VX] * abs(x[X.VX]) / p[P.MASS], ay, yaw_acceleration
+    return ax - p[Q.DRAG] * x[Body.VX] * abs(x[Body.VX]) / p[P.MASS], ay, yaw_acceleration
 
 
 @compiled
@@ -192,7 +192,7 @@ def turn_wheels(
     radius = p[P.RADIUS]
     for i in range(4):
         ground = gain - wheel_position(p, i)[1] * yaw_acceleration
-        omega, slip = x[X.OMEGA + i], abs(w[W.SLIP, i])
+        omega, slip = x[Body.OMEGA + i], abs(w[W.SLIP, i])
         slow = max(abs(omega), STANDING)
         resistance = p[Q.ROLLING] * radius * w[W.FZ, i] * omega / slow
         excess = w[W.TORQUE, i] - resistance - radius * w[W.FX, i] + dt * w[W.SLOPE, i] * ground
@@ -202,13 +202,13 @@ def turn_wheels(
             damping += asked * radius / (max(abs(w[W.SPEED, i]), SLOWEST_M_S) * slip_limit(p, i))
         if abs(omega) < BRAKED:
             damping += u[U.BRAKE, i] / BRAKED
-        x[X.OMEGA + i] = omega + dt * excess / (p[P.WHEEL_INERTIA] + dt * damping)
+        x[Body.OMEGA + i] = omega + dt * excess / (p[P.WHEEL_INERTIA] + dt * damping)
 
 
 @compiled
 def held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
     """Whether the brakes hold a vehicle that stands: they are stronger than engine and slope, and so are the tyres."""
-    if abs(x[X.VX]) > STILL or abs(x[X.VY]) > STILL or abs(x[X.YAW_RATE]) > STILL:
+    if abs(x[Body.VX]) > STILL or abs(x[Body.VY]) > STILL or abs(x[Body.YAW_RATE]) > STILL:
         return False
     along, across, share = gravity(u)
     brake = pull = grip = 0.0
@@ -224,11 +224,11 @@ def held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
 def stand(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
     """One step of a vehicle that is `held`: only the suspension still moves, to where the slope wants it."""
     along, across, _ = gravity(u)
-    x[X.VX] = x[X.VY] = x[X.YAW_RATE] = 0.0
-    x[X.OMEGA : X.OMEGA + 4] = 0.0
+    x[Body.VX] = x[Body.VY] = x[Body.YAW_RATE] = 0.0
+    x[Body.OMEGA : Body.OMEGA + 4] = 0.0
     follow = min(dt / p[Q.LAG], 1.0)
-    x[X.AX_LAGGED] += follow * (-along - x[X.AX_LAGGED])
-    x[X.AY_LAGGED] += follow * (-across - x[X.AY_LAGGED])
+    x[Body.AX_LAGGED] += follow * (-along - x[Body.AX_LAGGED])
+    x[Body.AY_LAGGED] += follow * (-across - x[Body.AY_LAGGED])
 
 
 @compiled
@@ -241,18 +241,18 @@ def advance(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: floa
             continue
         wheel_forces(x, p, u, w)
         ax, ay, yaw_acceleration = body_accelerations(x, p, u, w)
-        vx, vy, r = x[X.VX], x[X.VY], x[X.YAW_RATE]
+        vx, vy, r = x[Body.VX], x[Body.VY], x[Body.YAW_RATE]
         turn_wheels(x, p, u, w, dt, ax + r * vy + along, yaw_acceleration)
-        c, s = math.cos(x[X.YAW] + 0.5 * dt * r), math.sin(x[X.YAW] + 0.5 * dt * r)
-        x[X.X] += dt * (c * vx - s * vy)
-        x[X.Y] += dt * (s * vx + c * vy)
-        x[X.YAW] += dt * r
-        x[X.VX] += dt * (ax + r * vy + along)
-        x[X.VY] += dt * (ay - r * vx + across)
-        x[X.YAW_RATE] += dt * yaw_acceleration
+        c, s = math.cos(x[Body.YAW] + 0.5 * dt * r), math.sin(x[Body.YAW] + 0.5 * dt * r)
+        x[Body.X] += dt * (c * vx - s * vy)
+        x[Body.Y] += dt * (s * vx + c * vy)
+        x[Body.YAW] += dt * r
+        x[Body.VX] += dt * (ax + r * vy + along)
+        x[Body.VY] += dt * (ay - r * vx + across)
+        x[Body.YAW_RATE] += dt * yaw_acceleration
         follow = min(dt / p[Q.LAG], 1.0)
-        x[X.AX_LAGGED] += follow * (ax - x[X.AX_LAGGED])
-        x[X.AY_LAGGED] += follow * (ay - x[X.AY_LAGGED])
+        x[Body.AX_LAGGED] += follow * (ax - x[Body.AX_LAGGED])
+        x[Body.AY_LAGGED] += follow * (ay - x[Body.AY_LAGGED])
 
 
 @compiled
@@ -306,12 +306,16 @@ def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: 
     wheel_forces(x, p, u, w)
     ax, ay, _ = body_accelerations(x, p, u, w)
     record[R.AX], record[R.AY] = ax, ay
-    record[R.AX_FELT] = ax + p[Q.PITCH_LEAK] * x[X.AX_LAGGED]
-    record[R.AY_FELT] = ay + p[Q.ROLL_LEAK] * x[X.AY_LAGGED]
-    record[R.YAW_RATE], record[R.VX], record[R.VY] = x[X.YAW_RATE], x[X.VX], x[X.VY]
-    record[R.X], record[R.Y], record[R.YAW] = x[X.X], x[X.Y], x[X.YAW]
+    record[R.AX_FELT] = ax + p[Q.PITCH_LEAK] * x[Body.AX_LAGGED]
+    record[R.AY_FELT] = ay + p[Q.ROLL_LEAK] * x[Body.AY_LAGGED]
+    record[R.YAW_RATE], record[R.VX], record[R.VY] = x[Body.YAW_RATE], x[Body.VX], x[Body.VY]
+    record[R.X], record[R.Y], record[R.YAW] = x[Body.X], x[Body.Y], x[Body.YAW]
     for i in range(4):
-        record[R.DELTA + i], record[R.OMEGA + i], record[R.TORQUE + i] = u[U.STEER, i], x[X.OMEGA + i], w[W.TORQUE, i]
+        record[R.DELTA + i], record[R.OMEGA + i], record[R.TORQUE + i] = (
+            u[U.STEER, i],
+            x[Body.OMEGA + i],
+            w[W.TORQUE, i],
+        )
         record[R.MU + i] = u[U.MU, i]
         record[R.UTILISATION + i] = math.hypot(w[W.FX, i], w[W.FY, i]) / (u[U.MU, i] * w[W.FZ, i])
     record[R.SLOPE], record[R.BANK] = u[U.TILT, 0], u[U.TILT, 1]
@@ -324,8 +328,8 @@ def _observe_held(x: FloatArray, p: FloatArray, u: FloatArray, record: FloatArra
     """What is true of a vehicle that is held: brakes and tyres give what the slope asks for."""
     along, across, share = gravity(u)
     record[R.AX], record[R.AY] = -along, -across
-    record[R.AX_FELT] = -along + p[Q.PITCH_LEAK] * x[X.AX_LAGGED]
-    record[R.AY_FELT] = -across + p[Q.ROLL_LEAK] * x[X.AY_LAGGED]
+    record[R.AX_FELT] = -along + p[Q.PITCH_LEAK] * x[Body.AX_LAGGED]
+    record[R.AY_FELT] = -across + p[Q.ROLL_LEAK] * x[Body.AY_LAGGED]
     record[R.YAW_RATE] = record[R.VX] = record[R.VY] = 0.0
     for i in range(4):
         brake_share = p[Q.BRAKE_FRONT] if i < 2 else 1.0 - p[Q.BRAKE_FRONT]
@@ -338,9 +342,9 @@ def _observe_held(x: FloatArray, p: FloatArray, u: FloatArray, record: FloatArra
 def start_at(x: FloatArray, p: FloatArray, place: tuple[float, float, float], speed: float) -> None:
     """Set the state `x` to rolling straight on at `speed` [m/s] from place (x [m], y [m], yaw [rad])."""
     x[:] = 0.0
-    x[X.VX] = speed
-    x[X.X], x[X.Y], x[X.YAW] = place
-    x[X.OMEGA : X.OMEGA + 4] = speed / p[P.RADIUS]
+    x[Body.VX] = speed
+    x[Body.X], x[Body.Y], x[Body.YAW] = place
+    x[Body.OMEGA : Body.OMEGA + 4] = speed / p[P.RADIUS]
 
 
 def substeps_of(rate_hz: float) -> int:
@@ -352,8 +356,8 @@ def substeps_of(rate_hz: float) -> int:
 def wheel_place(x: FloatArray, p: FloatArray, i: int) -> tuple[float, float]:
     """Where wheel `i` stands on the ground, (x, y) [m]."""
     ahead, left = wheel_position(p, i)
-    c, s = math.cos(x[X.YAW]), math.sin(x[X.YAW])
-    return x[X.X] + c * ahead - s * left, x[X.Y] + s * ahead + c * left
+    c, s = math.cos(x[Body.YAW]), math.sin(x[Body.YAW])
+    return x[Body.X] + c * ahead - s * left, x[Body.Y] + s * ahead + c * left
 
 
 @compiled

@@ -17,10 +17,10 @@ from edge_agent.lab.simulation.place import GOTHENBURG, Origin
 from edge_agent.lab.simulation.plant import (
     RECORD,
     STATES,
+    Body,
     R,
     U,
     W,
-    X,
     advance,
     command,
     gravity,
@@ -79,7 +79,7 @@ def simulate_manoeuvre(
     _check(speed=speed, rate_hz=rate_hz, duration_s=duration_s)
     speed = manoeuvre.speed if speed is None else speed
     duration = manoeuvre.duration if duration_s is None else duration_s
-    world = World(_friction(manoeuvre.friction if mu is None else mu), road_named(road, seed, slope).table)
+    world = TestTrack(_friction(manoeuvre.friction if mu is None else mu), road_named(road, seed, slope).table)
     records = _drive(manoeuvre, truth, world, speed, rate_hz, max(1, round(duration * rate_hz)))
     signals = _sensed(records, told, origin, seed, rate_hz)
     t = np.arange(len(records)) / rate_hz
@@ -108,7 +108,7 @@ def _friction(mu: Friction) -> Callable[[float, float], float]:
     return lambda _x, _y: mu
 
 
-class World(NamedTuple):
+class TestTrack(NamedTuple):
     """The test track: friction at (x, y) [m], and the table of its relief."""
 
     friction: Callable[[float, float], float]
@@ -116,7 +116,7 @@ class World(NamedTuple):
 
 
 def _drive(
-    manoeuvre: Manoeuvre, truth: TrueVehicle, world: World, speed: float, rate_hz: float, samples: int
+    manoeuvre: Manoeuvre, truth: TrueVehicle, world: TestTrack, speed: float, rate_hz: float, samples: int
 ) -> FloatArray:
     """True records (T, 32) of the drive; the driver gives as much more gas as a slope takes."""
     p, x, u, w = truth.row(), np.zeros(STATES), np.zeros((len(U), 4)), np.zeros((len(W), 4))
@@ -125,15 +125,15 @@ def _drive(
     start_at(x, p, (0.0, 0.0, 0.0), speed)
     steer = force = 0.0
     for k in range(samples):
-        east, north = gradient(world.relief, (x[X.X], x[X.Y]), (1.0, 0.0), 0.0)
-        u[U.TILT, :2] = tilt(east, north, x[X.YAW])
+        east, north = gradient(world.relief, (x[Body.X], x[Body.Y]), (1.0, 0.0), 0.0)
+        u[U.TILT, :2] = tilt(east, north, x[Body.YAW])
         wish, acceleration = manoeuvre.control(_moment(k * dt, x, speed))
         acceleration -= gravity(u)[0]
         if k == 0 and speed == 0.0:
             force = float(p[P.MASS]) * acceleration  # who stands has had his foot down before
         steer += (wish - steer) * -math.expm1(-dt / STEERING_LAG_S)
         force += (float(p[P.MASS]) * acceleration - force) * -math.expm1(-dt / PEDAL_LAG_S)
-        force = min(force, strongest_pull(p, float(x[X.VX])))
+        force = min(force, strongest_pull(p, float(x[Body.VX])))
         command(p, u, steer, force)
         for i in range(4):
             u[U.MU, i] = world.friction(*wheel_place(x, p, i))
@@ -143,7 +143,7 @@ def _drive(
 
 
 def _moment(t: float, x: FloatArray, speed: float) -> Moment:
-    return Moment(t, float(x[X.X]), float(x[X.Y]), float(x[X.YAW]), float(x[X.VX]), speed)
+    return Moment(t, float(x[Body.X]), float(x[Body.Y]), float(x[Body.YAW]), float(x[Body.VX]), speed)
 
 
 def _sensed(records: FloatArray, sensors: Sensors, origin: Origin, seed: int, rate_hz: float) -> FloatArray:

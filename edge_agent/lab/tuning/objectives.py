@@ -43,7 +43,7 @@ NOISY: Final = replace(USUAL, acceleration=(0.25, 0.03), yaw_rate=(0.01, 0.001),
 
 
 @dataclass(frozen=True)
-class Drive:
+class TuningDrive:
     """One simulated drive of a set."""
 
     manoeuvre: str
@@ -54,49 +54,49 @@ class Drive:
 
 
 TRAIN: Final = (
-    Drive("double-lane-change", "sedan", 0.85, 101),
-    Drive("double-lane-change", "small", 0.60, 102),
-    Drive("slalom", "small", 0.30, 103),
-    Drive("sine", "van", 0.50, 104),
-    Drive("sine", "small", 0.75, 105, NOISY),
-    Drive("acceleration", "sedan", 0.40, 106),
-    Drive("braking", "van", 0.70, 107),
-    Drive("gentle-braking", "sedan", 0.30, 108, NOISY),
-    Drive("constant-radius", "small", 0.35, 109),
-    Drive("pulses", "sedan", 0.35, 110),
-    Drive("pulses", "small", 0.80, 111, NOISY),
-    Drive("straight", "van", 0.85, 112),
-    Drive("double-lane-change", "sedan", 0.45, 113),
-    Drive("slalom", "van", 0.60, 114),
-    Drive("slalom", "small", 0.80, 115, NOISY),
-    Drive("sine", "van", 0.90, 116),
-    Drive("acceleration", "sedan", 0.85, 117),
-    Drive("braking", "small", 0.35, 118),
-    Drive("braking", "van", 0.25, 119, NOISY),
-    Drive("gentle-braking", "van", 0.80, 120),
-    Drive("constant-radius", "small", 0.70, 121),
-    Drive("j-turn", "van", 0.50, 122),
-    Drive("j-turn", "small", 0.30, 123, NOISY),
-    Drive("pulses", "sedan", 0.60, 124),
+    TuningDrive("double-lane-change", "sedan", 0.85, 101),
+    TuningDrive("double-lane-change", "small", 0.60, 102),
+    TuningDrive("slalom", "small", 0.30, 103),
+    TuningDrive("sine", "van", 0.50, 104),
+    TuningDrive("sine", "small", 0.75, 105, NOISY),
+    TuningDrive("acceleration", "sedan", 0.40, 106),
+    TuningDrive("braking", "van", 0.70, 107),
+    TuningDrive("gentle-braking", "sedan", 0.30, 108, NOISY),
+    TuningDrive("constant-radius", "small", 0.35, 109),
+    TuningDrive("pulses", "sedan", 0.35, 110),
+    TuningDrive("pulses", "small", 0.80, 111, NOISY),
+    TuningDrive("straight", "van", 0.85, 112),
+    TuningDrive("double-lane-change", "sedan", 0.45, 113),
+    TuningDrive("slalom", "van", 0.60, 114),
+    TuningDrive("slalom", "small", 0.80, 115, NOISY),
+    TuningDrive("sine", "van", 0.90, 116),
+    TuningDrive("acceleration", "sedan", 0.85, 117),
+    TuningDrive("braking", "small", 0.35, 118),
+    TuningDrive("braking", "van", 0.25, 119, NOISY),
+    TuningDrive("gentle-braking", "van", 0.80, 120),
+    TuningDrive("constant-radius", "small", 0.70, 121),
+    TuningDrive("j-turn", "van", 0.50, 122),
+    TuningDrive("j-turn", "small", 0.30, 123, NOISY),
+    TuningDrive("pulses", "sedan", 0.60, 124),
 )
 HELD_OUT: Final = (
-    Drive("double-lane-change", "van", 0.70, 901),
-    Drive("slalom", "sedan", 0.25, 902),
-    Drive("sine", "sedan", 0.55, 903, NOISY),
-    Drive("acceleration", "small", 0.70, 904),
-    Drive("acceleration", "van", 0.20, 905),
-    Drive("braking", "sedan", 0.85, 906),
-    Drive("gentle-braking", "small", 0.60, 907),
-    Drive("constant-radius", "sedan", 0.40, 908),
-    Drive("constant-radius", "van", 0.30, 909),
-    Drive("j-turn", "sedan", 0.90, 910),
-    Drive("pulses", "van", 0.50, 911, NOISY),
-    Drive("straight", "small", 0.30, 912),
+    TuningDrive("double-lane-change", "van", 0.70, 901),
+    TuningDrive("slalom", "sedan", 0.25, 902),
+    TuningDrive("sine", "sedan", 0.55, 903, NOISY),
+    TuningDrive("acceleration", "small", 0.70, 904),
+    TuningDrive("acceleration", "van", 0.20, 905),
+    TuningDrive("braking", "sedan", 0.85, 906),
+    TuningDrive("gentle-braking", "small", 0.60, 907),
+    TuningDrive("constant-radius", "sedan", 0.40, 908),
+    TuningDrive("constant-radius", "van", 0.30, 909),
+    TuningDrive("j-turn", "sedan", 0.90, 910),
+    TuningDrive("pulses", "van", 0.50, 911, NOISY),
+    TuningDrive("straight", "small", 0.30, 912),
 )
 
 
 @dataclass(frozen=True)
-class Recorded:
+class TuningSet:
     """Drives of equal length side by side, as one bank takes them."""
 
     vehicles: tuple[Vehicle, ...]
@@ -106,7 +106,7 @@ class Recorded:
 
 
 @dataclass(frozen=True)
-class Worth:
+class TuningScores:
     """Scores of memberships on recorded drives."""
 
     interval_score: float  # less is better [1]
@@ -116,13 +116,13 @@ class Worth:
 
 
 # objective by name -> the number to maximise
-OBJECTIVES: Final[dict[str, Callable[[Worth], float]]] = {
+OBJECTIVES: Final[dict[str, Callable[[TuningScores], float]]] = {
     "interval": lambda worth: -worth.interval_score,
     "innovation": lambda worth: worth.log_likelihood,
 }
 
 
-def record(drives: Sequence[Drive], duration_s: float) -> Recorded:
+def record(drives: Sequence[TuningDrive], duration_s: float) -> TuningSet:
     """Simulate the drives, each `duration_s` [s] long."""
     signals, truth, vehicles = [], [], []
     for drive in drives:
@@ -134,7 +134,7 @@ def record(drives: Sequence[Drive], duration_s: float) -> Recorded:
         truth.append(np.mean([log[name].to_numpy() for name in per_wheel("true_mu")], axis=0))
         vehicles.append(vehicle)
     t = np.arange(len(signals[0]))[:, None] / RATE_HZ + np.zeros(len(drives))
-    return Recorded(tuple(vehicles), t, np.stack(signals, axis=1), np.stack(truth, axis=1))
+    return TuningSet(tuple(vehicles), t, np.stack(signals, axis=1), np.stack(truth, axis=1))
 
 
 def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> FloatArray:
@@ -143,13 +143,13 @@ def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> F
     return score
 
 
-def worth(memberships: Memberships, drives: Recorded, estimator: str) -> Worth:
+def worth(memberships: Memberships, drives: TuningSet, estimator: str) -> TuningScores:
     """Run the estimator over the drives and score what it says after the first second."""
     estimates = create(estimator, drives.vehicles, memberships=memberships).advance(drives.t, drives.signals)
     settled = drives.t[:, 0] >= SETTLED_S
     lower, upper, truth = estimates.mu_lower[settled], estimates.mu_upper[settled], drives.mu[settled]
     told = np.nan_to_num(estimates.innovation_log_likelihood[settled], nan=WORST, neginf=WORST, posinf=WORST)
-    return Worth(
+    return TuningScores(
         interval_score=float(interval_score(lower, upper, truth).mean()),
         coverage=float(((lower <= truth) & (truth <= upper)).mean()),
         log_likelihood=float(np.maximum(told, WORST).mean()) * RATE_HZ,
@@ -157,7 +157,7 @@ def worth(memberships: Memberships, drives: Recorded, estimator: str) -> Worth:
     )
 
 
-def objective_on(drives: Recorded, estimator: str, name: str) -> Objective:
+def objective_on(drives: TuningSet, estimator: str, name: str) -> Objective:
     """An objective over membership vectors; a vector that is no membership counts as the worst.
 
     Raises:

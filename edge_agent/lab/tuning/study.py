@@ -49,7 +49,7 @@ CONDITIONS: Final = {
 }  # fmt: skip
 
 
-class Drive(NamedTuple):
+class StudyDrive(NamedTuple):
     """One drive on a road of friction MU."""
 
     manoeuvre: str
@@ -59,18 +59,18 @@ class Drive(NamedTuple):
 
 
 TRAIN: Final = (
-    Drive("double-lane-change", "sedan", kmh(80), 301), Drive("sine", "small", kmh(60), 302),
-    Drive("slalom", "sedan", kmh(35), 303), Drive("pulses", "van", kmh(50), 304),
+    StudyDrive("double-lane-change", "sedan", kmh(80), 301), StudyDrive("sine", "small", kmh(60), 302),
+    StudyDrive("slalom", "sedan", kmh(35), 303), StudyDrive("pulses", "van", kmh(50), 304),
 )  # fmt: skip
 HELD_OUT: Final = (
-    Drive("two-lane-changes", "small", kmh(60), 951), Drive("j-turn", "van", kmh(50), 952),
-    Drive("accelerating-sine", "sedan", kmh(70), 953), Drive("brisk-acceleration", "small", kmh(30), 954),
-    Drive("low-turn", "sedan", kmh(60), 955), Drive("moderate-braking", "van", kmh(80), 956),
+    StudyDrive("two-lane-changes", "small", kmh(60), 951), StudyDrive("j-turn", "van", kmh(50), 952),
+    StudyDrive("accelerating-sine", "sedan", kmh(70), 953), StudyDrive("brisk-acceleration", "small", kmh(30), 954),
+    StudyDrive("low-turn", "sedan", kmh(60), 955), StudyDrive("moderate-braking", "van", kmh(80), 956),
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Recorded:
+class StudySet:
     """Drives side by side: t (T, N) [s], signals (T, N, 18) by condition, truth (T, N, 3) of v_x, v_y, yaw rate."""
 
     vehicles: tuple[Vehicle, ...]
@@ -79,7 +79,7 @@ class Recorded:
     truth: FloatArray
 
 
-class Worth(NamedTuple):
+class StudyScores(NamedTuple):
     """How memberships do under one condition, mean over the drives."""
 
     log_likelihood: float  # of the innovations, more is better [nat/s]
@@ -89,7 +89,7 @@ class Worth(NamedTuple):
     rmse_yaw_rate: float  # [rad/s]
 
 
-def record(drives: Sequence[Drive], duration_s: float = DURATION_S) -> Recorded:
+def record(drives: Sequence[StudyDrive], duration_s: float = DURATION_S) -> StudySet:
     """Simulate the drives, each `duration_s` [s] long, with the noise of every condition."""
     exact, truth, vehicles = [], [], []
     for drive in drives:
@@ -104,7 +104,7 @@ def record(drives: Sequence[Drive], duration_s: float = DURATION_S) -> Recorded:
     signals, seeds = np.stack(exact, axis=1).astype(float), [drive.seed for drive in drives]
     t = np.arange(len(signals))[:, None] / RATE_HZ + np.zeros(len(drives))
     noisy = {name: _noisy(signals, t[:, 0], seeds, condition) for name, condition in CONDITIONS.items()}
-    return Recorded(tuple(vehicles), t, noisy, np.stack(truth, axis=1))
+    return StudySet(tuple(vehicles), t, noisy, np.stack(truth, axis=1))
 
 
 def _noisy(exact: FloatArray, t: FloatArray, seeds: Sequence[int], condition: Condition) -> FloatArray:
@@ -120,19 +120,19 @@ def setting(condition: Condition) -> Setting:
     return AT_THE_TRUTH._replace(noise=(condition.scale * VARIANCE,) * 3)
 
 
-def worth(memberships: Memberships, drives: Recorded, name: str) -> Worth:
+def worth(memberships: Memberships, drives: StudySet, name: str) -> StudyScores:
     """Run the filter over the drives under the condition of that name."""
     filters = bank(drives.vehicles, memberships, setting(CONDITIONS[name]))
     said = filters.advance(drives.t, drives.signals[name])
     told = np.nan_to_num(said.innovation_log_likelihood[1:], nan=WORST, neginf=WORST, posinf=WORST)
     motion = np.stack([said.vx, said.vy, said.yaw_rate], axis=-1)
     rmse = np.sqrt(((motion - drives.truth) ** 2).mean(axis=0)).mean(axis=0)
-    return Worth(
+    return StudyScores(
         float(np.maximum(told, WORST).mean()) * RATE_HZ, float(said.innovation_nis[1:].mean()), *map(float, rmse)
     )
 
 
-def interval(memberships: Memberships, drives: Recorded, name: str) -> tuple[float, float]:
+def interval(memberships: Memberships, drives: StudySet, name: str) -> tuple[float, float]:
     """(interval score, coverage) of the 90 % friction interval under a condition."""
     said = bank(drives.vehicles, memberships, setting(CONDITIONS[name])).advance(drives.t, drives.signals[name])
     truth = np.full(said.mu.shape, MU)
@@ -140,7 +140,7 @@ def interval(memberships: Memberships, drives: Recorded, name: str) -> tuple[flo
     return float(interval_score(said.mu_lower, said.mu_upper, truth).mean()), float(inside.mean())
 
 
-def overall(memberships: Memberships, drives: Recorded) -> float:
+def overall(memberships: Memberships, drives: StudySet) -> float:
     """Mean log-likelihood over the conditions [nat/s]: what is searched for."""
     return float(np.mean([worth(memberships, drives, name).log_likelihood for name in CONDITIONS]))
 
@@ -150,13 +150,13 @@ def memberships_of(vector: FloatArray) -> Memberships:
     return Memberships.from_vector(np.append(vector, np.zeros(CHANNELS)))
 
 
-def objective_on(drives: Recorded) -> Objective:
+def objective_on(drives: StudySet) -> Objective:
     """The objective over vectors of ten vertices."""
     return lambda vector: overall(memberships_of(vector), drives)
 
 
 def search(
-    way: str, drives: Recorded, *, ants: int, iterations: int, positions: int, seed: int,
+    way: str, drives: StudySet, *, ants: int, iterations: int, positions: int, seed: int,
     progress: Progress | None = None,
 ) -> Result:  # fmt: skip
     """Search the vertices in one of WAYS; both begin at the untuned ones."""

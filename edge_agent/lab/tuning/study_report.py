@@ -13,7 +13,7 @@ from edge_agent.adaptation.memberships import SETS, Memberships
 from edge_agent.app.tuned_memberships import Score
 from edge_agent.lab.tuning import study
 from edge_agent.lab.tuning.search import Progress, Result
-from edge_agent.lab.tuning.study import CONDITIONS, WAYS, Recorded, Worth, memberships_of, overall, worth
+from edge_agent.lab.tuning.study import CONDITIONS, WAYS, StudyScores, StudySet, memberships_of, overall, worth
 from schemas.runtime.figures import Figure
 
 UNITS: Final = {"log_likelihood": "nat/s", "nis": "1", "rmse_vx": "m/s", "rmse_vy": "m/s", "rmse_yaw_rate": "rad/s"}
@@ -29,8 +29,8 @@ SHOWN: Final = (*GIVEN, *WAYS)
 class Study:
     """Results of every repeat of every way, and what the found memberships are worth on held-out drives."""
 
-    train: Recorded
-    held_out: Recorded
+    train: StudySet
+    held_out: StudySet
     found: dict[str, list[Result]] = field(default_factory=dict)
 
     def memberships(self, way: str) -> list[Memberships]:
@@ -85,7 +85,7 @@ def figures(done: Study) -> list[Figure]:
     return listed
 
 
-def _spread(prefix: str, worths: Sequence[Worth]) -> list[Figure]:
+def _spread(prefix: str, worths: Sequence[StudyScores]) -> list[Figure]:
     return [
         figure
         for name, unit in UNITS.items()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from fleet_service.analytics.engines import Engine
+    from fleet_service.analytics.engines import QueryEngine
     from fleet_service.analytics.options import Options
 
 
@@ -30,10 +30,10 @@ class Question(NamedTuple):
     plot: tuple[str, str]
 
     @property
-    def ask(self) -> Callable[[Engine, Options], pa.Table]:
+    def ask(self) -> Callable[[QueryEngine, Options], pa.Table]:
         """What answers it; imported when it is asked, for Ibis is heavy."""
         module = import_module(f"fleet_service.analytics.questions.{self.name.replace('-', '_')}")
-        found: Callable[[Engine, Options], pa.Table] = module.ask
+        found: Callable[[QueryEngine, Options], pa.Table] = module.ask
         return found
 
 

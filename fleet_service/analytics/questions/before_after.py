@@ -14,7 +14,7 @@ import ibis
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.analytics.engines import Engine, Table, value
+from fleet_service.analytics.engines import QueryEngine, Table, value
 from fleet_service.analytics.options import Options
 from schemas.errors import InputError
 from schemas.thresholds import NS, Z_95
@@ -48,7 +48,7 @@ def expression(t: Table, at_s: int) -> Table:
     return total.cross_join(spread)
 
 
-def ask(engine: Engine, options: Options) -> pa.Table:
+def ask(engine: QueryEngine, options: Options) -> pa.Table:
     """Two rows, before and after, with mu and its difference, interval, cells, vehicles and values behind it.
 
     Raises:

@@ -10,7 +10,7 @@ from typing import Final
 
 import pyarrow as pa
 
-from fleet_service.analytics.engines import Engine, Table, value
+from fleet_service.analytics.engines import QueryEngine, Table, value
 from fleet_service.analytics.options import Options
 
 HORIZON_S: Final = 6 * 3600
@@ -45,6 +45,6 @@ def expression(t: Table, maps: Table) -> Table:
     )
 
 
-def ask(engine: Engine, _: Options) -> pa.Table:
+def ask(engine: QueryEngine, _: Options) -> pa.Table:
     """Rows of `expression`."""
     return engine.answer(expression(engine.observations(), engine.maps()))

@@ -8,7 +8,7 @@ import ibis
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.analytics.engines import Engine, Table, value
+from fleet_service.analytics.engines import QueryEngine, Table, value
 from fleet_service.analytics.options import Options
 
 PERCENTILES: Final = {"mu_p10": 0.1, "mu_p50": 0.5, "mu_p90": 0.9}
@@ -28,7 +28,7 @@ def expression(t: Table) -> Table:
     return found.mutate(**{name: found["all"][k] for k, name in enumerate(PERCENTILES)}).drop("all")
 
 
-def ask(engine: Engine, options: Options) -> pa.Table:
+def ask(engine: QueryEngine, options: Options) -> pa.Table:
     """Rows of `expression`; says the coverage of the network (every cell and sector seen in these days) per day."""
     found = engine.answer(expression(engine.observations()))
     for line in coverage(found):

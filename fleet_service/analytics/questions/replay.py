@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.analytics.engines import Engine
+from fleet_service.analytics.engines import QueryEngine
 from fleet_service.analytics.options import Options
 from fleet_service.fusion import Fusion
 from fleet_service.ingest.weather import archived
@@ -19,7 +19,7 @@ from schemas.thresholds import NS
 TOLD_ROWS: Final = 1_000_000  # between two lines of progress
 
 
-def ask(engine: Engine, options: Options) -> pa.Table:
+def ask(engine: QueryEngine, options: Options) -> pa.Table:
     """Cells of the map at `at`, or of each frame from the part's begin to its end; `frame` is its time."""
     at = options.at if options.at is not None else engine.part.until
     fusion = Fusion(options.lateness_s)
@@ -41,7 +41,7 @@ def ask(engine: Engine, options: Options) -> pa.Table:
     return pa.concat_tables([*frames, _frame(engine, fusion, engine.part.until)])
 
 
-def _frame(engine: Engine, fusion: Fusion, at: int) -> pa.Table:
+def _frame(engine: QueryEngine, fusion: Fusion, at: int) -> pa.Table:
     slots = np.flatnonzero(fusion.live.vehicles[: fusion.size] > 0)  # a poor fix makes neighbours that nobody visited
     if engine.part.bbox is not None:
         west, south, east, north = grid.bounds(fusion.cell[slots])

@@ -9,7 +9,7 @@ from __future__ import annotations
 import ibis
 import pyarrow as pa
 
-from fleet_service.analytics.engines import Engine, Table, value
+from fleet_service.analytics.engines import QueryEngine, Table, value
 from fleet_service.analytics.options import Options
 from schemas.thresholds import SLIPPERY_MU
 
@@ -45,6 +45,6 @@ def expression(t: Table, least_vehicles: int) -> Table:
     )  # fmt: skip
 
 
-def ask(engine: Engine, options: Options) -> pa.Table:
+def ask(engine: QueryEngine, options: Options) -> pa.Table:
     """Rows of `expression`."""
     return engine.answer(expression(engine.observations(), options.least_vehicles))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ibis
 import pyarrow as pa
 
-from fleet_service.analytics.engines import Engine, Table, value
+from fleet_service.analytics.engines import QueryEngine, Table, value
 from fleet_service.analytics.options import Options
 
 HOUR_S = 3600
@@ -43,6 +43,6 @@ def expression(t: Table) -> Table:
     return found.mutate(z=z).drop("spread")
 
 
-def ask(engine: Engine, _: Options) -> pa.Table:
+def ask(engine: QueryEngine, _: Options) -> pa.Table:
     """Rows of `expression`."""
     return engine.answer(expression(engine.observations()))

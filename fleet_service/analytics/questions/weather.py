@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 
-from fleet_service.analytics.engines import Engine, Table, value
+from fleet_service.analytics.engines import QueryEngine, Table, value
 from fleet_service.analytics.options import Options
 from schemas.errors import InputError
 from schemas.thresholds import SLIPPERY_MU
@@ -59,7 +59,7 @@ def expression(t: Table, stations: Table, readings: Table) -> Table:
     )
 
 
-def ask(engine: Engine, options: Options) -> pa.Table:
+def ask(engine: QueryEngine, options: Options) -> pa.Table:
     """Rows of `expression`.
 
     Raises:

@@ -10,7 +10,7 @@ import pyarrow as pa
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from fleet_service.analytics.engines import Engine, Table, value
+from fleet_service.analytics.engines import QueryEngine, Table, value
 from fleet_service.analytics.options import Options
 from schemas import grid
 from schemas.numeric import FloatArray, IntArray
@@ -34,7 +34,7 @@ def expression(t: Table, least_vehicles: int) -> Table:
     )
 
 
-def ask(engine: Engine, options: Options) -> pa.Table:
+def ask(engine: QueryEngine, options: Options) -> pa.Table:
     """Stretches, the worst first: score = length times the lower bound of the share of slippery values."""
     cells = engine.answer(expression(engine.observations(), options.least_vehicles))
     return stretches(cells)

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from edge_agent.inputs.signal_log import Log, read_log
+from edge_agent.inputs.signal_log import SignalLog, read_log
 from schemas.errors import InputError
 from schemas.signals import CHANNELS, S, per_wheel
 from tests.edge_agent.fakes import BAD_LOGS, a_log
@@ -19,7 +19,7 @@ from tests.edge_agent.fakes import BAD_LOGS, a_log
 NS = 1_000_000_000
 
 
-def read(tmp_path: Path, columns: dict[str, Any]) -> Log:
+def read(tmp_path: Path, columns: dict[str, Any]) -> SignalLog:
     path = tmp_path / "log.parquet"
     pq.write_table(pa.table(columns), path)
     return read_log(path)

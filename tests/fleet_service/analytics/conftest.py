@@ -13,21 +13,21 @@ import pyarrow.csv as pacsv
 import pytest
 
 from fleet_service.analytics import synthetic
-from fleet_service.analytics.engines import Engine
+from fleet_service.analytics.engines import QueryEngine
 from fleet_service.analytics.options import Options
 from fleet_service.analytics.questions import QUESTIONS
-from fleet_service.analytics.synthetic import DAY_S, START_NS, World
+from fleet_service.analytics.synthetic import DAY_S, START_NS, SyntheticFleet
 from fleet_service.archive import reading, rollup, snapshots
 from fleet_service.archive.compaction import compact
-from fleet_service.archive.export import Part
+from fleet_service.archive.export import Extract
 from fleet_service.fusion import Fusion
 from fleet_service.replay.rebuild import Since, replay
 from fleet_service.serve.map_state import cell_table
 from schemas.numeric import IntArray
 from schemas.wire import Kind
 
-WORLD = World(rows=24_000, days=2, vehicles=40, roads=8, length=60, icy=4)
-PART = Part(START_NS, START_NS + WORLD.days * DAY_S * 10**9)
+WORLD = SyntheticFleet(rows=24_000, days=2, vehicles=40, roads=8, length=60, icy=4)
+PART = Extract(START_NS, START_NS + WORLD.days * DAY_S * 10**9)
 HOUR_NS = 3600 * 10**9
 
 
@@ -82,9 +82,9 @@ def stations(archive: Path) -> Path:
 def asked(archive: Path) -> Callable[..., pa.Table]:
     """Ask a question: `asked("grip", at=...)`."""
 
-    def ask(name: str, engine: str = "duckdb", part: Part = PART, **options: object) -> pa.Table:
+    def ask(name: str, engine: str = "duckdb", part: Extract = PART, **options: object) -> pa.Table:
         said: list[str] = []
-        found = QUESTIONS[name].ask(Engine(engine, archive, part), Options(say=said.append, **options))  # type: ignore[arg-type]
+        found = QUESTIONS[name].ask(QueryEngine(engine, archive, part), Options(say=said.append, **options))  # type: ignore[arg-type]
         return found.replace_schema_metadata({"said": "\n".join(said)})
 
     return ask

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from fleet_service.analytics import example
-from fleet_service.analytics.synthetic import World
+from fleet_service.analytics.synthetic import SyntheticFleet
 
 
 def test_the_example_draws_its_figures(tmp_path: Path, archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -19,6 +19,6 @@ def test_the_example_draws_its_figures(tmp_path: Path, archive: Path, capsys: py
 
 
 def test_without_an_archive_it_makes_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(example, "WORLD", World(2000, 1, 10, 4, 40, 4))
+    monkeypatch.setattr(example, "WORLD", SyntheticFleet(2000, 1, 10, 4, 40, 4))
     assert example.main(["--out", str(tmp_path)]) == 0
     assert list((tmp_path / "archive" / "observations").rglob("*.parquet"))

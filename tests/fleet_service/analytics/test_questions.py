@@ -14,7 +14,7 @@ import pytest
 from fleet_service.analytics import synthetic
 from fleet_service.analytics.questions.worst import stretches, wilson
 from fleet_service.analytics.synthetic import START_NS
-from fleet_service.archive.export import Part
+from fleet_service.archive.export import Extract
 from fleet_service.fusion import Fusion
 from fleet_service.replay.rebuild import Since, replay
 from fleet_service.serve.map_state import cell_table
@@ -216,7 +216,7 @@ def test_replay_is_the_map_of_the_service(asked: Ask, archive: Path) -> None:
 def test_the_map_of_a_box_is_that_box_of_the_map(asked: Ask) -> None:
     at, west, east = START_NS + 40 * HOUR_NS, 11.972, 11.979
     whole = asked("replay", at=at)
-    part = asked("replay", at=at, part=Part(PART.since, PART.until, (west, 57.0, east, 58.0)))
+    part = asked("replay", at=at, part=Extract(PART.since, PART.until, (west, 57.0, east, 58.0)))
     inside = (whole["east"].to_numpy() > west) & (whole["west"].to_numpy() < east)
     order: Order = [("cell", "ascending"), ("sector", "ascending")]
     assert 100 < part.num_rows < whole.num_rows
@@ -224,7 +224,7 @@ def test_the_map_of_a_box_is_that_box_of_the_map(asked: Ask) -> None:
 
 
 def test_a_day_of_replay_has_a_frame_per_step_within_the_box(asked: Ask) -> None:
-    part = Part(START_NS, START_NS + 12 * HOUR_NS, (11.9, 57.6, 11.985, 57.8))
+    part = Extract(START_NS, START_NS + 12 * HOUR_NS, (11.9, 57.6, 11.985, 57.8))
     found = asked("replay", part=part, step_s=3 * 3600.0)
     frames = np.unique(found["frame"].cast(pa.int64()).to_numpy()).tolist()
     assert frames == [(START_NS + hour * HOUR_NS) // 1000 for hour in (3, 6, 9, 12)]
@@ -247,11 +247,11 @@ def test_what_a_question_lacks_is_said(asked: Ask, name: str, options: dict[str,
 
 def test_a_part_without_rows_is_said(asked: Ask) -> None:
     with pytest.raises(InputError, match="^archive: no compacted observations"):
-        asked("grip", part=Part(0, 10**9))
+        asked("grip", part=Extract(0, 10**9))
 
 
 def test_a_box_and_times_leave_other_rows_out(asked: Ask, rows: pd.DataFrame) -> None:
-    part = Part(PART.since + HOUR_NS, PART.since + 5 * HOUR_NS, (11.97, 57.69, 11.98, 57.72))
+    part = Extract(PART.since + HOUR_NS, PART.since + 5 * HOUR_NS, (11.97, 57.69, 11.98, 57.72))
     found = asked("grip", part=part)
     inside = rows[
         rows["time"].between(part.since // 10**9, part.until // 10**9 - 1)

@@ -8,25 +8,25 @@ from pathlib import Path
 import pytest
 
 from fleet_service.archive import segments
-from fleet_service.archive.log import Log
+from fleet_service.archive.log import SegmentLog
 from schemas.wire import Kind
 from tests.fleet_service.archive.rows import identities, rows_of
 from tests.waiting import until
 
 
 @pytest.fixture
-def log(tmp_path: Path) -> Iterator[Log[str]]:
-    made: Log[str] = Log(tmp_path, "shard-0")
+def log(tmp_path: Path) -> Iterator[SegmentLog[str]]:
+    made: SegmentLog[str] = SegmentLog(tmp_path, "shard-0")
     yield made
     made.close()
 
 
-def add(log: Log[str], name: str, seed: int, kind: Kind = Kind.OBSERVATION) -> None:
+def add(log: SegmentLog[str], name: str, seed: int, kind: Kind = Kind.OBSERVATION) -> None:
     """Three rows of a batch."""
     log.add(kind, rows_of(kind, 3, seed), [name])
 
 
-def test_what_is_added_while_a_segment_is_written_waits_for_the_next(log: Log[str], tmp_path: Path) -> None:
+def test_what_is_added_while_a_segment_is_written_waits_for_the_next(log: SegmentLog[str], tmp_path: Path) -> None:
     add(log, "first", 1)
     log.begin()
     add(log, "second", 2)
@@ -42,7 +42,7 @@ def test_what_is_added_while_a_segment_is_written_waits_for_the_next(log: Log[st
     assert len(identities(tmp_path, Kind.OBSERVATION)) == 6
 
 
-def test_a_flush_settles_what_was_begun_and_what_came_since(log: Log[str]) -> None:
+def test_a_flush_settles_what_was_begun_and_what_came_since(log: SegmentLog[str]) -> None:
     add(log, "first", 1)
     log.begin()
     add(log, "second", 2)
@@ -51,7 +51,7 @@ def test_a_flush_settles_what_was_begun_and_what_came_since(log: Log[str]) -> No
 
 
 def test_what_cannot_be_written_is_not_settled_and_comes_with_the_next_each_row_once(
-    log: Log[str], tmp_path: Path
+    log: SegmentLog[str], tmp_path: Path
 ) -> None:
     inbox, away = (segments.folder(tmp_path, Kind.STATE), tmp_path / "away")
     add(log, "seen", 1)

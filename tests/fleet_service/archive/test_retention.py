@@ -143,5 +143,5 @@ def test_an_export_of_the_map_is_the_newest_snapshot_before_a_time(tmp_path: Pat
 
     for k, cells in enumerate((5, 9)):
         snapshots.write(tmp_path, a_map(cells), START + k * 3600 * 10**9)
-    assert export.map_then(tmp_path, export.Part(0, START + 1800 * 10**9)).num_rows == 5
-    assert export.map_then(tmp_path, export.Part(0, START + 3600 * 10**9)).num_rows == 9
+    assert export.map_then(tmp_path, export.Extract(0, START + 1800 * 10**9)).num_rows == 5
+    assert export.map_then(tmp_path, export.Extract(0, START + 3600 * 10**9)).num_rows == 9

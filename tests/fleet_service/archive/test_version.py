@@ -32,7 +32,7 @@ from tests.fleet_service.archive.rows import fill, rows_of
 
 OLD = DATA / "v1.0"
 MADE: dict[str, Any] = json.loads((OLD / "map.json").read_text())
-EVERYTHING = export.Part(0, 2**62)
+EVERYTHING = export.Extract(0, 2**62)
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet_service.ingest import dedup
-from fleet_service.ingest.dedup import Stream, Streams
+from fleet_service.ingest.dedup import SequenceTracker, SequenceTrackers
 from schemas.wire import Kind
 
 KEY = (1, 5, Kind.STATE, 7)
@@ -17,7 +17,7 @@ STEPS = st.lists(st.tuples(st.integers(1, 60), st.integers(1, 60)), max_size=80)
 
 @given(STEPS)
 def test_a_stream_knows_exactly_what_was_admitted_or_never_comes(steps: list[tuple[int, int]]) -> None:
-    stream, admitted, floor = Stream(KEY), set(), 0
+    stream, admitted, floor = SequenceTracker(KEY), set(), 0
     for seq, held in steps:
         floor = max(floor, min(held, seq) - 1)
         stream.raise_to(min(held, seq))
@@ -30,7 +30,7 @@ def test_a_stream_knows_exactly_what_was_admitted_or_never_comes(steps: list[tup
 
 
 def test_a_stream_without_gaps_is_one_number() -> None:
-    stream = Stream(KEY)
+    stream = SequenceTracker(KEY)
     for seq in range(1, 5001):
         assert stream.admit(seq)
     assert (stream.low, len(stream.seen)) == (5000, 0)
@@ -38,7 +38,7 @@ def test_a_stream_without_gaps_is_one_number() -> None:
 
 def test_no_seq_however_far_ahead_takes_more_room_than_one_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dedup, "MAX_GAPS", 3)
-    stream = Stream(KEY)
+    stream = SequenceTracker(KEY)
     assert [stream.admit(2**62 - k) for k in range(4)] == [True, True, True, False]
     assert not stream.admitted(2**62 - 3)
     assert stream.admit(1)
@@ -47,7 +47,7 @@ def test_no_seq_however_far_ahead_takes_more_room_than_one_batch(monkeypatch: py
 
 @given(st.lists(st.tuples(st.integers(0, 1), st.integers(1, 30), st.integers(1, 30)), max_size=60))
 def test_rows_of_an_archive_restore_the_streams_that_wrote_them(rows: list[tuple[int, int, int]]) -> None:
-    before, after = Streams(), Streams()
+    before, after = SequenceTrackers(), SequenceTrackers()
     for vehicle, seq, held in rows:
         stream = before[vehicle, 5, Kind.STATE, 7]
         stream.raise_to(min(seq, held))
@@ -63,7 +63,7 @@ def test_rows_of_an_archive_restore_the_streams_that_wrote_them(rows: list[tuple
 
 
 def test_streams_too_old_to_be_let_in_again_are_forgotten() -> None:
-    both = Streams()
+    both = SequenceTrackers()
     both[1, 1, Kind.STATE, 1].admit(1, 100)
     both[2, 1, Kind.STATE, 1].admit(1, 50)
     both[2, 1, Kind.STATE, 1].admit(2, 150)

@@ -11,7 +11,7 @@ import zenoh
 
 from fleet_service.ingest import rate_limit
 from fleet_service.ingest.acks import Acks
-from fleet_service.ingest.dedup import Stream
+from fleet_service.ingest.dedup import SequenceTracker
 from fleet_service.ingest.rate_limit import LEAST_BYTES, Limits
 from schemas import wire
 from schemas.config import ServiceConfig, ZenohSettings
@@ -86,7 +86,7 @@ def test_an_acknowledgement_is_never_larger_than_its_receiver_reads() -> None:
     for one in sent:
         head = Head(one.kind, one.vehicle, one.boot, one.region, one.seq, one.first_held, one.estimator)
         acks.rejected("sim-001", head, 0, "x" * 120)
-    stream = Stream((1, sent[0].boot, sent[0].kind, sent[0].region))
+    stream = SequenceTracker((1, sent[0].boot, sent[0].kind, sent[0].region))
     stream.vehicle = "sim-001"
     acks.durable((stream, seq) for seq in range(5001, 9001, 2))
     messages = acks.messages()

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from fleet_service.archive.pseudonyms import Pseudonyms
 from fleet_service.ingest.acks import Acks, ranges
-from fleet_service.ingest.dedup import Streams
+from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.inbox import Inbox, Intake, Message
 from fleet_service.ingest.rate_limit import Limits
 from fleet_service.ingest.validation import Clock
@@ -40,7 +40,7 @@ class Desk:
     def __init__(self, folder: Path) -> None:
         self.counts: Counter[str] = Counter()
         self.acks = Acks()
-        self.intake = Intake(Streams(), Pseudonyms(folder), self.counts, self.acks)
+        self.intake = Intake(SequenceTrackers(), Pseudonyms(folder), self.counts, self.acks)
 
     def take(self, *messages: Message) -> int:
         """Number of rows admitted."""

@@ -14,7 +14,7 @@ from edge_agent.estimators import ESTIMATORS, Estimates
 from edge_agent.estimators.estimates import ONE_FRICTION, Y
 from edge_agent.lab.evaluation import measures
 from edge_agent.lab.evaluation.bars import BARS, figures
-from edge_agent.lab.evaluation.batch import Batch, Scenario, ideal, realistic, repeated
+from edge_agent.lab.evaluation.batch import DriveSet, TestDrive, ideal, realistic, repeated
 from edge_agent.lab.evaluation.campaign import DEFAULT, Results
 from edge_agent.lab.evaluation.faults import CASES
 from edge_agent.lab.evaluation.paper_004 import noisy, variances
@@ -48,7 +48,7 @@ ASKED = {
 }  # fmt: skip
 
 
-def fake(mu: float, lower: float, upper: float, like: Batch) -> Estimates:
+def fake(mu: float, lower: float, upper: float, like: DriveSet) -> Estimates:
     """Estimates that tell the same friction all the time, and the true motion."""
     told, truth = np.zeros((*like.t.shape, ONE_FRICTION)), like.truth
     told[..., Y.VX], told[..., Y.VY], told[..., Y.YAW_RATE] = (
@@ -61,7 +61,7 @@ def fake(mu: float, lower: float, upper: float, like: Batch) -> Estimates:
 
 
 @pytest.fixture(scope="module")
-def jumping() -> Batch:
+def jumping() -> DriveSet:
     """Two drives whose friction falls from .85 to .5."""
     return realistic(replace(PAPERS["003.jump"], duration_s=5.0), range(2))
 
@@ -83,7 +83,7 @@ def test_every_printed_figure_names_a_scenario_and_an_estimator_that_exist() -> 
         assert row.same.split(".")[0] in ("ideal", "noise"), row
 
 
-def test_true_motion_has_no_error_and_a_constant_friction_the_error_it_has(jumping: Batch) -> None:
+def test_true_motion_has_no_error_and_a_constant_friction_the_error_it_has(jumping: DriveSet) -> None:
     found = measures.measures(jumping, fake(0.6, 0.45, 0.7, jumping))
     assert found["rmse_vx"] == pytest.approx([0.0, 0.0])
     assert found["nees"] == pytest.approx([0.0, 0.0])
@@ -94,7 +94,7 @@ def test_true_motion_has_no_error_and_a_constant_friction_the_error_it_has(jumpi
     assert found["width"] == pytest.approx([0.25, 0.25])
 
 
-def test_arrival_is_counted_from_the_change_and_what_never_arrives_counts_to_the_end(jumping: Batch) -> None:
+def test_arrival_is_counted_from_the_change_and_what_never_arrives_counts_to_the_end(jumping: DriveSet) -> None:
     assert measures.arrival(jumping, fake(0.55, 0.4, 0.7, jumping)) == pytest.approx([0.0, 0.0])
     late = fake(0.85, 0.7, 0.9, jumping)
     late.mu[-50:] = 0.5
@@ -103,7 +103,7 @@ def test_arrival_is_counted_from_the_change_and_what_never_arrives_counts_to_the
     assert (measures.arrival(jumping, fake(0.85, 0.7, 0.9, jumping)) > 1.0).all()
 
 
-def test_a_false_change_is_an_interval_that_stays_beside_the_truth(jumping: Batch) -> None:
+def test_a_false_change_is_an_interval_that_stays_beside_the_truth(jumping: DriveSet) -> None:
     said = fake(0.85, 0.1, 1.0, jumping)
     assert measures.false_changes(jumping, said).tolist() == [0.0, 0.0]
     said.mu_upper[20:30] = 0.3
@@ -133,7 +133,7 @@ def test_the_noise_of_paper_004_is_on_three_signals_and_follows_its_schedule() -
 
 @pytest.mark.parametrize("kind", FOREIGN)
 def test_foreign_tyres_make_another_drive(kind: str) -> None:
-    usual = Scenario("j-turn", SEDAN, 0.4, duration_s=2.0)
+    usual = TestDrive("j-turn", SEDAN, 0.4, duration_s=2.0)
     own, other = ideal(usual), ideal(foreign(usual, kind))
     assert np.abs(own.truth["true_vy"] - other.truth["true_vy"]).max() > 1e-3
 

@@ -7,7 +7,7 @@ import pytest
 
 from edge_agent.estimators import ESTIMATORS
 from edge_agent.lab.evaluation import faults
-from edge_agent.lab.evaluation.batch import Batch, realistic
+from edge_agent.lab.evaluation.batch import DriveSet, realistic
 from edge_agent.lab.evaluation.campaign import DEFAULT
 from edge_agent.lab.evaluation.faults import BEGINS, CASES, DRIVES, ENDS, harmed
 from schemas.signals import Health, S
@@ -23,7 +23,7 @@ HONEST = 0.75  # of the samples of six drives; one drive that is wrong to its en
 
 
 @pytest.fixture(scope="module")
-def slalom() -> Batch:
+def slalom() -> DriveSet:
     return realistic(DRIVES["slalom"], range(1))
 
 
@@ -47,7 +47,7 @@ def test_under_a_fault_the_interval_of_the_default_stays_honest() -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in CASES if name != "none"])
-def test_every_case_harms_signals_or_clock_only_where_it_says(name: str, slalom: Batch) -> None:
+def test_every_case_harms_signals_or_clock_only_where_it_says(name: str, slalom: DriveSet) -> None:
     broken = harmed(slalom, CASES[name])
     same = (broken.signals == slalom.signals) | (np.isnan(broken.signals) & np.isnan(slalom.signals))
     assert not same.all() or not np.array_equal(broken.t, slalom.t)
@@ -55,7 +55,7 @@ def test_every_case_harms_signals_or_clock_only_where_it_says(name: str, slalom:
     assert {int(i) for i in np.flatnonzero(~same.all(axis=(0, 1)))} <= channels
 
 
-def test_a_gap_and_late_samples_are_on_the_clock_alone(slalom: Batch) -> None:
+def test_a_gap_and_late_samples_are_on_the_clock_alone(slalom: DriveSet) -> None:
     steps = np.diff(harmed(slalom, CASES["time-gap"]).t[:, 0])
     assert steps.max() == pytest.approx(3.01)
     late = np.diff(harmed(slalom, CASES["sample-out-of-order"]).t[:, 0])

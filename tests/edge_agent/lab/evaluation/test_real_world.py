@@ -8,7 +8,7 @@ import pytest
 from edge_agent.estimators import Estimates
 from edge_agent.estimators.estimates import ONE_FRICTION, Y
 from edge_agent.lab.evaluation import real_world
-from edge_agent.lab.evaluation.batch import Batch
+from edge_agent.lab.evaluation.batch import DriveSet
 from edge_agent.lab.evaluation.real_world import PRIOR, SURFACES, Tally
 from edge_agent.lab.seeds import FIGURES
 from edge_agent.lab.tuning import objectives, study
@@ -18,12 +18,12 @@ from schemas.thresholds import GRAVITY
 
 
 @pytest.fixture(scope="module")
-def driven() -> tuple[Batch, FloatArray]:
+def driven() -> tuple[DriveSet, FloatArray]:
     """Six rough cars for forty seconds in a town of the figures."""
     return real_world.town(FIGURES, 6, 40.0)
 
 
-def saying(batch: Batch, lower: float, upper: float) -> Estimates:
+def saying(batch: DriveSet, lower: float, upper: float) -> Estimates:
     """Estimates that know the motion and always say the same of friction."""
     told = np.zeros((*batch.t.shape, ONE_FRICTION))
     for column, name in ((Y.VX, "vx"), (Y.VY, "vy"), (Y.YAW_RATE, "yaw_rate")):
@@ -33,13 +33,13 @@ def saying(batch: Batch, lower: float, upper: float) -> Estimates:
     return Estimates(told)
 
 
-def figures(driven: tuple[Batch, FloatArray], said: Estimates) -> dict[str, float]:
+def figures(driven: tuple[DriveSet, FloatArray], said: Estimates) -> dict[str, float]:
     tally = Tally()
     real_world.count(tally, driven[0], said, driven[1])
     return tally.means()
 
 
-def test_the_prior_is_always_right_and_never_tells_anything(driven: tuple[Batch, FloatArray]) -> None:
+def test_the_prior_is_always_right_and_never_tells_anything(driven: tuple[DriveSet, FloatArray]) -> None:
     found = figures(driven, saying(driven[0], *PRIOR))
     baseline = Tally()
     real_world.baseline(baseline, driven[0])
@@ -50,7 +50,7 @@ def test_the_prior_is_always_right_and_never_tells_anything(driven: tuple[Batch,
     assert 0.0 < baseline.means()["rmse_vx"] < 0.5
 
 
-def test_who_says_ice_of_every_road_is_right_on_ice_alone(driven: tuple[Batch, FloatArray]) -> None:
+def test_who_says_ice_of_every_road_is_right_on_ice_alone(driven: tuple[DriveSet, FloatArray]) -> None:
     found = figures(driven, saying(driven[0], 0.05, 0.2))
     assert [found[f"coverage90.{name}"] for name in ("snow", "wet", "dry")] == [0.0, 0.0, 0.0]
     assert found["false_ice"] == 1.0
@@ -58,7 +58,7 @@ def test_who_says_ice_of_every_road_is_right_on_ice_alone(driven: tuple[Batch, F
     assert found["score"] > 3.0
 
 
-def test_each_surface_and_cars_without_torque_are_met_in_a_town(driven: tuple[Batch, FloatArray]) -> None:
+def test_each_surface_and_cars_without_torque_are_met_in_a_town(driven: tuple[DriveSet, FloatArray]) -> None:
     batch, used = driven
     for above, most in SURFACES.values():
         assert ((batch.mu > above) & (batch.mu <= most)).any()
@@ -71,7 +71,7 @@ def test_each_surface_and_cars_without_torque_are_met_in_a_town(driven: tuple[Ba
     assert 0.0 < (real_world.lately(used) >= 0.6).mean() < 1.0
 
 
-def test_the_grip_in_use_never_exceeds_the_friction_where_it_is_one(driven: tuple[Batch, FloatArray]) -> None:
+def test_the_grip_in_use_never_exceeds_the_friction_where_it_is_one(driven: tuple[DriveSet, FloatArray]) -> None:
     batch, _ = driven
     one = np.ptp(batch.mu_wheel, axis=-1) == 0.0
     steady = one & (np.abs(np.gradient(batch.mu, axis=0)) == 0.0)

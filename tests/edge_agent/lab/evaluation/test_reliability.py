@@ -9,7 +9,7 @@ import pytest
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates
-from edge_agent.lab.evaluation.batch import Batch, estimates, realistic
+from edge_agent.lab.evaluation.batch import DriveSet, estimates, realistic
 from edge_agent.lab.evaluation.measures import bounds, consistency
 from edge_agent.lab.evaluation.reliability import LEVELS, between_quantiles, on_the_grid, shares, watched
 from edge_agent.lab.evaluation.scenarios import PAPERS
@@ -18,7 +18,7 @@ from tests.edge_agent.lab.evaluation.test_evaluation import fake
 
 
 @pytest.fixture(scope="module")
-def turning() -> Batch:
+def turning() -> DriveSet:
     return realistic(replace(PAPERS["003.turn"], duration_s=4.0), range(3))
 
 
@@ -55,7 +55,7 @@ def test_an_end_that_the_range_cuts_off_does_not_narrow_the_gaussian() -> None:
 
 
 @pytest.mark.parametrize("estimator", ["aco-fckf", "sr-ukf"])
-def test_watching_a_drive_changes_nothing_that_is_said_of_it(estimator: str, turning: Batch) -> None:
+def test_watching_a_drive_changes_nothing_that_is_said_of_it(estimator: str, turning: DriveSet) -> None:
     plain = estimates(bank_of(estimator, turning.vehicles), turning)
     said, ranks = watched(bank_of(estimator, turning.vehicles), turning)
     assert np.array_equal(plain.told, said.told)
@@ -63,7 +63,7 @@ def test_watching_a_drive_changes_nothing_that_is_said_of_it(estimator: str, tur
     assert ((ranks >= 0.0) & (ranks <= 1.0)).all()
 
 
-def test_the_whole_posterior_of_the_default_has_the_quantiles_that_it_tells_within_a_bin(turning: Batch) -> None:
+def test_the_whole_posterior_of_the_default_has_the_quantiles_that_it_tells_within_a_bin(turning: DriveSet) -> None:
     said, _ = watched(bank_of("aco-fckf", turning.vehicles), turning)
     for level, told in ((0.05, said.mu_lower), (0.5, said.mu), (0.95, said.mu_upper)):
         for side in (-1.0, 1.0):
@@ -73,7 +73,9 @@ def test_the_whole_posterior_of_the_default_has_the_quantiles_that_it_tells_with
             assert (side * (ranks - level) > 0.0).all()
 
 
-def test_consistency_is_full_where_the_spread_is_right_and_none_where_it_is_ten_times_too_small(turning: Batch) -> None:
+def test_consistency_is_full_where_the_spread_is_right_and_none_where_it_is_ten_times_too_small(
+    turning: DriveSet,
+) -> None:
     said = fake(0.35, 0.3, 0.4, turning)
     rng = np.random.default_rng(2)
     right, wrong = Estimates(said.told.copy()), Estimates(said.told.copy())

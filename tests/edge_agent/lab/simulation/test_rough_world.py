@@ -20,7 +20,7 @@ from edge_agent.lab.simulation import (
     simulate_manoeuvre,
 )
 from edge_agent.lab.simulation.misaligned import DEVICE_OF, DEVICES, WIDE, M, Misalignment, misalignment_row
-from edge_agent.lab.simulation.plant import INPUTS, STATES, U, W, X, advance, command, held, start_at, wheel_forces
+from edge_agent.lab.simulation.plant import INPUTS, STATES, Body, U, W, advance, command, held, start_at, wheel_forces
 from edge_agent.lab.simulation.relief import STEEPEST, gradient, tilt
 from edge_agent.lab.simulation.roads import L
 from edge_agent.lab.simulation.scenarios import scenario_named
@@ -92,14 +92,14 @@ def test_a_coasting_vehicle_gains_what_it_falls_and_no_more(slope: float) -> Non
     command(p, u, 0.0, 0.0)
 
     def energy() -> float:
-        turning = 0.5 * p[P.WHEEL_INERTIA] * (x[X.OMEGA : X.OMEGA + 4] ** 2).sum()
-        return float(0.5 * p[P.MASS] * x[X.VX] ** 2 + turning + p[P.MASS] * GRAVITY * sine(slope) * x[X.X])
+        turning = 0.5 * p[P.WHEEL_INERTIA] * (x[Body.OMEGA : Body.OMEGA + 4] ** 2).sum()
+        return float(0.5 * p[P.MASS] * x[Body.VX] ** 2 + turning + p[P.MASS] * GRAVITY * sine(slope) * x[Body.X])
 
     before = energy()
     for _ in range(50):
         advance(x, p, u, w, 1e-3, 100)
         assert before * (1 - 1e-3) < energy() <= before * (1 + 1e-5)
-    assert (x[X.VX] - 15.0) * slope < 0.0
+    assert (x[Body.VX] - 15.0) * slope < 0.0
 
 
 def test_loads_add_up_to_the_weight_that_is_normal_to_the_road_and_move_downhill() -> None:
@@ -121,8 +121,8 @@ def test_brakes_hold_what_they_can_and_tyres_what_the_road_allows() -> None:
         command(p, u, 0.0, force)
         assert held(x, p, u) == stays
         advance(x, p, u, w, 1e-3, 2000)
-        assert (x[X.VX] == 0.0) == stays
-        assert (x[X.X] < -0.1) == (not stays)
+        assert (x[Body.VX] == 0.0) == stays
+        assert (x[Body.X] < -0.1) == (not stays)
 
 
 @pytest.mark.parametrize("slope", [-0.08, 0.0, 0.08])

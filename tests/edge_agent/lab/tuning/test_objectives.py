@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.app.tuned_memberships import WAYS, Comparison, Score, load
+from edge_agent.app.tuned_memberships import WAYS, Score, SplitScores, load
 from edge_agent.cli import tune
 from edge_agent.lab.tuning.objectives import (
     HELD_OUT,
     OBJECTIVES,
     TRAIN,
-    Recorded,
-    Worth,
+    TuningScores,
+    TuningSet,
     choices,
     interval_score,
     objective_on,
@@ -30,12 +30,12 @@ ESTIMATOR = tune.ESTIMATOR
 
 
 @pytest.fixture(scope="module")
-def drives() -> Recorded:
+def drives() -> TuningSet:
     """Three short drives of the training set, one of them with noisy sensors."""
     return record(TRAIN[:3], 4.0)
 
 
-def test_recorded_drives_stand_side_by_side(drives: Recorded) -> None:
+def test_recorded_drives_stand_side_by_side(drives: TuningSet) -> None:
     assert drives.signals.shape == (400, 3, len(CHANNELS))
     assert drives.t.shape == drives.mu.shape == (400, 3)
     assert len(drives.vehicles) == 3
@@ -49,18 +49,18 @@ def test_drives_that_judge_share_no_seed_and_no_setting_with_those_that_are_sear
     assert not searched & judged
 
 
-def test_worth_is_finite_and_the_same_every_time(drives: Recorded) -> None:
+def test_worth_is_finite_and_the_same_every_time(drives: TuningSet) -> None:
     first, second = (worth(Memberships(), drives, ESTIMATOR) for _ in range(2))
     assert first == second
     assert np.isfinite(astuple(first)).all()
     assert 0.0 <= first.coverage <= 1.0
 
 
-def test_worth_of_several_drives_is_the_mean_of_each(drives: Recorded) -> None:
+def test_worth_of_several_drives_is_the_mean_of_each(drives: TuningSet) -> None:
     single = [
         worth(
             Memberships(),
-            Recorded((vehicle,), drives.t[:, [n]], drives.signals[:, [n]], drives.mu[:, [n]]),
+            TuningSet((vehicle,), drives.t[:, [n]], drives.signals[:, [n]], drives.mu[:, [n]]),
             ESTIMATOR,
         )
         for n, vehicle in enumerate(drives.vehicles)
@@ -81,14 +81,14 @@ def test_interval_score_is_least_at_the_true_quantiles() -> None:
     assert scores[1.645] < min(scores[1.2], scores[2.2])
 
 
-def test_inflated_noise_does_not_win_the_innovation_likelihood(drives: Recorded) -> None:
+def test_inflated_noise_does_not_win_the_innovation_likelihood(drives: TuningSet) -> None:
     """R times 4.5 makes the innovations less likely than R as it is, however seldom it is surprised."""
     usual, inflated = (worth(Memberships(ln_scales=(s, s)), drives, ESTIMATOR) for s in (0.0, 1.5))
     assert inflated.log_likelihood < usual.log_likelihood
     assert inflated.nis_ratio < usual.nis_ratio
 
 
-def test_each_objective_maximises_its_own_score(drives: Recorded) -> None:
+def test_each_objective_maximises_its_own_score(drives: TuningSet) -> None:
     vector = Memberships().to_vector()
     found = worth(Memberships(), drives, ESTIMATOR)
     assert set(OBJECTIVES) == {"interval", "innovation"}
@@ -96,12 +96,12 @@ def test_each_objective_maximises_its_own_score(drives: Recorded) -> None:
     assert objective_on(drives, ESTIMATOR, "innovation")(vector) == found.log_likelihood
 
 
-def test_vector_that_is_no_membership_counts_as_the_worst(drives: Recorded) -> None:
+def test_vector_that_is_no_membership_counts_as_the_worst(drives: TuningSet) -> None:
     vector = Memberships().to_vector()
     assert objective_on(drives, ESTIMATOR, "interval")(np.full_like(vector, np.nan)) == -np.inf
 
 
-def test_an_unknown_objective_is_refused(drives: Recorded) -> None:
+def test_an_unknown_objective_is_refused(drives: TuningSet) -> None:
     with pytest.raises(InputError, match="objective"):
         objective_on(drives, ESTIMATOR, "rmse")
 
@@ -133,8 +133,8 @@ def test_quick_tuning_writes_a_valid_file_and_says_what_it_does(
     tuned = load(out)
     scores, provenance = tuned.document.scores, tuned.document.provenance
     for way in ("random", "colony"):
-        gain = OBJECTIVES[objective](Worth(**scores[way].train.model_dump()))
-        assert gain >= OBJECTIVES[objective](Worth(**scores["default"].train.model_dump()))
+        gain = OBJECTIVES[objective](TuningScores(**scores[way].train.model_dump()))
+        assert gain >= OBJECTIVES[objective](TuningScores(**scores["default"].train.model_dump()))
     assert provenance.command == f"edge-agent tune --seed 4 --ants 3 --iterations 2 --objective {objective} --quick"
     assert provenance.budget.evaluations == {"random": 6, "colony": 6}
 
@@ -156,10 +156,10 @@ def test_progress_line_tells_iteration_best_mean_elapsed_and_remaining_time() ->
 
 def test_table_has_a_row_per_way_and_set_of_drives() -> None:
     score = Score(interval_score=0.5, coverage=0.9, log_likelihood=1.0, nis_ratio=1.1)
-    rows = tune.table({way: Comparison(train=score, held_out=score) for way in WAYS}).splitlines()[1:]
+    rows = tune.table({way: SplitScores(train=score, held_out=score) for way in WAYS}).splitlines()[1:]
     assert [row.split()[0] for row in rows] == [way for way in WAYS for _ in range(2)]
 
 
-def test_another_drive_of_the_set_gives_another_worth(drives: Recorded) -> None:
+def test_another_drive_of_the_set_gives_another_worth(drives: TuningSet) -> None:
     other = record((replace(TRAIN[0], seed=77), *TRAIN[1:3]), 4.0)
     assert worth(Memberships(), other, ESTIMATOR) != worth(Memberships(), drives, ESTIMATOR)

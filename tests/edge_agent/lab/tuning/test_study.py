@@ -13,7 +13,7 @@ from edge_agent.app.tuned_memberships import WAYS, load
 from edge_agent.cli import main
 from edge_agent.lab.simulation.white import SCHEDULE
 from edge_agent.lab.tuning import study, study_report
-from edge_agent.lab.tuning.study import CONDITIONS, HELD_OUT, TRAIN, VARIANCE, Recorded, overall, record, search, worth
+from edge_agent.lab.tuning.study import CONDITIONS, HELD_OUT, TRAIN, VARIANCE, StudySet, overall, record, search, worth
 from schemas.runtime.figures import Figure
 from schemas.signals import S
 
@@ -21,7 +21,7 @@ STILL = study_report.GIVEN["fixed"]
 
 
 @pytest.fixture(scope="module")
-def drives() -> Recorded:
+def drives() -> StudySet:
     """Two of the drives that are searched on, six seconds each."""
     return record(TRAIN[:2])
 
@@ -31,7 +31,7 @@ def test_drives_that_judge_share_neither_seed_nor_manoeuvre_with_those_that_are_
         assert not {getattr(drive, name) for drive in TRAIN} & {getattr(drive, name) for drive in HELD_OUT}
 
 
-def test_noise_lies_on_three_signals_alone_and_follows_the_schedule(drives: Recorded) -> None:
+def test_noise_lies_on_three_signals_alone_and_follows_the_schedule(drives: StudySet) -> None:
     right, schedule = drives.signals["right"], drives.signals["schedule"]
     differs = (right != schedule) & ~(np.isnan(right) & np.isnan(schedule))
     assert set(np.flatnonzero(differs.any(axis=(0, 1)))) == {S.AX, S.AY, S.YAW_RATE}
@@ -46,7 +46,7 @@ def test_conditions_say_what_the_filter_takes_the_noise_for() -> None:
     assert scales == pytest.approx([1.0, 0.1, 10.0])
 
 
-def test_without_adaptation_the_right_noise_is_the_most_likely_and_its_nis_is_one(drives: Recorded) -> None:
+def test_without_adaptation_the_right_noise_is_the_most_likely_and_its_nis_is_one(drives: StudySet) -> None:
     right, small, large = (worth(STILL, drives, name) for name in ("right", "too-small", "too-large"))
     assert right.log_likelihood > max(small.log_likelihood, large.log_likelihood) + 50.0
     assert right.nis == pytest.approx(1.0, abs=0.1)
@@ -54,14 +54,14 @@ def test_without_adaptation_the_right_noise_is_the_most_likely_and_its_nis_is_on
     assert large.nis < 0.15
 
 
-def test_adaptation_recovers_most_of_what_a_wrong_noise_costs(drives: Recorded) -> None:
+def test_adaptation_recovers_most_of_what_a_wrong_noise_costs(drives: StudySet) -> None:
     best = worth(STILL, drives, "right").log_likelihood
     for name in ("too-small", "too-large"):
         lost, left = (best - worth(sets, drives, name).log_likelihood for sets in (STILL, Memberships()))
         assert left < 0.2 * lost
 
 
-def test_a_search_is_never_worse_than_the_untuned_sets_and_the_same_every_time(drives: Recorded) -> None:
+def test_a_search_is_never_worse_than_the_untuned_sets_and_the_same_every_time(drives: StudySet) -> None:
     for way in study.WAYS:
         first, again = (search(way, drives, ants=3, iterations=2, positions=7, seed=5) for _ in range(2))
         assert first.value >= overall(Memberships(), drives)
