@@ -110,6 +110,14 @@ def bounds(cell: ArrayLike, zoom: int = CELL_ZOOM) -> tuple[FloatArray, FloatArr
     return _longitude(x, zoom), _latitude(y + 1, zoom), _longitude(x + 1, zoom), _latitude(y, zoom)
 
 
+def touches(
+    box: tuple[float, float, float, float], area: tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]
+) -> NDArray[np.bool_]:
+    """Whether areas and a box, each given as west, south, east, north [deg], share more than a border."""
+    west, south, east, north = (np.asarray(side) for side in area)
+    return np.asarray((east > box[0]) & (north > box[1]) & (west < box[2]) & (south < box[3]))
+
+
 def neighbours(cell: ArrayLike, zoom: int = CELL_ZOOM) -> IntArray:
     """The eight cells around a cell, (…, 8), row by row from the north-west; columns wrap, beyond the poles is -1."""
     n = 1 << zoom

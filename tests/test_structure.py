@@ -68,7 +68,10 @@ PURE = (
 # Beside it, what turns one thing in memory into another: tables and messages too, but no input or output either.
 SANS_IO = (
     *(f"fleet_service/ingest/{name}.py" for name in ("acks", "validation")),
-    *(f"fleet_service/serve/{name}.py" for name in ("map_state", "neighbour_fill", "query", "tile_cache")),
+    *(
+        f"fleet_service/serve/{name}.py"
+        for name in ("encode", "map_state", "neighbour_fill", "query", "tile_cache", "view")
+    ),
 )
 IMPURE = {
     "asyncio", "datetime", "duckdb", "http", "logging", "multiprocessing", "os", "pathlib", "pyarrow", "random",

@@ -35,9 +35,10 @@ from fleet_service.replay import checkpoints
 from fleet_service.replay.checkpoint_tables import fusion_from, tables_of
 from fleet_service.replay.rebuild import Since, replay, restore_streams
 from fleet_service.serve.alerts import Alerts
-from fleet_service.serve.map_state import MapState, cell_table
+from fleet_service.serve.encode import cell_table
+from fleet_service.serve.map_state import MapState
 from fleet_service.serve.query import answer
-from fleet_service.serve.tile_cache import Tiles
+from fleet_service.serve.tile_cache import TileCache
 from schemas import grid, wire
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
@@ -85,7 +86,7 @@ class Engine:
         self._alerts = Alerts(self.fusion)
         self._alerts.resume(standing)
         self._guard = threading.Lock()
-        self._tiles = Tiles(self.map, self._guard, config.public_vehicles)
+        self._tiles = TileCache(self.map, self._guard, config.public_vehicles)
         self._acks = Acks()
         streams = SequenceTrackers()
         self._intake = Intake(streams, Pseudonyms(root / "keys"), self.counts, self._acks)
@@ -183,7 +184,7 @@ class Engine:
             self.map.changed(updated.slots)
             raised = self._alerts.updated(updated.slots)
             if raised:
-                self._tiles.settle()
+                self._tiles.acknowledge()
         rows["late"], rows["weight"] = updated.late, updated.weight
         self.counts["late"] += int(updated.late.sum())
         return raised
@@ -234,7 +235,7 @@ class Engine:
             self.failing = True
         else:
             self.failing = False
-            self._tiles.settle()
+            self._tiles.acknowledge()
         return self._acks.messages()
 
     def tiles(self, now: int) -> list[tuple[int, bytes]]:
@@ -279,7 +280,7 @@ class Engine:
                 pass  # folding is what counts; the alerts of then are history
         except OSError as error:
             raise InputError("at", f"the archive cannot be read ({error.strerror})", "ask again later") from error
-        return answer(Tiles(MapState(past), nullcontext(), least), query, wanted, at, only)
+        return answer(TileCache(MapState(past), nullcontext(), least), query, wanted, at, only)
 
 
 def _box(query: MapQuery) -> tuple[float, float, float, float] | None:

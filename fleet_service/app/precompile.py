@@ -16,7 +16,7 @@ from fleet_service.fusion.likelihoods import at_least, levelled
 from fleet_service.fusion.shape import unshaped
 from fleet_service.fusion.space import shares
 from fleet_service.serve.alerts import Alerts
-from fleet_service.serve.map_state import cell_table
+from fleet_service.serve.encode import cell_table
 from schemas import mugrid
 from schemas.runtime.jit import kernel_cache
 

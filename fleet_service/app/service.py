@@ -25,7 +25,7 @@ from fleet_service.enrolment.fleet import Enrolment
 from fleet_service.ingest.inbox import Inbox, Message
 from fleet_service.ingest.rate_limit import Limits
 from fleet_service.ingest.weather import Heard
-from fleet_service.serve.queryable import Replies
+from fleet_service.serve.queryable import MapQueryable
 from schemas import grid, keys, wire
 from schemas.config import ServiceConfig, load
 from schemas.query import MapQuery
@@ -58,7 +58,7 @@ class Service:
         self.engine = Engine(config, root)
         self._clock = SteadyClock(self.engine.seen)
         limits = Limits(config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, known, self.engine.counts)
-        self._replies = Replies(self._answer, self.engine.counts)
+        self._replies = MapQueryable(self._answer, self.engine.counts)
         self.inbox = Inbox(config.queue_batches, self.engine.counts, limits)
         self.failure: BaseException | None = None  # of the worker; leaving the session after it may hang
         self._session: zenoh.Session | None = None

@@ -79,9 +79,7 @@ def _inside(table: pa.Table, bbox: Box | None) -> pa.Table:
     """Cells that touch a box."""
     if bbox is None:
         return table
-    west, south, east, north = grid.bounds(table["cell"].to_numpy())
-    keep = (east > bbox[0]) & (north > bbox[1]) & (west < bbox[2]) & (south < bbox[3])
-    return table.filter(pa.array(np.asarray(keep)))
+    return table.filter(pa.array(grid.touches(bbox, grid.bounds(table["cell"].to_numpy()))))
 
 
 def write(table: pa.Table, path: Path) -> None:

@@ -121,8 +121,7 @@ def watch(connection: ZenohSettings, bbox: str | None, stop: threading.Event, sa
         tile = keys.parse(key).place
         if tile is None or box is None:
             return tile
-        west, south, east, north = grid.bounds(tile, grid.TILE_ZOOM)
-        return tile if east > box[0] and north > box[1] and west < box[2] and south < box[3] else None
+        return tile if grid.touches(box, grid.bounds(tile, grid.TILE_ZOOM)) else None
 
     def changed(sample: zenoh.Sample) -> None:
         tile = near(str(sample.key_expr))

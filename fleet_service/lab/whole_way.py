@@ -19,7 +19,7 @@ from fleet_service.fusion import Fusion, Observations, observations_of
 from fleet_service.lab.drive import LATENESS_S
 from fleet_service.lab.score import Scores, of_beliefs, safe
 from fleet_service.serve.alerts import Alerts
-from fleet_service.serve.map_state import LOWER, UPPER, measured
+from fleet_service.serve.view import LOWER, UPPER, measured
 from schemas import grid, mugrid, wire
 from schemas.errors import InputError
 from schemas.numeric import FloatArray, IntArray

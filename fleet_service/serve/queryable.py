@@ -24,7 +24,7 @@ TEXT: Final = "text/plain"
 Answering = Callable[[MapQuery, Callable[[int], bool], int | None], Iterable[tuple[int, bytes]]]
 
 
-class Replies:
+class MapQueryable:
     """The callback of the queryables.
 
     Args:
@@ -37,56 +37,56 @@ class Replies:
         self._answer, self._counts = answer, counts
         self._past = threading.Lock()
 
-    def __call__(self, asked: zenoh.Query) -> None:
+    def __call__(self, request: zenoh.Query) -> None:
         """Answer one query, now or a little later."""
         self._counts["queries"] += 1
         try:
-            pairs: Iterable[tuple[str, str]] = asked.parameters  # type: ignore[assignment] # stub: no iterable
+            pairs: Iterable[tuple[str, str]] = request.parameters  # type: ignore[assignment] # stub: no iterable
             wanted = query.parse({name: value for name, value in pairs if not name.startswith("_")})  # Zenoh's own
         except InputError as error:
-            self._refuse(asked, error)
+            self._refuse(request, error)
             return
         if wanted.at is None:
-            self._reply(asked, wanted)
+            self._reply(request, wanted)
         elif self._past.acquire(blocking=False):
-            threading.Thread(target=self._rebuild, args=(asked, wanted), name="past", daemon=True).start()
+            threading.Thread(target=self._answer_past, args=(request, wanted), name="past", daemon=True).start()
         else:
-            self._refuse(asked, InputError("at", "another past is being rebuilt", "ask again later"))
+            self._refuse(request, InputError("at", "another past is being rebuilt", "ask again later"))
 
-    def _rebuild(self, asked: zenoh.Query, wanted: MapQuery) -> None:
+    def _answer_past(self, request: zenoh.Query, wanted: MapQuery) -> None:
         try:
-            self._reply(asked, wanted)
+            self._reply(request, wanted)
         finally:
             self._past.release()
 
-    def _reply(self, asked: zenoh.Query, wanted: MapQuery) -> None:
-        with asked:
+    def _reply(self, request: zenoh.Query, wanted: MapQuery) -> None:
+        with request:
             try:
-                self._send(asked, wanted)
+                self._send(request, wanted)
             except InputError as error:
-                self._refuse(asked, error)
+                self._refuse(request, error)
             except zenoh.ZError:  # the session closed meanwhile: nobody is there to hear it
                 pass
             except Exception as error:  # whatever it is: a query that ends without a reply says that there is no data
                 self._counts["answer_failures"] += 1
                 log.exception("a query could not be answered")
-                asked.reply_err(
+                request.reply_err(
                     f"query: could not be answered ({type(error).__name__}); ask again later", encoding=TEXT
                 )
 
-    def _send(self, asked: zenoh.Query, wanted: MapQuery) -> None:
-        expression = asked.key_expr
+    def _send(self, request: zenoh.Query, wanted: MapQuery) -> None:
+        expression = request.key_expr
         only = _tile(str(expression))
         for tile, payload in self._answer(
             wanted, lambda t: t == only or expression.intersects(zenoh.KeyExpr(keys.map_key(t))), only
         ):
-            asked.reply(keys.map_key(tile), payload, encoding=wanted.format.encoding)
+            request.reply(keys.map_key(tile), payload, encoding=wanted.format.encoding)
 
-    def _refuse(self, asked: zenoh.Query, error: InputError) -> None:
+    def _refuse(self, request: zenoh.Query, error: InputError) -> None:
         field = error.field if error.field in MapQuery.model_fields else "query"  # else the asker's own word
         self._counts[f"bad_queries.{field}"] += 1
-        with asked:
-            asked.reply_err(str(error), encoding=TEXT)
+        with request:
+            request.reply_err(str(error), encoding=TEXT)
 
 
 @lru_cache(1 << 12)

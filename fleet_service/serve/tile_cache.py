@@ -15,37 +15,44 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from fleet_service.serve.map_state import MapState, arrow_stream, cells_at, map_batch
+from fleet_service.serve.encode import arrow_stream, batch_of
+from fleet_service.serve.map_state import MapState
+from fleet_service.serve.view import CellView, view
 from schemas import grid
 from schemas.numeric import IntArray
 from schemas.thresholds import NS
 
 SHOWN_NS: Final = NS  # as old as a tile that is put once a second may be
 KEPT_BYTES: Final = 32 << 20
-FILTERED: Final = ("vehicles", "west", "south", "east", "north")  # columns by which a question chooses cells
+SELECTED_BY: Final = ("vehicles", "west", "south", "east", "north")  # columns by which a query selects cells
+
+NOTHING: Final = (math.inf, math.inf, -math.inf, -math.inf)  # an area that no box touches
 
 
-class Shown(NamedTuple):
-    """A tile's public cells.
+class ShownTile(NamedTuple):
+    """Cells of a tile.
 
     Attributes:
-        payload: as an Arrow stream.
-        cells: the same, from south to north; shares the payload's memory.
-        columns: FILTERED as arrays (k,).
-        common: what all cells have: so many vehicles, an eastern border east of this and a western one west of this.
+        cells: in the schema of the map.
+        columns: SELECTED_BY as arrays (k,).
+        payload: all cells as an Arrow stream, of which `cells` shares the memory, from south to north; empty where
+            the cells have another order and are used once.
+        least: vehicles that every cell has.
+        common: west, south, east and north that all cells touch, where they lie from south to north.
         made: when [ns].
         change: the last change of the map that is in it.
     """
 
-    payload: bytes
     cells: pa.RecordBatch
     columns: Mapping[str, NDArray[Any]]
-    common: tuple[int, float, float]
-    made: int
-    change: int
+    payload: bytes = b""
+    least: int = 0
+    common: tuple[float, float, float, float] = NOTHING
+    made: int = 0
+    change: int = 0
 
 
-class Tiles:
+class TileCache:
     """The tiles of a map.
 
     Args:
@@ -56,31 +63,31 @@ class Tiles:
 
     def __init__(self, state: MapState, guard: AbstractContextManager[Any], least: int) -> None:
         self.state, self.guard, self._least = state, guard, least
-        self._kept: dict[int, Shown] = {}
+        self._kept: dict[int, ShownTile] = {}
         self._held = 0  # bytes
-        self._settled = 0  # change up to which all must be seen
+        self._acknowledged = 0  # change up to which all must be seen
 
-    def settle(self) -> None:
-        """All that the map holds now is promised to somebody: no tile without it is shown from here on."""
-        self._settled = self.state.change
+    def acknowledge(self) -> None:
+        """Note that all the map holds now was acknowledged or alerted: no tile without it is shown from here on."""
+        self._acknowledged = self.state.change
 
-    def shown(self, tile: int, now: int) -> Shown:
-        """A tile that is good enough for a question at `now` [ns]."""
+    def shown(self, tile: int, now: int) -> ShownTile:
+        """A tile that is good enough for a query at `now` [ns]."""
         kept = self._kept.get(tile)
         if kept is None or not 0 <= now - kept.made <= SHOWN_NS:
             return self.make(tile, now)
-        whole = kept.change >= min(self._settled, self.state.changed_at(tile))
+        whole = kept.change >= min(self._acknowledged, self.state.changed_at(tile))
         return kept if whole else self.make(tile, now)
 
-    def make(self, tile: int, now: int) -> Shown:
+    def make(self, tile: int, now: int) -> ShownTile:
         """A tile as it is believed at `now` [ns]."""
         with self.guard:
             change = self.state.change
-            cells = cells_at(self.state.fusion, self._public(self.state.slots(tile)), now)
-        payload = arrow_stream(map_batch(cells))
+            cells = view(self.state.fusion, self._public(self.state.slots(tile)), now)
+        payload = arrow_stream(batch_of(cells, now))
         batch = pa.ipc.open_stream(payload).read_next_batch()
-        columns = filtered(batch)
-        made = Shown(payload, batch, columns, _common(columns), now, change)
+        columns = selected_by(batch)
+        made = ShownTile(batch, columns, payload, *_common(columns), now, change)
         self._keep(tile, made)
         return made
 
@@ -91,7 +98,7 @@ class Tiles:
         _, row = grid.deinterleave(live.key[public] // grid.SECTORS)
         return public[np.argsort(-row, kind="stable")]
 
-    def _keep(self, tile: int, made: Shown) -> None:
+    def _keep(self, tile: int, made: ShownTile) -> None:
         with self.guard:
             self._drop(tile)
             self._kept[tile] = made
@@ -104,12 +111,19 @@ class Tiles:
         self._held -= len(kept.payload) if kept else 0
 
 
-def _common(columns: Mapping[str, NDArray[Any]]) -> tuple[int, float, float]:
+def used_once(cells: CellView, now: int) -> ShownTile:
+    """Cells in an order of their own, which are shown to one asker."""
+    batch = batch_of(cells, now)
+    return ShownTile(batch, selected_by(batch))
+
+
+def _common(columns: Mapping[str, NDArray[Any]]) -> tuple[int, tuple[float, float, float, float]]:
     if not len(columns["vehicles"]):
-        return 0, -math.inf, math.inf
-    return int(columns["vehicles"].min()), float(columns["east"].min()), float(columns["west"].max())
+        return 0, NOTHING
+    west, east = float(columns["west"].max()), float(columns["east"].min())
+    return int(columns["vehicles"].min()), (west, -math.inf, east, math.inf)
 
 
-def filtered(cells: pa.RecordBatch) -> dict[str, NDArray[Any]]:
-    """The columns by which a question chooses cells."""
-    return {name: cells[name].to_numpy() for name in FILTERED}
+def selected_by(cells: pa.RecordBatch) -> dict[str, NDArray[Any]]:
+    """The columns by which a query selects cells."""
+    return {name: cells[name].to_numpy() for name in SELECTED_BY}

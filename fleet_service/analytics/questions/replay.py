@@ -12,7 +12,7 @@ from fleet_service.analytics.options import Options
 from fleet_service.fusion import Fusion
 from fleet_service.ingest.weather import archived
 from fleet_service.replay.rebuild import Since, replay
-from fleet_service.serve.map_state import cell_table
+from fleet_service.serve.encode import cell_table
 from schemas import grid, tables
 from schemas.thresholds import NS
 

@@ -22,7 +22,7 @@ from fleet_service.archive.compaction import compact
 from fleet_service.archive.export import Extract
 from fleet_service.fusion import Fusion
 from fleet_service.replay.rebuild import Since, replay
-from fleet_service.serve.map_state import cell_table
+from fleet_service.serve.encode import cell_table
 from schemas.numeric import IntArray
 from schemas.wire import Kind
 

@@ -17,7 +17,7 @@ from fleet_service.analytics.synthetic import START_NS
 from fleet_service.archive.export import Extract
 from fleet_service.fusion import Fusion
 from fleet_service.replay.rebuild import Since, replay
-from fleet_service.serve.map_state import cell_table
+from fleet_service.serve.encode import cell_table
 from schemas import grid
 from schemas.errors import InputError
 from schemas.thresholds import Z_95

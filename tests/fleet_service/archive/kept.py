@@ -29,7 +29,7 @@ from fleet_service.archive.compaction import compact
 from fleet_service.ingest.inbox import Message
 from fleet_service.ingest.weather import Heard
 from fleet_service.replay import checkpoints
-from fleet_service.serve.map_state import cell_table
+from fleet_service.serve.encode import cell_table
 from schemas import grid, keys, weather, wire
 from schemas.config import ServiceConfig
 from schemas.wire import Batch, Kind

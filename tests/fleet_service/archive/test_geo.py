@@ -14,7 +14,7 @@ import pytest
 from fleet_service.archive import export, geo, snapshots
 from fleet_service.archive.files import MAP, write_table
 from fleet_service.fusion import Fusion
-from fleet_service.serve.map_state import cell_table
+from fleet_service.serve.encode import cell_table
 from schemas import grid, tables
 from tests.fleet_service.examples import CELL, START, observations, value
 

@@ -29,6 +29,13 @@ _rising = st.lists(st.floats(0.0, 1.0), min_size=32, max_size=32).map(np.sort).f
 _steps = st.lists(st.integers(0, 255), min_size=32, max_size=32).map(lambda e: np.array(e, np.uint8))
 
 
+@given(st.lists(st.floats(0.0, 1.0), min_size=64, max_size=64), st.floats(0.0, 1.0))
+def test_quantiles_are_those_of_the_contract_bit_for_bit(bins: list[float], level: float) -> None:
+    belief = np.array(bins).reshape(2, 32)
+    expected = [mugrid.quantiles(belief, q) for q in (level, 0.5)]
+    np.testing.assert_array_equal(b.quantiles(belief, (level, 0.5)), expected)
+
+
 @given(_steps, st.floats(0.0, 1e6), st.floats(0.15, 1.0), st.floats(0.0, 1.0))
 def test_a_belief_stays_a_probability_whatever_time_and_votes_do(
     evidence: np.ndarray, seconds: float, contamination: float, power: float

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pytest
 import zenoh
 
-from fleet_service.serve.queryable import Replies
+from fleet_service.serve.queryable import MapQueryable
 from schemas import keys
 from schemas.query import MapQuery
 from tests.fleet_service.examples import TILE
@@ -38,7 +38,7 @@ def test_an_answer_that_fails_on_the_way_is_an_error_and_the_next_one_is_answere
 
     counts: Counter[str] = Counter()
     key = keys.map_key(TILE)
-    queryable = session.declare_queryable(key, Replies(answer, counts), complete=True)
+    queryable = session.declare_queryable(key, MapQueryable(answer, counts), complete=True)
     querier = session.declare_querier(key)
     matched(querier)
     first = texts(session, key + parameters)

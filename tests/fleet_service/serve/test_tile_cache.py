@@ -11,7 +11,7 @@ from fleet_service.fusion import Fusion
 from fleet_service.serve import tile_cache
 from fleet_service.serve.map_state import MapState
 from fleet_service.serve.query import answer
-from fleet_service.serve.tile_cache import Tiles
+from fleet_service.serve.tile_cache import TileCache
 from schemas import grid
 from schemas.query import MapQuery
 from schemas.wire.tile import decode_tile
@@ -32,12 +32,12 @@ def state() -> MapState:
     return made
 
 
-def vehicles(made: Tiles, now: int, tile: int = TILE) -> list[int]:
+def vehicles(made: TileCache, now: int, tile: int = TILE) -> list[int]:
     return [int(n) for n in made.shown(tile, now).columns["vehicles"]]
 
 
 def test_an_unchanged_tile_is_shown_again_for_a_second_and_then_made_anew(state: MapState) -> None:
-    made = Tiles(state, nullcontext(), 1)
+    made = TileCache(state, nullcontext(), 1)
     first = made.shown(TILE, NOW)
     assert made.shown(TILE, NOW + tile_cache.SHOWN_NS) is first
     later = made.shown(TILE, NOW + tile_cache.SHOWN_NS + 1)
@@ -46,35 +46,35 @@ def test_an_unchanged_tile_is_shown_again_for_a_second_and_then_made_anew(state:
 
 
 def test_a_change_is_seen_at_once_when_it_was_acknowledged_and_within_a_second_anyway(state: MapState) -> None:
-    made = Tiles(state, nullcontext(), 1)
+    made = TileCache(state, nullcontext(), 1)
     assert vehicles(made, NOW) == [1]
     visit(state, 2)
     assert vehicles(made, NOW + 1) == [1]  # nobody was promised the second
     assert vehicles(made, NOW + tile_cache.SHOWN_NS + 1) == [2]
     visit(state, 3)
-    made.settle()
+    made.acknowledge()
     assert vehicles(made, NOW + tile_cache.SHOWN_NS + 1) == [3]
 
 
 def test_a_promise_about_another_tile_does_not_make_this_one_anew(state: MapState) -> None:
-    made = Tiles(state, nullcontext(), 1)
+    made = TileCache(state, nullcontext(), 1)
     first = made.shown(TILE, NOW)
     visit(state, 2, (TILE + 1) << 14)
-    made.settle()
+    made.acknowledge()
     assert made.shown(TILE, NOW) is first
     assert vehicles(made, NOW, TILE + 1) == [1]
 
 
 def test_cells_of_too_few_vehicles_are_not_in_a_tile(state: MapState) -> None:
-    made = Tiles(state, nullcontext(), 2)
+    made = TileCache(state, nullcontext(), 2)
     assert vehicles(made, NOW) == []
     visit(state, 2)
-    made.settle()
+    made.acknowledge()
     assert vehicles(made, NOW) == [2]
 
 
 def test_tiles_are_kept_up_to_a_bound_the_youngest_of_them(state: MapState, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = Tiles(state, nullcontext(), 1)
+    made = TileCache(state, nullcontext(), 1)
     one = len(made.shown(TILE, NOW).payload)
     monkeypatch.setattr(tile_cache, "KEPT_BYTES", 2 * one)
     for tile in (TILE + 1, TILE + 2):
@@ -87,7 +87,7 @@ def test_tiles_are_kept_up_to_a_bound_the_youngest_of_them(state: MapState, monk
 
 
 def test_what_is_shown_is_a_copy_that_later_visits_do_not_change(state: MapState) -> None:
-    made = Tiles(state, nullcontext(), 1).shown(TILE, NOW)
+    made = TileCache(state, nullcontext(), 1).shown(TILE, NOW)
     before = np.array(made.columns["vehicles"])
     visit(state, 2)
     assert (made.columns["vehicles"] == before).all()
@@ -98,7 +98,7 @@ def test_a_box_gets_exactly_the_cells_that_it_touches_wherever_its_borders_lie()
     for vehicle in (1, 2):
         for cell in (TILE << 14) + rng.choice(1 << 14, 60, replace=False):
             visit(state, vehicle, int(cell))
-    made = Tiles(state, nullcontext(), 1)
+    made = TileCache(state, nullcontext(), 1)
     cells = made.shown(TILE, NOW).cells.to_pylist()
     west, south, east, north = (float(border) for border in grid.bounds(TILE, grid.TILE_ZOOM))
     lengths = set()

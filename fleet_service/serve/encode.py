@@ -1,0 +1,83 @@
+"""A view of cells as Arrow, GeoJSON or JSON. Pure."""
+
+from __future__ import annotations
+
+import json
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_service.fusion import Fusion
+from fleet_service.fusion.belief import SLIPPERY_SHARE, quantiles
+from fleet_service.serve.view import LOWER, UPPER, CellView, measured, view
+from schemas import grid, tables
+from schemas.numeric import IntArray
+from schemas.query import Format
+from schemas.thresholds import GRAVITY
+
+_BASES: Final = pa.array(["bound", "measured", "borrowed"])
+_BORROWED: Final = 2
+_SCHEMA: Final = tables.MAP_SCHEMA.serialize().to_pybytes()
+_END: Final = b"\xff\xff\xff\xff\x00\x00\x00\x00"  # a message without a head: the stream's end
+
+
+def batch_of(cells: CellView, now: int) -> pa.RecordBatch:
+    """Cells in the schema of the map; their age is that at `now` [ns]."""
+    latitude, longitude = grid.centre(cells.cell)
+    west, south, east, north = grid.bounds(cells.cell)
+    lower, middle, upper = quantiles(cells.belief, (LOWER, 0.5, UPPER))
+    basis = np.where(cells.imputed, _BORROWED, measured(lower, upper, cells.values))
+    columns: dict[str, Any] = {
+        "cell": cells.cell, "sector": cells.sector, "mu": middle, "mu_lower": lower, "mu_upper": upper,
+        "p_slippery": cells.belief @ SLIPPERY_SHARE, "basis": _BASES.take(basis.astype(np.int8)),
+        "vehicles": cells.vehicles, "observations": cells.observations,
+        "first_time": cells.first, "last_time": cells.last, "age_s": np.maximum(now - cells.last, 0) * 1e-9,
+        "latitude": latitude, "longitude": longitude, "west": west, "south": south, "east": east, "north": north,
+        "safe_deceleration": GRAVITY * lower,
+    }  # fmt: skip
+    arrays = [pa.array(columns[f.name]).cast(f.type, safe=False) for f in tables.MAP_SCHEMA]
+    return pa.RecordBatch.from_arrays(arrays, schema=tables.MAP_SCHEMA)
+
+
+def cell_table(fusion: Fusion, slots: IntArray, now: int) -> pa.Table:
+    """The cells of `slots` as they are believed at `now` [ns], in the schema of the map."""
+    return pa.Table.from_batches([batch_of(view(fusion, slots, now), now)])
+
+
+def encode(cells: pa.RecordBatch, form: Format, tile: int) -> bytes:
+    """The cells of a tile in one of the three forms."""
+    if form is Format.ARROW:
+        return arrow_stream(cells)
+    rows = _plain(cells)
+    if form is Format.JSON:
+        return json.dumps({"tile": grid.quadkey(tile, grid.TILE_ZOOM), "cells": rows}, allow_nan=False).encode()
+    features = [{"type": "Feature", "geometry": _polygon(cell), "properties": cell} for cell in rows]
+    return json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False).encode()
+
+
+def arrow_stream(cells: pa.RecordBatch) -> bytes:
+    """Cells as an Arrow stream, of one batch."""
+    return b"".join([_SCHEMA, cells.serialize(), _END])
+
+
+def _plain(table: pa.RecordBatch) -> list[dict[str, Any]]:
+    """Rows with times as ISO 8601 text; single-precision numbers without the digits they do not have."""
+    columns: dict[str, list[Any]] = {}
+    for f in table.schema:
+        if pa.types.is_timestamp(f.type):
+            ns = table[f.name].cast(pa.int64()).to_numpy()
+            columns[f.name] = np.datetime_as_string(ns.astype("datetime64[ns]"), "ms", "UTC").tolist()
+        elif f.type == pa.float32():
+            columns[f.name] = table[f.name].to_numpy().astype(np.float64).round(6).tolist()
+        else:
+            columns[f.name] = table[f.name].to_pylist()
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
+def _polygon(cell: dict[str, Any]) -> dict[str, Any]:
+    west, south, east, north = (cell[side] for side in ("west", "south", "east", "north"))
+    return {
+        "type": "Polygon",
+        "coordinates": [[[west, south], [east, south], [east, north], [west, north], [west, south]]],
+    }

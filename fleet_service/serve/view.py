@@ -1,0 +1,67 @@
+"""A view of cells: what a fusion knows of them at one moment, as columns that no longer change. Pure."""
+
+from __future__ import annotations
+
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_service.fusion import Fusion
+from schemas import grid, mugrid
+from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray
+
+CountArray = NDArray[np.integer[Any]]
+LOWER, UPPER = 0.05, 0.95  # of the interval
+PRIOR_UPPER: Final = float(mugrid.quantiles(mugrid.PRIOR, UPPER))
+PRIOR_WIDTH: Final = PRIOR_UPPER - float(mugrid.quantiles(mugrid.PRIOR, LOWER))
+# A cell is `measured` when a value brought its upper end down by more than numerics and forgetting move it, or halved
+# the interval; else all that is known is a lower bound.
+MEASURED_DROP: Final = 0.02
+MEASURED_WIDTH: Final = 0.5
+
+
+class CellView(NamedTuple):
+    """Cells as they are believed at one moment: columns (k,) and beliefs (k, 32).
+
+    Attributes:
+        cell, sector: where.
+        belief: about the road.
+        values: votes with a value.
+        vehicles, observations: how many.
+        first, last: times of the first and the last observation [ns].
+        imputed: whether the belief was made from neighbours'.
+    """
+
+    cell: IntArray
+    sector: IntArray
+    belief: FloatArray
+    values: Float32Array
+    vehicles: CountArray
+    observations: CountArray
+    first: IntArray
+    last: IntArray
+    imputed: BoolArray
+
+
+def view(fusion: Fusion, slots: IntArray, now: int) -> CellView:
+    """The cells of `slots` as they are believed at `now` [ns]; copies, so that the fusion may go on."""
+    live = fusion.live
+    key = live.key[slots]
+    return CellView(
+        cell=key // grid.SECTORS, sector=key % grid.SECTORS, belief=fusion.beliefs(slots, now),
+        values=live.values[slots], vehicles=live.vehicles[slots], observations=live.visits[slots],
+        first=live.first[slots], last=live.time[slots], imputed=np.zeros(len(slots), bool),
+    )  # fmt: skip
+
+
+def joined(*views: CellView) -> CellView:
+    """Views one after the other."""
+    return CellView(*(np.concatenate(columns) for columns in zip(*views, strict=True)))
+
+
+def measured(lower: FloatArray, upper: FloatArray, values: Float32Array) -> BoolArray:
+    """Whether a value, and not only bounds, made beliefs what they are: (k,), of the interval's ends and how many votes
+    with a value there were (k,)."""
+    narrow = upper - lower < MEASURED_WIDTH * PRIOR_WIDTH
+    return np.asarray((values > 0) & ((upper < PRIOR_UPPER - MEASURED_DROP) | narrow))
