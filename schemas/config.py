@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from schemas.errors import InputError
-from schemas.thresholds import SLIPPERY_MU
+from schemas.thresholds import NS, SLIPPERY_MU
 
 NAME_PATTERN = r"^[a-z][a-z0-9-]{2,62}$"
 REGION_PATTERN = r"^([0-3]{4}|\*)/([0-3]{3}|\*)/([0-3]{3}|\*)$"
@@ -117,6 +118,30 @@ class ServiceConfig(MonitoringSettings):
     fleet: Path | None = Field(
         default=None, description="enrolment file; reports of vehicles that are not on it are not looked at"
     )
+
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def moment(text: str, field: str) -> int:
+    """A time as people write it (ISO 8601, a day or more), in ns since 1970. Without a zone it is UTC, everywhere.
+
+    Raises:
+        InputError: it is none, or lies outside what 64 bits of nanoseconds hold.
+    """
+    try:
+        found = nanoseconds(datetime.fromisoformat(text))
+    except ValueError as error:
+        raise InputError(field, f"{text[:60]!r} is no time", "write it like 2026-01-31T07:00:00Z") from error
+    if not 0 <= found < 1 << 63:
+        raise InputError(field, f"{text[:60]!r} lies before 1970 or after 2261", "give a time between")
+    return found
+
+
+def nanoseconds(time: datetime) -> int:
+    """A time in ns since 1970, exactly; without a zone it is UTC."""
+    since = (time if time.tzinfo else time.replace(tzinfo=UTC)) - _EPOCH
+    return (since.days * 86_400 + since.seconds) * NS + since.microseconds * 1_000
 
 
 Model = TypeVar("Model", bound=BaseModel)

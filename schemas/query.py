@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from datetime import datetime
+from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Annotated, Final
 
@@ -20,7 +20,7 @@ _FIXES: Final = {
     "route": f"give route=lon,lat|lon,lat with 2 to {MAX_ROUTE_POINTS} points in degrees",
     "min_vehicles": "give a whole number from 1",
     "format": "give format=arrow, geojson or json",
-    "at": "give a time with zone, e.g. at=2026-01-31T07:00:00Z",
+    "at": "give a time like at=2026-01-31T07:00:00Z; without a zone it is UTC",
     "basis": "give basis=borrowed, or leave it out",
 }
 
@@ -78,11 +78,11 @@ class MapQuery(BaseModel):
     @field_validator("at")
     @classmethod
     def _zoned(cls, value: datetime | None) -> datetime | None:
-        if value is not None and value.tzinfo is None:
-            raise ValueError("has no time zone")
-        if value is not None and value.year < FIRST_YEAR:
+        if value is None:
+            return None
+        if value.year < FIRST_YEAR:
             raise ValueError("lies before all reports")
-        return value
+        return value if value.tzinfo else value.replace(tzinfo=UTC)
 
 
 def parse(parameters: Mapping[str, str]) -> MapQuery:

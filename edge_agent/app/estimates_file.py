@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
@@ -13,6 +14,7 @@ import pyarrow.parquet as pq
 
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
+from schemas.runtime.durable import written
 from schemas.signals import per_wheel
 from schemas.tables import ESTIMATES_SCHEMA
 
@@ -42,8 +44,10 @@ class EstimatesFile:
     """Writes estimates block by block; the file appears under its name when it is whole."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._part = path, writable("out", path).with_name(path.name + ".part")
-        self._writer = pq.ParquetWriter(self._part, ESTIMATES_SCHEMA)
+        with ExitStack() as opened:
+            file = opened.enter_context(written(writable("out", path)))
+            self._writer = opened.enter_context(pq.ParquetWriter(file, ESTIMATES_SCHEMA))
+            self._opened = opened.pop_all()
 
     def __enter__(self) -> Self:
         return self
@@ -51,11 +55,7 @@ class EstimatesFile:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._writer.close()
-        if kind is None:
-            self._part.replace(self._path)
-        else:
-            self._part.unlink(missing_ok=True)
+        self._opened.__exit__(kind, error, trace)
 
     def write(self, t: FloatArray, estimates: Estimates) -> None:
         """Add a block: t (T, 1) and the estimates of a bank of one vehicle."""

@@ -6,7 +6,6 @@ import argparse
 import sys
 import time
 from collections.abc import Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,7 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--publish", action="store_true", help="send observations and states, wait for acknowledgement")
     parser.add_argument("--config", type=Path, help="agent configuration (JSON), for --publish")
     parser.add_argument("--name", help="name to publish under (default: the vehicle file's)")
-    parser.add_argument("--start", help="time of t = 0, ISO 8601 (default: the log's, else such that it ends now)")
+    parser.add_argument(
+        "--start", help="time of t = 0, UTC without a zone (default: the log's, else such that it ends now)"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -116,15 +117,8 @@ def _published(
 
 def _start(given: str | None, log: SignalLog) -> int:
     """The ns UTC of t = 0."""
-    from schemas.errors import InputError
+    from schemas.config import moment
 
     if given is None:
         return log.start_ns if log.start_ns is not None else time.time_ns() - round(float(log.t[-1]) * NS)
-    try:
-        moment = datetime.fromisoformat(given)
-    except ValueError as error:
-        raise InputError("start", f"{given!r} is no time", "write it like 2026-01-31T07:00:00Z") from error
-    if moment.tzinfo is None:
-        moment = moment.replace(tzinfo=UTC)
-    since = moment - datetime(1970, 1, 1, tzinfo=UTC)
-    return (since.days * 86_400 + since.seconds) * NS + since.microseconds * 1_000
+    return moment(given, "start")

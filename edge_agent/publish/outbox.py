@@ -14,7 +14,6 @@ Time is monotonic seconds and comes in as an argument.
 from __future__ import annotations
 
 import heapq
-import os
 import random
 import secrets
 import sqlite3
@@ -24,6 +23,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from schemas.errors import InputError
+from schemas.runtime.durable import make_folder
 from schemas.wire import Kind
 
 BOOT_LIMIT = 2**63  # boot fits a signed 64-bit column
@@ -299,7 +299,7 @@ def _within(held: dict[int, int], first: int, last: int) -> list[int]:
 def _open(path: Path) -> sqlite3.Connection:
     database: sqlite3.Connection | None = None
     try:
-        _make_folder(path.parent)
+        make_folder(path.parent)
         database = sqlite3.connect(path, timeout=0.0, check_same_thread=False)
         database.execute("PRAGMA locking_mode = EXCLUSIVE")
         database.execute("PRAGMA journal_mode = WAL")
@@ -313,15 +313,3 @@ def _open(path: Path) -> sqlite3.Connection:
         problem = f"{path} cannot be opened ({error})"
         raise InputError("spool", problem, "name a writable place, or move the file aside") from error
     return database
-
-
-def _make_folder(folder: Path) -> None:
-    """Make a folder, and the ones above it, such that power loss does not forget them. SQLite syncs the files in it."""
-    if not folder.exists():
-        _make_folder(folder.parent)
-        folder.mkdir(exist_ok=True)
-        handle = os.open(folder.parent, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)

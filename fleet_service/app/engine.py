@@ -40,7 +40,7 @@ from fleet_service.serve.map_state import MapState
 from fleet_service.serve.query import answer
 from fleet_service.serve.tile_cache import TileCache
 from schemas import grid, wire
-from schemas.config import ServiceConfig
+from schemas.config import ServiceConfig, nanoseconds
 from schemas.errors import InputError
 from schemas.numeric import IntArray
 from schemas.query import MapQuery
@@ -270,7 +270,7 @@ class Engine:
         query = query.model_copy(update={"min_vehicles": least})
         if query.at is None:
             return answer(self._tiles, query, wanted, now, only)
-        at = int(query.at.timestamp() * NS)
+        at = nanoseconds(query.at)
         if at > now:
             raise InputError("at", "lies in the future", "give a time that has been")
         past = Fusion(self._config.lateness_s)

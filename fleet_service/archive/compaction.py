@@ -22,10 +22,11 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_service.archive import layout, reading, readme, segments
-from fleet_service.archive.files import COMPACTED, exclusive, sync_directory, sync_tree, write_synced
+from fleet_service.archive.files import COMPACTED, exclusive, sync_tree, write_table
 from fleet_service.archive.load import conformed, content, set_aside
 from fleet_service.archive.version import KEY, VERSION
 from schemas.errors import InputError
+from schemas.runtime.durable import sync_directory
 from schemas.wire import Kind
 
 # Rows of one round at the most: half a gigabyte while it runs, and files of several row groups.
@@ -129,7 +130,7 @@ def _place(root: Path, kind: Kind, name: str, table: pa.Table, footer: Mapping[s
     for partition, part in partitioned(table, kind):
         path = partition.folder(root, layout.TABLES[kind]) / name
         draft = root / "drafts" / f"{len(drafts)}.parquet"
-        write_synced(part, draft, COMPACTED, footer)
+        write_table(part, draft, COMPACTED, footer, named=False)
         drafts.append((draft, path))
     for draft, path in drafts:
         path.parent.mkdir(parents=True, exist_ok=True)

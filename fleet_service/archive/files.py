@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ import pyarrow.parquet as pq
 from fleet_service.archive import version
 from schemas import tables
 from schemas.errors import InputError
+from schemas.runtime.durable import sync_directory, written
 
 ROW_GROUP: Final = 128 * 1024  # rows: 5 MB, which is what a query reads at the least
 
@@ -53,20 +53,25 @@ MAP: Final = Encoding(("basis", "sector", "vehicles", "observations"), ("first_t
 ROLLUP: Final = Encoding(("sector", "hour", "observations", "late", "vehicles", "mu_count"), index=True)
 
 
-def sync_directory(folder: Path) -> None:
-    """Make renames and new names in `folder` durable."""
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+def write_table(
+    table: pa.Table,
+    path: Path,
+    encoding: Encoding,
+    footer: Mapping[str, str] | None = None,
+    *,
+    named: bool = True,
+) -> None:
+    """Write a Parquet file that is whole and durable when this returns, or as it was before.
 
-
-def write_synced(table: pa.Table, path: Path, encoding: Encoding, footer: Mapping[str, str] | None = None) -> None:
-    """Write a Parquet file and sync it; `footer` are key-value pairs for its end, beside version and digest.
+    Args:
+        table: the rows.
+        path: of the file; one that is there is replaced.
+        encoding: how.
+        footer: key-value pairs for its end, beside version and digest.
+        named: whether its name is durable too; else the caller syncs the folder.
 
     Raises:
-        OSError: the disk is full or read-only; nothing is left under `path`.
+        OSError: the disk is full or read-only; nothing is left of it.
     """
     names = table.schema.names
     options: dict[str, Any] = {
@@ -75,48 +80,21 @@ def write_synced(table: pa.Table, path: Path, encoding: Encoding, footer: Mappin
         "column_encoding": {name: "DELTA_BINARY_PACKED" for name in encoding.delta if name in names},
         "write_statistics": encoding.index, "write_page_index": encoding.index, "write_page_checksum": True,
     }  # fmt: skip
-    try:
-        with path.open("wb") as file:
-            with pq.ParquetWriter(file, table.schema, **options) as writer:
-                writer.write_table(table, ROW_GROUP)
-                writer.add_key_value_metadata(version.footer(table.schema, footer))
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError:
-        path.unlink(missing_ok=True)
-        raise
-
-
-def write_table(table: pa.Table, path: Path, encoding: Encoding = SEGMENT) -> None:
-    """Write a Parquet file that is whole and durable when this returns, or not there.
-
-    Raises:
-        OSError: the disk is full or read-only; nothing is left under `path`.
-    """
-    draft = path.with_name(path.name + ".tmp")
-    write_synced(table, draft, encoding)
-    try:
-        draft.rename(path)
-    except OSError:
-        draft.unlink(missing_ok=True)
-        raise
-    sync_directory(path.parent)
+    with written(path, named=named) as file, pq.ParquetWriter(file, table.schema, **options) as writer:
+        writer.write_table(table, ROW_GROUP)
+        writer.add_key_value_metadata(version.footer(table.schema, footer))
 
 
 def put_in_place(
     root: Path, table: pa.Table, path: Path, encoding: Encoding, footer: Mapping[str, str] | None = None
 ) -> None:
-    """Write a file below `root`, or in place of an old one: whole and durable when this returns, or as it was before.
-
-    The draft beside it is hidden by its dot, which Spark and pyarrow pass over.
+    """Write a file below `root`, or in place of an old one, with the folders that it wants.
 
     Raises:
         OSError: the disk is full or read-only.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.tmp")
-    write_synced(table, draft, encoding, footer)
-    draft.rename(path)
+    write_table(table, path, encoding, footer, named=False)
     sync_tree(root, [path.parent])
 
 

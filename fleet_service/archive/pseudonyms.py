@@ -5,7 +5,6 @@ The month is that of a batch's first record, so that a batch that is sent again 
 
 from __future__ import annotations
 
-import os
 import secrets
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -16,8 +15,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_service.archive.files import sync_directory
 from schemas.numeric import IntArray
+from schemas.runtime.durable import written
 
 KEY_BYTES: Final = 32
 _DIGEST_BYTES: Final = 8  # 64 bits: a collision among 10⁶ vehicles has probability 3e-8
@@ -77,10 +76,5 @@ class Pseudonyms:
 
     def _make(self, path: Path) -> None:
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        draft = path.with_suffix(".tmp")
-        with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
+        with written(path, 0o600) as file:
             file.write(secrets.token_bytes(KEY_BYTES))
-            file.flush()
-            os.fsync(file.fileno())
-        draft.rename(path)
-        sync_directory(self._folder)

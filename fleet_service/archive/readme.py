@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from fleet_service.archive.files import sync_directory
 from schemas import mugrid, tables
+from schemas.runtime.durable import written
 from schemas.tables import Field
 
 NAME: Final = "README.md"
@@ -71,7 +71,5 @@ def keep(root: Path) -> None:
     """
     path, page = root / NAME, text().encode()
     if not path.exists() or path.read_bytes() != page:  # bytes: power loss may have left any
-        draft = root / f".{NAME}.tmp"
-        draft.write_bytes(page)
-        draft.rename(path)
-        sync_directory(root)
+        with written(path) as file:
+            file.write(page)

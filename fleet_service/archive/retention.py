@@ -15,12 +15,13 @@ import pyarrow.compute as pc
 
 from fleet_service.archive import layout, rollup
 from fleet_service.archive.compaction import compact, compacting
-from fleet_service.archive.files import COMPACTED, lock, put_in_place, sync_directory
+from fleet_service.archive.files import COMPACTED, lock, put_in_place
 from fleet_service.archive.layout import TABLES
 from fleet_service.archive.load import content
 from fleet_service.archive.pseudonyms import Pseudonyms
 from fleet_service.archive.version import KEY
 from schemas.errors import InputError
+from schemas.runtime.durable import sync_directory
 from schemas.wire import Kind
 
 # A batch may come again for thirty days (ServiceConfig.oldest_s), and its rows are what tells that it was there before.

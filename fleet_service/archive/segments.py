@@ -17,9 +17,10 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_service.archive import layout
-from fleet_service.archive.files import SEGMENT, sync_directory, write_synced
+from fleet_service.archive.files import SEGMENT, write_table
 from schemas import mugrid, tables
 from schemas.numeric import IntArray
+from schemas.runtime.durable import ENDING, sync_directory
 from schemas.wire import Kind
 from schemas.wire.batches import ABSENT
 
@@ -55,7 +56,7 @@ class Writer:
         folders = [folder(root, kind) for kind in SCHEMAS]
         for inbox in folders:
             inbox.mkdir(parents=True, exist_ok=True)
-            for draft in inbox.glob("*.tmp"):  # of a run that died while writing: never acknowledged
+            for draft in inbox.glob(f"*{ENDING}"):  # of a run that died while writing: never acknowledged
                 draft.unlink()
         for parent in {root.parent, root, *folders}:  # a folder that power loss forgets takes its segments along
             sync_directory(parent)
@@ -73,13 +74,7 @@ class Writer:
         """
         self._seq += 1
         path = folder(self._root, kind) / layout.segment_name(f"{self._shard}-{self._epoch:010d}", self._seq)
-        draft = path.with_name(path.name + ".tmp")
-        write_synced(table_of(kind, rows), draft, SEGMENT)
-        try:
-            draft.rename(path)
-        except OSError:
-            draft.unlink(missing_ok=True)
-            raise
+        write_table(table_of(kind, rows), path, SEGMENT, named=False)
         self._unsynced.add(path.parent)
         return path
 

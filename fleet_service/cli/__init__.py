@@ -64,7 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     query.add_argument("--bbox", metavar="W,S,E,N", help="degrees; without it, everything")
     query.add_argument("--route", metavar="LON,LAT|LON,LAT", help="the cells ahead, in their order")
     query.add_argument("--min-vehicles", metavar="K", help="only cells of K vehicles or more")
-    query.add_argument("--at", metavar="TIME", help="the map as it was, e.g. 2026-01-31T07:00:00Z")
+    query.add_argument("--at", metavar="TIME", help="the map as it was, e.g. 2026-01-31T07:00:00Z; UTC without a zone")
     query.add_argument("--basis", metavar="borrowed", help="also cells that only neighbours speak for")
     query.add_argument("--format", metavar="arrow|geojson|json", help="arrow (default) prints a table")
     query.add_argument("--out", metavar="FILE", type=Path, help="write the answer there")

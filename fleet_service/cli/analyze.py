@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from fleet_service.analytics.options import Options
 from fleet_service.analytics.questions import QUESTIONS
-from fleet_service.cli.archive import add_part, moment
+from fleet_service.cli.archive import add_part, span
+from schemas.config import moment
 from schemas.errors import InputError
 
 if TYPE_CHECKING:
@@ -48,12 +48,11 @@ def _analyze(arguments: argparse.Namespace) -> int:
     if arguments.engine not in engines.ENGINES:
         raise InputError("engine", f"{arguments.engine!r} is none", f"use one of {', '.join(engines.ENGINES)}")
     bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
-    now = time.time_ns()
-    part = Extract(moment(arguments.since, "from", 0), moment(arguments.until, "to", now), bbox)
+    part = Extract(*span(arguments), bbox)
     engine = engines.QueryEngine(arguments.engine, arguments.archive, part, progress=sys.stderr.isatty())
-    at = moment(arguments.at, "at", -1)
+    at = None if arguments.at is None else moment(arguments.at, "at")
     options = Options(
-        at=None if at < 0 else at, stations=arguments.stations, least_vehicles=arguments.min_vehicles,
+        at=at, stations=arguments.stations, least_vehicles=arguments.min_vehicles,
         step_s=arguments.step, say=_say,
     )  # fmt: skip
     _say(f"{question.name}: {len(engine.files('observations'))} files, {engine.rows():,} observations")

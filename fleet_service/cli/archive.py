@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from schemas.config import moment
 from schemas.errors import InputError
-from schemas.thresholds import NS
 
 if TYPE_CHECKING:
     Commands = argparse._SubParsersAction[argparse.ArgumentParser]
@@ -35,24 +36,19 @@ def add_commands(commands: Commands) -> None:
 
 def add_part(parser: argparse.ArgumentParser) -> None:
     """Declare which part of an archive is wanted."""
-    parser.add_argument("--from", dest="since", metavar="TIME", help="e.g. 2026-01-31 or 2026-01-31T07:00:00Z")
+    parser.add_argument("--from", dest="since", metavar="TIME", help="e.g. 2026-01-31 or 2026-01-31T07:00:00Z, UTC")
     parser.add_argument("--to", dest="until", metavar="TIME", help="likewise, excluded; default now")
     parser.add_argument("--bbox", metavar="W,S,E,N", help="degrees; without it, everything")
 
 
-def moment(text: str | None, field: str, otherwise: int) -> int:
-    """A time as people write it, in ns; without a zone it is UTC.
+def span(arguments: argparse.Namespace) -> tuple[int, int]:
+    """From when until when [ns], of the options of `add_part`.
 
     Raises:
-        InputError: it is none.
+        InputError: one of them is no time.
     """
-    if text is None:
-        return otherwise
-    try:
-        found = datetime.fromisoformat(text)
-    except ValueError as error:
-        raise InputError(field, f"{text!r} is no time", "give one like 2026-01-31T07:00:00Z") from error
-    return int((found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()) * NS
+    since = 0 if arguments.since is None else moment(arguments.since, "from")
+    return since, time.time_ns() if arguments.until is None else moment(arguments.until, "to")
 
 
 def _command(
@@ -104,14 +100,11 @@ def _forget(arguments: argparse.Namespace) -> str:
 
 
 def _export(arguments: argparse.Namespace) -> str:
-    import time
-
     from fleet_service.archive import export
     from schemas import query
 
     bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
-    until = moment(arguments.until, "to", time.time_ns())
-    part = export.Extract(moment(arguments.since, "from", 0), until, bbox)
+    part = export.Extract(*span(arguments), bbox)
     table = export.WHAT[arguments.what](arguments.archive, part)
     export.write(table, arguments.out)
     return f"{table.num_rows} rows in {arguments.out}"

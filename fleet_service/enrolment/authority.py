@@ -10,7 +10,6 @@ DIR/revoked/NAME.pem              of names that were taken off the list
 from __future__ import annotations
 
 import ipaddress
-import os
 from collections.abc import Sequence
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -23,6 +22,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from schemas.errors import InputError
+from schemas.runtime.durable import written
 
 SKEW: Final = timedelta(minutes=10)  # clocks of vehicles may be behind the authority's
 Key = ec.EllipticCurvePrivateKey
@@ -50,14 +50,8 @@ def pem(certificate: x509.Certificate) -> bytes:
 
 def write(path: Path, data: bytes, mode: int) -> None:
     """Replace a file whole; it never has a wider mode than `mode`."""
-    draft = path.with_name(path.name + ".tmp")
-    draft.unlink(missing_ok=True)
-    with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
-        os.fchmod(file.fileno(), mode)
+    with written(path, mode) as file:
         file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    draft.rename(path)
 
 
 def read(stem: Path) -> KeyPair | None:

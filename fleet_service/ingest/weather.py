@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_service.archive.files import write_table
+from fleet_service.archive.files import SEGMENT, write_table
 from fleet_service.archive.load import Damaged, load, pass_over
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.weather import VALID_NS, Reports
@@ -89,7 +89,7 @@ class WeatherDesk:
         self._last = max(time.time_ns(), self._last + 1)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            write_table(table, self._folder / f"{self._name}-{self._last:020d}.parquet")
+            write_table(table, self._folder / f"{self._name}-{self._last:020d}.parquet", SEGMENT)
         except OSError:  # what is not archived must not act; the next report comes within the hour
             self._counts["weather_failures"] += 1
             return None

@@ -8,16 +8,15 @@ costs the time of a replay.
 
 from __future__ import annotations
 
-import os
 import shutil
 from pathlib import Path
 from typing import Final
 
 import pyarrow as pa
 
-from fleet_service.archive.files import sync_directory
 from fleet_service.archive.layout import CHECKPOINTS
 from fleet_service.archive.version import KEY, VERSION
+from schemas.runtime.durable import sync_directory, written
 
 KEPT: Final = 2  # the newest, and the one before, should the newest be damaged
 _DRAFT: Final = ".draft"
@@ -34,12 +33,10 @@ def save(root: Path, tables: dict[str, pa.Table], received: int) -> Path:
     shutil.rmtree(draft, ignore_errors=True)
     draft.mkdir(parents=True)
     for name, table in tables.items():
-        with (draft / f"{name}.arrow").open("wb") as file:
+        with written(draft / f"{name}.arrow", named=False) as file:
             said = {**(table.schema.metadata or {}), KEY.encode(): str(VERSION).encode()}
             with pa.ipc.new_file(file, table.schema.with_metadata(said)) as writer:
                 writer.write_table(table.replace_schema_metadata(said))
-            file.flush()
-            os.fsync(file.fileno())
     sync_directory(draft)
     shutil.rmtree(path, ignore_errors=True)
     draft.rename(path)

@@ -120,10 +120,34 @@ def test_an_unknown_setting_is_refused_and_defaults_hold(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
+    ("text", "utc"),
+    [
+        ("2026-01-31", "2026-01-31T00:00:00"),
+        ("2026-01-31T07:00:00", "2026-01-31T07:00:00"),
+        ("2026-01-31T07:00:00Z", "2026-01-31T07:00:00"),
+        ("2026-01-31T07:00:00.123456+01:00", "2026-01-31T06:00:00.123456"),
+        ("1971-01-01 00:00:00.000001", "1971-01-01T00:00:00.000001"),
+    ],
+)
+def test_a_time_is_read_in_one_way_everywhere_and_without_a_zone_it_is_utc(text: str, utc: str) -> None:
+    expected = int(np.datetime64(utc, "ns").astype(np.int64))
+    assert config.moment(text, "from") == expected
+    at = query.parse({"at": text}).at
+    assert at is not None
+    assert config.nanoseconds(at) == expected
+
+
+@pytest.mark.parametrize("text", ["", "yesterday", "07:00", "1969-12-31", "2300-01-01", "1e9"])
+def test_what_is_no_time_is_refused_by_name(text: str) -> None:
+    with pytest.raises(InputError, match="^from: .* is no time; write it like|^from: .* lies before 1970 or after"):
+        config.moment(text, "from")
+
+
+@pytest.mark.parametrize(
     ("parameters", "field"),
     [({"bbox": "1,2,3"}, "bbox"), ({"bbox": "3,2,1,4"}, "bbox"), ({"bbox": "a,b,c,d"}, "bbox"),
      ({"bbox": "nan,0,1,1"}, "bbox"), ({"min_vehicles": "0"}, "min_vehicles"), ({"format": "xml"}, "format"),
-     ({"at": "2026-01-31T07:00:00"}, "at"),
+     ({"at": "1970-12-31T07:00:00"}, "at"),
      ({"at": "yesterday"}, "at"), ({"route": "1,2"}, "route"), ({"route": "1,2|3"}, "route"), ({"box": "1"}, "box"),
      ({"basis": "guessed"}, "basis")],
 )  # fmt: skip

@@ -95,8 +95,8 @@ def operations(monkeypatch: pytest.MonkeyPatch, die_at: int) -> list[str]:
     for name in ("rename", "unlink", "mkdir"):
         monkeypatch.setattr(Path, name, counted(name, getattr(Path, name)))
     monkeypatch.setattr(os, "fsync", counted("fsync", lambda _: None))  # a dead process needs no disk that syncs
-    monkeypatch.setattr(files, "write_synced", counted("write", files.write_synced))
-    monkeypatch.setattr(compaction, "write_synced", counted("write", files.write_synced))
+    monkeypatch.setattr(files, "write_table", counted("write", files.write_table))
+    monkeypatch.setattr(compaction, "write_table", counted("write", files.write_table))
     return seen
 
 

@@ -19,7 +19,7 @@ from fleet_service import cli
 from fleet_service.app.engine import Engine
 from fleet_service.archive import export, layout, reading, rollup, segments, version
 from fleet_service.archive.compaction import compact
-from fleet_service.archive.files import COMPACTED, MAP, ROLLUP, SEGMENT, Encoding, write_synced
+from fleet_service.archive.files import COMPACTED, MAP, ROLLUP, SEGMENT, Encoding, write_table
 from fleet_service.archive.load import content
 from fleet_service.archive.retention import drop_checkpoints
 from fleet_service.replay import checkpoints
@@ -114,7 +114,7 @@ def rewritten(path: Path, change: Callable[[pa.Table], pa.Table], said: str, enc
     """Let a file be one of another version."""
     found = content(path)
     assert found is not None
-    write_synced(change(found.table), path, encoding, {**found.entries, version.KEY: said})
+    write_table(change(found.table), path, encoding, {**found.entries, version.KEY: said})
 
 
 def without_columns(table: pa.Table) -> pa.Table:
@@ -292,7 +292,7 @@ def test_every_file_that_is_written_says_version_and_digest(tmp_path: Path) -> N
 
 def test_rows_with_null_are_written_again_as_they_are_read(tmp_path: Path) -> None:
     table = segments.table_of(Kind.OBSERVATION, rows_of(Kind.OBSERVATION, 5)).drop_columns(["speed"])
-    write_synced(table, tmp_path / "one.parquet", SEGMENT)
+    write_table(table, tmp_path / "one.parquet", SEGMENT)
     found = content(tmp_path / "one.parquet")
     assert found is not None
     assert found.table.equals(table)

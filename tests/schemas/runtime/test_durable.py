@@ -1,0 +1,64 @@
+"""A file is there whole or as it was; permissions from its first byte on; folders that power loss does not forget."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from schemas.runtime.durable import draft_of, make_folder, written
+
+
+def test_a_file_has_its_name_when_it_is_whole_and_synced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    order: list[str] = []
+    fsync, rename = os.fsync, Path.rename
+
+    def seen_fsync(handle: int) -> None:
+        order.append("folder" if os.path.isdir(f"/proc/self/fd/{handle}") else "file")  # noqa: PTH112
+        fsync(handle)
+
+    def seen_rename(path: Path, target: Path) -> Path:
+        order.append("name")
+        return rename(path, target)
+
+    monkeypatch.setattr(os, "fsync", seen_fsync)
+    monkeypatch.setattr(Path, "rename", seen_rename)
+    path = tmp_path / "a"
+    with written(path) as file:
+        file.write(b"one")
+        assert not path.exists()
+    assert order == ["file", "name", "folder"]
+    with written(path, named=False) as file:
+        file.write(b"two")
+    assert order[3:] == ["file", "name"]
+    assert (path.read_bytes(), [p.name for p in tmp_path.iterdir()]) == (b"two", ["a"])
+
+
+@pytest.mark.parametrize("error", [OSError(28, "full"), KeyboardInterrupt(), ValueError()])
+def test_what_fails_leaves_the_file_as_it_was(tmp_path: Path, error: BaseException) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"old")
+
+    def half() -> None:
+        with written(path) as file:
+            file.write(b"new")
+            raise error
+
+    with pytest.raises(type(error)):
+        half()
+    assert (path.read_bytes(), [p.name for p in tmp_path.iterdir()]) == (b"old", ["a"])
+
+
+def test_a_secret_is_never_readable_by_others_not_even_in_a_draft_that_was_left(tmp_path: Path) -> None:
+    path = tmp_path / "key"
+    draft_of(path).write_bytes(b"of a process that died, open to all")
+    with written(path, 0o600) as file:
+        assert os.fstat(file.fileno()).st_mode & 0o777 == 0o600
+    assert path.stat().st_mode & 0o777 == 0o600
+
+
+def test_a_folder_is_made_with_those_above_it(tmp_path: Path) -> None:
+    make_folder(tmp_path / "a" / "b" / "c")
+    make_folder(tmp_path / "a" / "b" / "c")
+    assert (tmp_path / "a" / "b" / "c").is_dir()
