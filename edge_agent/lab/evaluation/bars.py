@@ -139,6 +139,8 @@ def figures(results: Results, *, quick: bool) -> list[Figure]:
         listed += _context(f"noise.004.{experiment}.{estimator}", found)
     for (case, estimator), found in results.faults.items():
         listed += _context(f"faults.{case}.{estimator}", found)
+    for name, errors in results.oracle.items():
+        listed.append(Figure(f"oracle.{name}", mean(errors), unit_of(name)))
     for estimator, values in results.world.items():
         listed += [Figure(f"world.{estimator}.{name}", value, unit_of(name)) for name, value in values.items()]
     listed += _consistency(results)

@@ -12,6 +12,7 @@ from edge_agent.estimators import Estimates, EstimatorBank
 from edge_agent.lab.simulation import Fault, simulate_manoeuvre
 from edge_agent.lab.simulation.manoeuvres import Friction
 from edge_agent.lab.simulation.presets import TrueVehicle
+from edge_agent.lab.simulation.sensors import Sensors
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, per_wheel
 from schemas.vehicle import Vehicle
@@ -63,7 +64,7 @@ class DriveSet:
         return slice(int(np.searchsorted(self.t[:, 0], self.t[-1, 0] - seconds)), None)
 
 
-def realistic(scenario: TestDrive, seeds: Sequence[int], sensors: str = USUAL) -> DriveSet:
+def realistic(scenario: TestDrive, seeds: Sequence[int], sensors: str | Sensors = USUAL) -> DriveSet:
     """One drive per seed with ordinary sensors, of a vehicle known to a few per cent."""
     return joined([_drive(scenario, seed, sensors, 1) for seed in seeds])
 
@@ -74,7 +75,7 @@ def ideal(scenario: TestDrive) -> DriveSet:
     return joined([_drive(replace(scenario, rate_hz=scenario.rate_hz * step), 0, "ideal", step)])
 
 
-def _drive(scenario: TestDrive, seed: int, sensors: str, step: int) -> tuple[pa.Table, Vehicle]:
+def _drive(scenario: TestDrive, seed: int, sensors: str | Sensors, step: int) -> tuple[pa.Table, Vehicle]:
     log, vehicle = simulate_manoeuvre(
         scenario.manoeuvre, mu=scenario.mu, speed=scenario.speed, seed=seed, rate_hz=scenario.rate_hz,
         duration_s=scenario.duration_s, vehicle=scenario.vehicle, sensors=sensors, road=scenario.road,

@@ -9,7 +9,7 @@ import numpy as np
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import ESTIMATORS, Estimates, EstimatorBank, adaptive_federated_ckf, compensated_wckf
-from edge_agent.lab.evaluation import faults, real_world
+from edge_agent.lab.evaluation import faults, oracle, real_world
 from edge_agent.lab.evaluation.batch import DriveSet, estimates, ideal, realistic, repeated
 from edge_agent.lab.evaluation.measures import arrival, consistency, false_changes, measures, sides
 from edge_agent.lab.evaluation.paper_004 import experiments
@@ -43,6 +43,7 @@ class Results:
     foreign: dict[str, FloatArray] = field(default_factory=dict)  # coverage of the default, by kind of tyre
     faults: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)  # by (fault, estimator)
     world: dict[str, dict[str, float]] = field(default_factory=dict)  # the rough one: by estimator and "baseline"
+    oracle: dict[str, FloatArray] = field(default_factory=dict)  # errors that an oracle makes, by figure
     rough: RealWorldResults | None = None  # its first town, kept for plots
     ranks: dict[str, list[FloatArray]] = field(default_factory=dict)  # of the truth in the posterior, by estimator
     seeds: int = 0
@@ -77,6 +78,8 @@ def run(seeds: Sequence[int], *, quick: bool, tell: Callable[[str], None]) -> Re
     results.world = results.rough.found
     tell(f"rough cars in {1 if quick else real_world.TOWNS} hilly towns, and standing on slopes")
     if not quick:
+        results.oracle = {"002.sine.rmse_vx": oracle.speed(seeds), "003.accel.mu_error": oracle.friction(seeds)[0]}
+        tell("what an oracle makes of two of the papers' manoeuvres")
         results.foreign = _foreign_tyres(seeds, tell)
     return results
 

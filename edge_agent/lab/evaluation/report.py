@@ -52,6 +52,11 @@ OWN_HEAD: Final = """\
 The bars above hold on the plant that is matched to the filter: tyres, drag and loads as its model has them. The paper
 used CarSim, which is not matched. The same experiments on the simulator's own sedan and van (rounder tyres, drag,
 lagging loads):"""
+ORACLE_HEAD: Final = """\
+## What anybody could do
+
+Two bars of the papers that are hard, and an oracle on the same sensors (`oracle.py`): a Bayesian who knows the friction
+and the motion, and is told everything but what vehicle file and data sheet leave open."""
 FRICTION: Final = ("paper-aco-fckf", "federated-ckf", "sr-ukf")  # papers' estimators that estimate friction
 SHOWN_LEVELS: Final = LEVELS[::2]
 
@@ -69,6 +74,8 @@ def report(figures: Sequence[Figure], *, seeds: int) -> str:
         WHY_NOT.rstrip(),
         OWN_HEAD,
         own_plants(barred, by_name),
+        ORACLE_HEAD,
+        oracles(barred, by_name),
         WORLD_HEAD,
         world(by_name),
         VEHICLES_HEAD,
@@ -117,6 +124,16 @@ def own_plants(barred: Sequence[Figure], values: dict[str, float]) -> str:
             cells.append(number(values, name, spread=False) + ("" if own.holds else " (missed)"))
         rows.append([f"{noise} noise, {measure}", f"{bar.bar}", f"{bar.value:.3g}", *cells])
     return grid(("figure", "bar", "matched plant", "sedan", "van"), rows)
+
+
+def oracles(barred: Sequence[Figure], values: dict[str, float]) -> str:
+    """The bars for which there is an oracle, the default, and the oracle."""
+    rows = [
+        [bar.name, f"{bar.bar}", f"{bar.value:.3g}", number(values, bar.name.replace("papers.", "oracle.", 1))]
+        for bar in barred
+        if bar.name.replace("papers.", "oracle.", 1) in values
+    ]
+    return grid(("figure", "bar", "default", "oracle"), rows)
 
 
 def world(values: dict[str, float]) -> str:

@@ -7,9 +7,10 @@ import pytest
 
 from edge_agent.estimators import Estimates
 from edge_agent.estimators.estimates import ONE_FRICTION, Y
-from edge_agent.lab.evaluation import real_world
-from edge_agent.lab.evaluation.batch import DriveSet
+from edge_agent.lab.evaluation import oracle, real_world
+from edge_agent.lab.evaluation.batch import DriveSet, realistic
 from edge_agent.lab.evaluation.real_world import PRIOR, SURFACES, Tally
+from edge_agent.lab.evaluation.scenarios import PAPERS
 from edge_agent.lab.seeds import FIGURES
 from edge_agent.lab.tuning import objectives, study
 from schemas.numeric import FloatArray
@@ -88,6 +89,18 @@ def test_cars_stand_on_the_slope_they_were_put_on() -> None:
     felt = np.array([batch.signals[..., S.AX].mean() for batch in batches])
     assert np.abs(felt[:3] / GRAVITY - 0.05).max() < 0.015
     assert np.isnan(batches[-1].signals[..., S.TORQUE]).all()
+
+
+def test_the_oracle_knows_what_is_told_and_misses_what_is_unknown() -> None:
+    """The file's radius is most of what he misses of the speed; friction he finds to a few hundredths."""
+    seeds = range(FIGURES, FIGURES + 4)
+    speeds, (frictions, expected) = oracle.speed(seeds), oracle.friction(seeds)
+    batch = realistic(PAPERS["002.sine"], seeds)
+    true = PAPERS["002.sine"].vehicle.vehicle.wheel_radius
+    by_wheels = [abs(vehicle.wheel_radius / true - 1.0) * batch.truth["true_vx"].mean() for vehicle in batch.vehicles]
+    assert 0.2 < speeds.mean() / np.mean(by_wheels) < 1.1
+    assert (frictions < 0.1).all()
+    assert 0.2 < frictions.mean() / expected.mean() < 2.0
 
 
 def test_nobody_tunes_on_the_seeds_of_the_figures() -> None:

@@ -1,0 +1,160 @@
+"""How well anybody could do with these sensors: two bars of the papers, and an oracle that is told nearly everything.
+
+An oracle is a Bayesian who hears the same noisy readings, knows the friction and the motion, and is told the truth of
+all that is not listed as unknown. What is unknown to him is what vehicle file and data sheet leave open to anybody.
+Everything is linear about the truth, so that his estimate is that of least squares with a Gaussian prior.
+
+`speed`: v_x of an accelerating sine. He hears the wheels without noise: W = (1 + ρ) v.
+
+    a_y − v_y' = (1 − ρ) W r + κ_y a_l + τ a_l' + c (v_y − l_r r)' + b_y     a_l: what the rolling body has followed
+    ΔW (1 − ρ) = ∫(a_x + r v_y − κ_x a_p − c r (v_y − l_r r) − b_x)          over stretches of STRETCH_S
+    unknown: ρ radius of the file, c ln of cornering stiffness, κ and τ how the body rolls and pitches, b offsets
+
+`friction`: μ under .6 g, at the end of the drive. He hears the mean of four wheels, knows the force of every tyre, and
+the speed but for offset and leak of a_x.
+
+    R ω = (1 + ρ)(v + b t + κ (v − v(0)) + v_0)(1 + s e^{−k} g(μ, shape))    s true slip
+    g    slip that the forces take at μ and with that shape of the tyre's curve, over the true one
+    unknown: μ (uniform), shape (as the fleet's), k ln of stiffness, ρ, b, κ, v_0
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from itertools import product
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from edge_agent.dynamics.tyres import magic_formula
+from edge_agent.lab.evaluation.batch import USUAL, DriveSet, realistic
+from edge_agent.lab.evaluation.scenarios import PAPERS
+from edge_agent.lab.simulation.presets import KNOWN
+from edge_agent.lab.simulation.sensors import SENSORS, Sensors
+from schemas.mugrid import UPPER
+from schemas.numeric import FloatArray
+from schemas.signals import S, per_wheel
+
+STRETCH_S: Final = 0.5
+ROLL_LEAK_STD: Final = 0.012  # of .07: the suspensions of a fleet differ by 17 %
+PITCH_LEAK_STD: Final = 0.005  # of .03
+ROLL_LAG_STD: Final = 0.03  # [s] of .1
+START_STD: Final = 0.05  # [m/s] of the speed at the start, as the wheels know it
+LIKELY: Final = np.linspace(0.62, UPPER, 59)  # frictions that are weighed; .6 g leaves none below
+SHAPES: Final = tuple(product(np.linspace(1.38, 1.62, 5), np.linspace(-0.5, 0.1, 5)))  # as `one_of_a_fleet` draws them
+THETA: Final = np.linspace(0.0, 4.0, 2001)
+LEAST: Final = 1e-3  # normalised slip below which a wheel rolls freely
+
+
+class Heard(NamedTuple):
+    """A drive of 002.sine: what the oracle knows, and what rolls and pitches in the accelerometers, (T,) each."""
+
+    batch: DriveSet
+    rolled: FloatArray
+    pitched: FloatArray
+    felt: FloatArray  # (T, 2), by accelerometers without any other error
+
+
+def speed(seeds: Sequence[int]) -> FloatArray:
+    """RMSE of v_x [m/s] in 002.sine, one per seed."""
+    scenario = PAPERS["002.sine"]
+    car, batch = scenario.vehicle, realistic(scenario, seeds)
+    felt = realistic(scenario, seeds[:1], Sensors(leak=True)).signals[:, 0, S.AX : S.AY + 1]
+    leaked = felt - np.stack([batch.truth["true_ax"][:, 0], batch.truth["true_ay"][:, 0]], axis=-1)
+    heard = Heard(batch, leaked[:, 1] / car.roll_leak, leaked[:, 0] / car.pitch_leak, felt)
+    known = [vehicle.wheel_radius / car.vehicle.wheel_radius - 1.0 for vehicle in batch.vehicles]
+    return np.array([_speed(heard, n, rho) for n, rho in enumerate(known)])
+
+
+def _speed(heard: Heard, n: int, rho: float) -> float:
+    """Each second he estimates ρ anew from all that came before, and corrects the wheels by it."""
+    batch, car = heard.batch, PAPERS["002.sine"].vehicle
+    v, vy, r = (batch.truth[f"true_{name}"][:, n] for name in ("vx", "vy", "yaw_rate"))
+    dt = float(batch.t[1, n] - batch.t[0, n])
+    wheels, slipping = (1.0 + rho) * v, vy - car.vehicle.cg_to_rear_axle * r
+    across = batch.signals[:, n, S.AY] - heard.felt[:, 1] + (v - wheels) * r
+    along = batch.signals[:, n, S.AX] - heard.felt[:, 0] + np.gradient(v - wheels, dt)
+    none, one = np.zeros_like(v), np.ones_like(v)
+    rolling = (heard.rolled, car.roll_leak * np.gradient(heard.rolled, dt))
+    sideways = np.stack([-wheels * r, *rolling, np.gradient(slipping, dt), one, none, none], axis=1)
+    ahead = np.stack([-np.gradient(wheels, dt), none, none, r * slipping, none, heard.pitched, one], axis=1)
+    white, offset = SENSORS[USUAL].acceleration
+    std = np.array([
+        KNOWN["wheel_radius"], ROLL_LEAK_STD, ROLL_LAG_STD, KNOWN["cornering_stiffness"], offset, PITCH_LEAK_STD, offset
+    ])  # fmt: skip
+    stretch = round(STRETCH_S / dt)
+    information, vector, off, estimate = np.diag(std**-2), np.zeros(len(std)), np.empty(len(v)), 0.0
+    for first in range(0, len(v), round(1.0 / dt)):
+        now = slice(first, first + round(1.0 / dt))
+        off[now] = wheels[now] / (1.0 + estimate) - v[now]
+        starts = range(now.start, min(now.stop, len(v)) - stretch + 1, stretch)
+        long = np.stack([ahead[k : k + stretch].mean(axis=0) for k in starts])
+        told = np.array([along[k : k + stretch].mean() for k in starts])
+        rows = np.concatenate([sideways[now], np.sqrt(stretch) * long]) / white
+        readings = np.concatenate([across[now], np.sqrt(stretch) * told]) / white
+        information, vector = information + rows.T @ rows, vector + rows.T @ readings
+        estimate = float(np.linalg.solve(information, vector)[0])
+    return float(np.sqrt(np.mean(off**2)))
+
+
+def friction(seeds: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+    """|μ − truth| at the end of 003.accel, one per seed, and the error that the oracle expects of himself, likewise."""
+    scenario = PAPERS["003.accel"]
+    exact, batch = realistic(scenario, seeds[:1], "ideal"), realistic(scenario, seeds)
+    car, v, truth = scenario.vehicle, exact.truth["true_vx"][:, 0], float(exact.mu[0, 0])
+    slip = car.vehicle.wheel_radius * exact.signals[:, 0, S.OMEGA : S.OMEGA + 4] / v[:, None] - 1.0
+    used = np.stack([exact.truth[name][:, 0] for name in per_wheel("true_utilisation")], axis=-1)
+    here = np.maximum(_theta(used, car.shape, car.curvature) * truth, LEAST)
+    slips = {
+        (mu, *shape): (slip * np.where(here > LEAST, mu * _theta(used * truth / mu, *shape) / here, 1.0)).mean(axis=1)
+        for mu in LIKELY for shape in SHAPES
+    }  # fmt: skip
+    errors, expected = [], []
+    for n, vehicle in enumerate(batch.vehicles):
+        told = vehicle.wheel_radius * batch.signals[:, n, S.OMEGA : S.OMEGA + 4].mean(axis=1)
+        stiff = float(np.log(vehicle.longitudinal_stiffness / car.vehicle.longitudinal_stiffness))
+        cost = np.array([_cost(told, v, slip, vehicle.wheel_radius, stiff) for slip in slips.values()])
+        weight = np.exp(cost.min() - cost).reshape(len(LIKELY), -1).sum(axis=1)
+        median = float(np.interp(0.5, np.cumsum(weight) / weight.sum(), LIKELY))
+        errors.append(abs(median - truth))
+        expected.append(float(np.abs(LIKELY - median) @ weight / weight.sum()))
+    return np.array(errors), np.array(expected)
+
+
+def _theta(force: FloatArray, shape: float, curvature: float) -> FloatArray:
+    """Normalised slip on the rising branch that gives the share `force` of the grip."""
+    curve = _curve(shape, curvature)
+    return np.interp(force, curve, THETA[: len(curve)])
+
+
+@cache
+def _curve(shape: float, curvature: float) -> FloatArray:
+    """The curve at THETA up to its peak."""
+    curve = np.array([magic_formula(x, shape, curvature) for x in THETA])
+    return curve[: int(np.argmax(curve)) + 1]
+
+
+def _cost(told: FloatArray, v: FloatArray, slip: FloatArray, radius: float, stiff: float) -> float:
+    """−ln of the likelihood of a friction and a shape, the other unknowns fitted and integrated out (Laplace)."""
+    t = np.arange(len(v)) / 100.0
+    std = np.array([
+        KNOWN["longitudinal_stiffness"], KNOWN["wheel_radius"], SENSORS[USUAL].acceleration[1], PITCH_LEAK_STD,
+        START_STD,
+    ])  # fmt: skip
+    white, z = 0.5 * SENSORS[USUAL].wheel_speed * radius, np.array([-stiff, 0.0, 0.0, 0.0, 0.0])
+    centre = z.copy()
+    for _ in range(3):
+        k, rho, offset, leak, start = z
+        ground, turned = v + offset * t + leak * (v - v[0]) + start, 1.0 + slip * np.exp(-k)
+        off = told - (1.0 + rho) * ground * turned
+        slopes = np.stack(
+            [-ground * slip * np.exp(-k), ground * turned, t * turned, (v - v[0]) * turned, turned], axis=1
+        )
+        information = slopes.T @ slopes / white**2 + np.diag(std**-2)
+        step = np.linalg.solve(information, slopes.T @ off / white**2 + (centre - z) / std**2)
+        z = z + step
+    k, rho, offset, leak, start = z
+    off = told - (1.0 + rho) * (v + offset * t + leak * (v - v[0]) + start) * (1.0 + slip * np.exp(-k))
+    squares = float((off @ off) / white**2 + (((z - centre) / std) ** 2).sum())
+    return 0.5 * (squares + float(np.linalg.slogdet(information)[1]))
