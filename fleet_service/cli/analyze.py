@@ -5,37 +5,33 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from fleet_service.analytics.options import Options
 from fleet_service.analytics.questions import QUESTIONS
-from fleet_service.cli.archive import add_part, span
+from fleet_service.cli.common import add_part, span
 from schemas.config import moment
 from schemas.errors import InputError
-
-if TYPE_CHECKING:
-    from fleet_service.cli.archive import Commands
 
 ENDINGS: Final = (".parquet", ".geo.parquet", ".geojson", ".csv", ".png", ".svg", ".html")
 
 
-def add_command(commands: Commands) -> None:
-    """Declare it."""
-    about = "; ".join(f"{question.name}: {question.about}" for question in QUESTIONS.values())
-    analyze = commands.add_parser("analyze", help="ask the archive: " + ", ".join(QUESTIONS), description=about)
-    analyze.add_argument("question", metavar="NAME", help=" | ".join(QUESTIONS))
-    analyze.add_argument("--archive", metavar="DIR", type=Path, required=True, help="compacted files are read")
-    add_part(analyze)
-    analyze.add_argument("--out", metavar="FILE", type=Path, help=f"ends in {', '.join(ENDINGS)}")
-    analyze.add_argument("--engine", default="duckdb", metavar="duckdb|spark", help="default %(default)s")
-    analyze.add_argument("--at", metavar="TIME", help="before-after: of the treatment; replay: of the map")
-    analyze.add_argument("--stations", metavar="FILE", type=Path, help="weather: readings, CSV or Parquet")
-    analyze.add_argument("--step", metavar="SECONDS", type=float, default=0.0, help="replay: between frames")
-    analyze.add_argument("--min-vehicles", metavar="K", type=int, default=2, help="worst, spells: default %(default)s")
-    analyze.set_defaults(command=_analyze)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.description = "; ".join(f"{question.name}: {question.about}" for question in QUESTIONS.values())
+    parser.add_argument("question", metavar="NAME", help=" | ".join(QUESTIONS))
+    parser.add_argument("--archive", metavar="DIR", type=Path, required=True, help="compacted files are read")
+    add_part(parser)
+    parser.add_argument("--out", metavar="FILE", type=Path, help=f"ends in {', '.join(ENDINGS)}")
+    parser.add_argument("--engine", default="duckdb", metavar="duckdb|spark", help="default %(default)s")
+    parser.add_argument("--at", metavar="TIME", help="before-after: of the treatment; replay: of the map")
+    parser.add_argument("--stations", metavar="FILE", type=Path, help="weather: readings, CSV or Parquet")
+    parser.add_argument("--step", metavar="SECONDS", type=float, default=0.0, help="replay: between frames")
+    parser.add_argument("--min-vehicles", metavar="K", type=int, default=2, help="worst, spells: default %(default)s")
 
 
-def _analyze(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
+    """Ask, print the answer, and write it on request."""
     question = QUESTIONS.get(arguments.question)
     if question is None:
         raise InputError("question", f"{arguments.question!r} is none", f"use one of {', '.join(QUESTIONS)}")

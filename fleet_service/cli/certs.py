@@ -12,19 +12,18 @@ LONGEST_DAYS = 36525.0  # a century; beyond, dates end
 SHOWN = 8  # names of a kind
 
 
-def add_command(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Declare the command and its options."""
-    certs = commands.add_parser("certs", help="certificates and router configurations for everyone on a list")
-    certs.add_argument("--fleet", metavar="FILE", type=Path, required=True, help="JSON: who takes part, by role")
-    certs.add_argument("--out", metavar="DIR", type=Path, required=True, help="run it again to renew and to revoke")
-    certs.add_argument("--days", type=float, default=365.0, help="how long a certificate is good (default 365)")
-    certs.add_argument("--ca-days", type=float, default=3650.0, help="how long a new authority is good (default 3650)")
-    certs.add_argument("--renew-days", type=float, default=30.0, help="renew what ends sooner (default 30)")
-    certs.add_argument("--ca", choices=("next", "switch", "drop"), help="a step on the way to another authority")
-    certs.set_defaults(command=_certs)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--fleet", metavar="FILE", type=Path, required=True, help="JSON: who takes part, by role")
+    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="run it again to renew and to revoke")
+    parser.add_argument("--days", type=float, default=365.0, help="how long a certificate is good (default 365)")
+    parser.add_argument("--ca-days", type=float, default=3650.0, help="how long a new authority is good (default 3650)")
+    parser.add_argument("--renew-days", type=float, default=30.0, help="renew what ends sooner (default 30)")
+    parser.add_argument("--ca", choices=("next", "switch", "drop"), help="a step on the way to another authority")
 
 
-def _certs(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
+    """Enrol everyone on the list."""
     from fleet_service.enrolment.fleet import Enrolment
     from schemas.config import load
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -15,6 +16,8 @@ import pytest
 import zenoh
 
 from deploy.router import open_router
+from fleet_service import cli
+from fleet_service.analytics.questions import QUESTIONS
 from fleet_service.cli import main
 from schemas import wire
 from schemas.config import ZenohSettings
@@ -26,6 +29,34 @@ from tests.fleet_service.examples import CELL, SECOND, batch, key
 from tests.waiting import until
 
 COMMAND = [sys.executable, "-m", "fleet_service.cli"]
+
+
+README = Path(cli.__file__).parents[1] / "README.md"
+
+
+@pytest.mark.parametrize("command", cli.COMMANDS, ids=lambda command: str(command.name))
+def test_every_command_has_help_and_stands_in_the_readme_with_all_its_options(
+    command: cli.Command, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        main([command.name, "--help"])
+    options = re.findall(r"^  (--[a-z-]+)", capsys.readouterr().out, re.MULTILINE)
+    written = re.search(rf"^fleet-service {command.name} .*(?:\n  .*)*", README.read_text(), re.MULTILINE)
+    assert written
+    assert options
+    assert not [option for option in options if option not in written[0]]
+
+
+def test_the_help_of_analyze_names_every_question() -> None:
+    (analyze,) = (command for command in cli.COMMANDS if command.name == "analyze")
+    assert analyze.help == f"ask the archive: {', '.join(QUESTIONS)}"
+
+
+def test_help_comes_without_what_commands_need() -> None:
+    words = "import sys; from fleet_service import cli; cli._parser(None); print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True).stdout.split()
+    assert "fleet_service.cli" in loaded
+    assert not {"numpy", "pyarrow", "zenoh", "numba", "pydantic"} & set(loaded)
 
 
 @pytest.fixture

@@ -181,7 +181,7 @@ def test_the_questions_of_analysts_see_files_of_several_versions_as_one_table(tm
         fill(tmp_path, 1, 20, seed)
         rewritten(segments.paths(tmp_path, Kind.OBSERVATION)[0], change, "1.7")
         compact(tmp_path)
-    engine = pytest.importorskip("fleet_service.analytics.engines").Engine("duckdb", tmp_path, EVERYTHING)
+    engine = pytest.importorskip("fleet_service.analytics.engines").QueryEngine("duckdb", tmp_path, EVERYTHING)
     seen = engine.answer(engine.observations().select("seq", "tyre_season", "road_wetness"))
     assert (seen.num_rows, seen["tyre_season"].null_count, seen["road_wetness"].null_count) == (60, 20, 40)
 

@@ -1,0 +1,35 @@
+"""`fleet-service compact`: the log as files by date and zone. The service may run meanwhile."""
+
+from __future__ import annotations
+
+import argparse
+
+from fleet_service.cli.common import add_archive, on_archive
+from schemas.errors import InputError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_archive(parser)
+    parser.add_argument("--to", metavar="URI", help="then put what is new there, e.g. s3://bucket/folder")
+    parser.add_argument(
+        "--round-rows", metavar="N", type=int, help="rows in memory at once; default a million, half a gigabyte"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command on its archive."""
+    return on_archive(arguments, _compact)
+
+
+def _compact(arguments: argparse.Namespace) -> str:
+    from fleet_service.archive import mirror, rollup
+    from fleet_service.archive.compaction import ROUND_ROWS, compact
+
+    rows = ROUND_ROWS if arguments.round_rows is None else arguments.round_rows
+    if rows < 1:
+        raise InputError("round-rows", f"{rows} is below 1", "give the rows of one round")
+    done = compact(arguments.archive, rows)
+    parts = rollup.complete(arguments.archive)
+    said = f"{done.rows} rows of {done.segments} segments moved into {done.files} files, {parts} rolled up"
+    return said if arguments.to is None else f"{said}, {mirror.put(arguments.archive, arguments.to)} put"

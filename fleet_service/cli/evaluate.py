@@ -1,0 +1,35 @@
+"""`fleet-service evaluate`: simulated fleets, beside truth and simple rules."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from schemas.errors import InputError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="figures, table and plots go there")
+    parser.add_argument("--quick", action="store_true", help="one seed, to see that it works; judges nothing")
+    way = parser.add_mutually_exclusive_group()
+    way.add_argument("--skip-whole-way", action="store_true", help="leave the vehicles with real estimators out")
+    way.add_argument("--whole-way", action="store_true", help="those alone, in a level town and on hills")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Measure, and print the table of bars."""
+    from fleet_service.lab import campaign
+    from schemas.runtime import figures
+
+    drives = {} if arguments.skip_whole_way else campaign.whole_ways(arguments.quick)
+
+    def tell(line: str) -> None:
+        print(line, flush=True)
+
+    try:
+        found = campaign.run(arguments.out, arguments.quick, drives, tell, alone=arguments.whole_way)
+    except OSError as error:
+        raise InputError("out", f"cannot write {error.filename} ({error.strerror})", "give another folder") from error
+    print(f"\n{figures.markdown([figure for figure in found if figure.bar is not None])}\n")
+    return 0 if arguments.quick or campaign.holds(found) else 1

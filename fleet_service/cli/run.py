@@ -1,0 +1,69 @@
+"""`fleet-service run`: the service, until a signal."""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fleet_service.cli.common import stop_on_signals
+from schemas.errors import InputError
+from schemas.runtime.process import end_now, line_logger, log_as
+
+if TYPE_CHECKING:
+    from fleet_service.app.service import Service
+
+SWITCH_S = 0.0005  # after which a busy worker lets an answer go first; ten times that is Python's own
+LEAVE_AT_LAST_S = 2.7  # after a signal; the process is to be gone within 3 s
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--config", metavar="FILE", help="JSON; every setting has a default")
+    parser.add_argument("--archive", metavar="DIR", type=Path, required=True, help="one service per archive")
+    parser.add_argument("--weather", metavar="FILE", type=Path, help="Parquet of road weather to begin with")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Serve."""
+    from fleet_service.app.service import Service
+    from schemas.config import ServiceConfig, load
+
+    stop = stop_on_signals()
+    config = load(arguments.config, ServiceConfig)
+    log_as(config.log, sys.stderr, service=config.name)
+    if arguments.weather is not None:
+        config = config.model_copy(update={"weather": arguments.weather})
+    try:
+        say = line_logger(config.log, sys.stdout, service=config.name)
+        service = Service(config, arguments.archive, say)
+    except OSError as error:
+        problem = f"cannot use {error.filename} ({error.strerror})"
+        raise InputError("archive", problem, "give a folder you may read and write") from error
+    sys.setswitchinterval(SWITCH_S)
+    gc.collect()
+    gc.freeze()  # what came from the archive stays: looking through it takes longer than an alert may
+    gone = threading.Event()
+    threading.Thread(target=_leave_at_last, args=(stop, gone, service, say), daemon=True).start()
+    service.run(stop)
+    gone.set()
+    return 0
+
+
+def _leave_at_last(stop: threading.Event, gone: threading.Event, service: Service, say: Callable[[str], None]) -> None:
+    """A session that hangs on a frozen router, or a long compaction, must not keep a stopped service.
+
+    Whatever it was doing may end at any instant: what is not acknowledged its senders keep. The exit code is the one
+    that it would have ended with.
+    """
+    stop.wait()
+    if not gone.wait(LEAVE_AT_LAST_S):
+        say("left at last: a session or a job did not end in time")
+        if service.failure is not None:
+            traceback.print_exception(service.failure)
+        end_now(service.exit_code)
