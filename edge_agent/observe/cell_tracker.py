@@ -45,7 +45,7 @@ class CellTrack:
     sector: int
 
 
-class Fix:
+class ReceiverSample:
     """One sample of the satellite receiver, as a record: position [deg], yaw [rad], its cell and the cell's borders."""
 
     latitude: float
@@ -112,7 +112,7 @@ def locate(
 
 def _fixes(signals: FloatArray) -> RecordArray:
     """The receiver's part of signals (T, N, channels), as records (T, N)."""
-    fixes = records(Fix, *signals.shape[:-1])
+    fixes = records(ReceiverSample, *signals.shape[:-1])
     latitude, longitude = signals[..., S.LATITUDE], signals[..., S.LONGITUDE]
     fixes["latitude"], fixes["longitude"], fixes["yaw"] = latitude, longitude, signals[..., S.YAW]
     there = (np.abs(latitude) <= grid.MAX_LATITUDE) & (np.abs(longitude) <= 180.0)
@@ -136,7 +136,7 @@ def _course(track: CellTrack, latitude: float, longitude: float) -> None:
 
 
 @compiled
-def _stays(track: CellTrack, fix: Fix, yaw: float) -> bool:
+def _stays(track: CellTrack, fix: ReceiverSample, yaw: float) -> bool:
     """Whether a fix still belongs to the visit, margins included."""
     wide = CELL_MARGIN * (track.east - track.west)
     high = CELL_MARGIN * (track.north - track.south)
@@ -149,7 +149,7 @@ def _stays(track: CellTrack, fix: Fix, yaw: float) -> bool:
 
 
 @compiled
-def _receive(track: CellTrack, fix: Fix, now: float) -> None:
+def _receive(track: CellTrack, fix: ReceiverSample, now: float) -> None:
     """Remember what a sample brings."""
     if np.isfinite(fix.yaw):
         track.yaw_time, track.yaw = now, fix.yaw
@@ -159,7 +159,7 @@ def _receive(track: CellTrack, fix: Fix, now: float) -> None:
 
 
 @compiled
-def _begin(track: CellTrack, fix: Fix, heading: float) -> None:
+def _begin(track: CellTrack, fix: ReceiverSample, heading: float) -> None:
     """Begin a visit of the fix's cell."""
     track.cell = fix.cell
     track.sector = int(np.floor((heading + np.pi / 4) / (np.pi / 2))) % grid.SECTORS
@@ -167,7 +167,7 @@ def _begin(track: CellTrack, fix: Fix, heading: float) -> None:
 
 
 @compiled
-def _follow(t: FloatArray, fixes: Records[Fix], tracks: Records[CellTrack], located: Located) -> None:
+def _follow(t: FloatArray, fixes: Records[ReceiverSample], tracks: Records[CellTrack], located: Located) -> None:
     """Sequential core of `locate`; moves the tracks on and fills `located`."""
     for k in range(t.shape[0]):
         for n in range(t.shape[1]):

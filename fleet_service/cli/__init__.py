@@ -18,7 +18,7 @@ BAD_INPUT: Final = 2
 UNUSED = ("scipy", "pyarrow._s3fs", "pyarrow._gcsfs", "pyarrow._azurefs", "pyarrow._hdfs")
 
 
-class Command(NamedTuple):
+class ServiceCommand(NamedTuple):
     """A subcommand: its module has `add_arguments(parser)` and `run(arguments) -> int`."""
 
     name: str
@@ -31,19 +31,19 @@ class Command(NamedTuple):
 
 
 COMMANDS: Final = (
-    Command("run", "take observations in, serve the map, keep the archive"),
-    Command("query", "ask the map once"),
-    Command("watch", "print tiles and alerts as they change, until Ctrl-C"),
-    Command("compact", "sort the log into files by date and zone, roll them up"),
-    Command("retention", "remove old raw rows; their roll-ups stay"),
-    Command("forget", "destroy the key of a month, or remove one vehicle's rows of it"),
-    Command("export", "write a part as GeoParquet, GeoJSON or CSV"),
-    Command(
+    ServiceCommand("run", "take observations in, serve the map, keep the archive"),
+    ServiceCommand("query", "ask the map once"),
+    ServiceCommand("watch", "print tiles and alerts as they change, until Ctrl-C"),
+    ServiceCommand("compact", "sort the log into files by date and zone, roll them up"),
+    ServiceCommand("retention", "remove old raw rows; their roll-ups stay"),
+    ServiceCommand("forget", "destroy the key of a month, or remove one vehicle's rows of it"),
+    ServiceCommand("export", "write a part as GeoParquet, GeoJSON or CSV"),
+    ServiceCommand(
         "analyze",
         "ask the archive: grip, worst, spells, before-after, vehicles, calibration, weather, replay",
     ),
-    Command("certs", "certificates and router configurations for everyone on a list"),
-    Command("evaluate", "simulated fleets, beside truth and simple rules"),
+    ServiceCommand("certs", "certificates and router configurations for everyone on a list"),
+    ServiceCommand("evaluate", "simulated fleets, beside truth and simple rules"),
 )
 
 

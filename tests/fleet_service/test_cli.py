@@ -36,7 +36,7 @@ README = Path(cli.__file__).parents[1] / "README.md"
 
 @pytest.mark.parametrize("command", cli.COMMANDS, ids=lambda command: str(command.name))
 def test_every_command_has_help_and_stands_in_the_readme_with_all_its_options(
-    command: cli.Command, capsys: pytest.CaptureFixture[str]
+    command: cli.ServiceCommand, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit, match="0"):
         main([command.name, "--help"])

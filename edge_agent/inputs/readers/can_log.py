@@ -15,7 +15,7 @@ from typing import Any, Final, TypeAlias
 
 import numpy as np
 
-from edge_agent.inputs.readers.dbc import LONGEST, Bytes, Database, Message
+from edge_agent.inputs.readers.dbc import LONGEST, Bytes, CanMessage, Database
 from edge_agent.inputs.recording import Recording, Series, library
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
@@ -109,7 +109,7 @@ def bus_of(channel: Any) -> int:  # noqa: ANN401 python-can gives a number, a na
     return int(digits[-3:]) if digits else 0
 
 
-def _placed(log: Log, messages: list[Message], buses: dict[str, int]) -> dict[str, Key]:
+def _placed(log: Log, messages: list[CanMessage], buses: dict[str, int]) -> dict[str, Key]:
     """Which frames are which message."""
     counts: dict[int, int] = defaultdict(int)
     for message in messages:

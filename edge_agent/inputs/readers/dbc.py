@@ -80,7 +80,7 @@ class Signal:
 
 
 @dataclass(frozen=True)
-class Message:
+class CanMessage:
     """A message of a database: identifier with its extended flag taken off, length [byte] and signals by name."""
 
     name: str
@@ -101,7 +101,7 @@ class Message:
         return found
 
 
-Database: TypeAlias = dict[str, Message]
+Database: TypeAlias = dict[str, CanMessage]
 
 
 def read_dbc(path: Path) -> Database:
@@ -125,11 +125,11 @@ def read_dbc(path: Path) -> Database:
 def parse_dbc(text: str) -> Database:
     """The messages of a database's text; lines that make no sense are left out, and of two alike the last holds."""
     database: Database = {}
-    message: Message | None = None
+    message: CanMessage | None = None
     for line in text.splitlines():
         if found := _MESSAGE.match(line):
             number, length = int(found[1]), int(found[3])
-            message = Message(found[2], number & (EXTENDED - 1), bool(number & EXTENDED), length, {})
+            message = CanMessage(found[2], number & (EXTENDED - 1), bool(number & EXTENDED), length, {})
             database[message.name] = message
         elif message is not None and (found := _SIGNAL.match(line)):
             signal = _signal(found)
@@ -137,7 +137,7 @@ def parse_dbc(text: str) -> Database:
                 continue
             message.signals[signal.name] = signal
             if found["mux"] == "M":
-                message = Message(**{**vars(message), "multiplexer": signal.name})
+                message = CanMessage(**{**vars(message), "multiplexer": signal.name})
                 database[message.name] = message
         elif line.strip() and not line.lstrip().startswith("SG_"):
             message = None

@@ -70,14 +70,14 @@ def _onward(file: BinaryIO, address: int, size: int, path: Path) -> list[int]:
     return [links[place] for place in LINKS.get(kind, ()) if place < count and links[place]]
 
 
-class Content(NamedTuple):
+class MdfContent(NamedTuple):
     """What a file holds: frames and the time of the first [s since 1970 UTC], or the channels of a measurement."""
 
     frames: tuple[Log, float] | None
     recording: Recording | None
 
 
-def read_isolated(path: Path, identifiers: set[int] | None, names: set[str] | None) -> Content:
+def read_isolated(path: Path, identifiers: set[int] | None, names: set[str] | None) -> MdfContent:
     """Read a file in a process of its own: asammdf's compiled parts crash on some broken files.
 
     Args:
@@ -101,13 +101,13 @@ def _limited() -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
-def _content(path: Path, identifiers: set[int] | None, names: set[str] | None) -> Content:
+def _content(path: Path, identifiers: set[int] | None, names: set[str] | None) -> MdfContent:
     with library("asammdf").MDF(path) as file:
         if not has_frames(file):
-            return Content(None, read_mdf(file, path, names))
+            return MdfContent(None, read_mdf(file, path, names))
         if identifiers is None:
             raise no_database(path)
-        return Content(mdf_frames(file, identifiers), None)
+        return MdfContent(mdf_frames(file, identifiers), None)
 
 
 def has_frames(mdf: Any) -> bool:  # noqa: ANN401

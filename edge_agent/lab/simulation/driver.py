@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from edge_agent.dynamics.parameters import P
 from edge_agent.lab.simulation.chance import uniform
-from edge_agent.lab.simulation.friction import F, look_up
-from edge_agent.lab.simulation.plant import Body, W, strongest_pull
-from edge_agent.lab.simulation.roads import L
+from edge_agent.lab.simulation.friction import PatchColumn, look_up
+from edge_agent.lab.simulation.plant import Motion, Wheel, strongest_pull
+from edge_agent.lab.simulation.roads import LanePoint
 from schemas.numeric import FloatArray, IntArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY
@@ -30,7 +30,7 @@ Key: TypeAlias = np.uint64
 KeyArray: TypeAlias = NDArray[np.uint64]
 
 
-class D(IntEnum):
+class Driver(IntEnum):
     """State of one driver (float64)."""
 
     STEER = 0  # [rad] mean road-wheel angle, as the arms have followed so far
@@ -44,7 +44,7 @@ class D(IntEnum):
     STOPS = 8  # share of the ALERT_S in which he comes to a stop and waits; 0: nobody stops
 
 
-class G(IntEnum):
+class Route(IntEnum):
     """Where one driver is on his route (int64)."""
 
     LANE = 0
@@ -97,17 +97,19 @@ def follow(x: FloatArray, g: IntArray, lanes: Lanes, key: Key) -> float:
     """
     points, first, size, spacing, ways = lanes
     while True:
-        lane, point = g[G.LANE], g[G.POINT]
+        lane, point = g[Route.LANE], g[Route.POINT]
         row = points[first[lane] + point]
-        along = (x[Body.X] - row[L.X]) * row[L.COS] + (x[Body.Y] - row[L.Y]) * row[L.SIN]
+        along = (x[Motion.X] - row[LanePoint.X]) * row[LanePoint.COS] + (x[Motion.Y] - row[LanePoint.Y]) * row[
+            LanePoint.SIN
+        ]
         if not along > 0.0:
             return float(min(-along, spacing[lane]))
         if point + 1 < size[lane]:
-            g[G.POINT] = point + 1
+            g[Route.POINT] = point + 1
             continue
-        g[G.LANE], g[G.POINT] = ways[lane, g[G.WAY]], 0
-        g[G.TURNS] += 1
-        g[G.WAY] = int(uniform(key, g[G.TURNS]) * ways_of(ways, g[G.LANE]))
+        g[Route.LANE], g[Route.POINT] = ways[lane, g[Route.WAY]], 0
+        g[Route.TURNS] += 1
+        g[Route.WAY] = int(uniform(key, g[Route.TURNS]) * ways_of(ways, g[Route.LANE]))
 
 
 @compiled
@@ -117,8 +119,8 @@ def ahead(d: FloatArray, g: IntArray, lanes: Lanes, distance: float) -> tuple[in
     Beyond the next lane he takes the first way.
     """
     _, first, size, spacing, ways = lanes
-    lane, way = g[G.LANE], g[G.WAY]
-    left = max(distance - d[D.SHORT] + g[G.POINT] * spacing[lane], 0.0)
+    lane, way = g[Route.LANE], g[Route.WAY]
+    left = max(distance - d[Driver.SHORT] + g[Route.POINT] * spacing[lane], 0.0)
     while True:
         length = (size[lane] - 1) * spacing[lane]
         if left <= length:
@@ -131,25 +133,25 @@ def ahead(d: FloatArray, g: IntArray, lanes: Lanes, distance: float) -> tuple[in
 @compiled
 def budget(d: FloatArray) -> float:
     """q [m/s^2]: what the driver is ready to ask of the tyres."""
-    return float(min(d[D.STYLE] * d[D.BELIEF] * GRAVITY, d[D.COMFORT]))
+    return float(min(d[Driver.STYLE] * d[Driver.BELIEF] * GRAVITY, d[Driver.COMFORT]))
 
 
 @compiled
 def cruise(d: FloatArray) -> float:
     """Speed he keeps on an open road [m/s]: slower where he believes it slippery."""
-    return float(d[D.CRUISE] * math.sqrt(min(1.0, 0.25 + 1.1 * d[D.BELIEF])))
+    return float(d[Driver.CRUISE] * math.sqrt(min(1.0, 0.25 + 1.1 * d[Driver.BELIEF])))
 
 
 @compiled
 def believe(d: FloatArray, looks: float, w: FloatArray, dt: float) -> None:
     """Take in how the road ahead looks, and whether wheels slide."""
-    lag = WORSE_S if looks < d[D.BELIEF] else BETTER_S
-    d[D.BELIEF] += (looks - d[D.BELIEF]) * -math.expm1(-dt / lag)
+    lag = WORSE_S if looks < d[Driver.BELIEF] else BETTER_S
+    d[Driver.BELIEF] += (looks - d[Driver.BELIEF]) * -math.expm1(-dt / lag)
     for i in range(4):
-        if w[W.THETA, i] > SLIDING:
-            d[D.BELIEF] *= math.exp(-dt / ALARM_S)
+        if w[Wheel.THETA, i] > SLIDING:
+            d[Driver.BELIEF] *= math.exp(-dt / ALARM_S)
             break
-    d[D.BELIEF] = max(d[D.BELIEF], LEAST_BELIEF)
+    d[Driver.BELIEF] = max(d[Driver.BELIEF], LEAST_BELIEF)
 
 
 @compiled
@@ -173,26 +175,26 @@ def wished_acceleration(
     x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float, key: Key
 ) -> float:
     """Longitudinal acceleration [m/s^2] that he asks for."""
-    vx, q = x[Body.VX], budget(d)
+    vx, q = x[Motion.VX], budget(d)
     reach = max(2.0, 0.5 * vx)
-    lane = g[G.LANE]
+    lane = g[Route.LANE]
     row, beyond = ahead(d, g, lanes, reach)
     last = lanes[1][lane] + lanes[2][lane] - 1
     stays = lanes[1][lane] <= row <= last
-    here = lanes[0][lanes[1][lane] + g[G.POINT], L.PROFILE + g[G.WAY]]
-    there = lanes[0][row, L.PROFILE + g[G.WAY]] if stays else min(here, lanes[0][row, L.PROFILE])
+    here = lanes[0][lanes[1][lane] + g[Route.POINT], LanePoint.PROFILE + g[Route.WAY]]
+    there = lanes[0][row, LanePoint.PROFILE + g[Route.WAY]] if stays else min(here, lanes[0][row, LanePoint.PROFILE])
     if stays and row < last:
-        there += (lanes[0][row + 1, L.PROFILE + g[G.WAY]] - there) * beyond / lanes[3][lane]
+        there += (lanes[0][row + 1, LanePoint.PROFILE + g[Route.WAY]] - there) * beyond / lanes[3][lane]
     aim = min(q * there, cruise(d) ** 2)
     wish = (max(aim, SLOWEST**2) - vx * vx) / (2.0 * reach)
-    across = min(abs(vx * x[Body.YAW_RATE]) / q, 1.0)
+    across = min(abs(vx * x[Motion.YAW_RATE]) / q, 1.0)
     room = math.sqrt(1.0 - across * across)  # what cornering leaves of the budget
     driven = max(p[P.DRIVE_FRONT], 1.0 - p[P.DRIVE_FRONT])  # share of the pull on an axle that carries half the vehicle
-    gas = min(PULL * d[D.BELIEF] * GRAVITY * min(1.0, 0.5 / driven), 0.8 * q, strongest_pull(p, vx) / p[P.MASS])
+    gas = min(PULL * d[Driver.BELIEF] * GRAVITY * min(1.0, 0.5 / driven), 0.8 * q, strongest_pull(p, vx) / p[P.MASS])
     alarm = alerted(t, key)
     if alarm > 0.0 and vx > SLOWEST + 1.0:
         wish = min(wish, -alarm * q)
-    if stops(t, d[D.STOPS], key):
+    if stops(t, d[Driver.STOPS], key):
         wish = -STOPPING * q
     hardest = max(q, FRIGHT) if vx * vx > TOO_FAST * aim else q
     return float(min(max(wish, -max(room, LEAST_BRAKING) * hardest), room * gas))
@@ -202,25 +204,25 @@ def wished_acceleration(
 def wished_force(p: FloatArray, d: FloatArray, vx: float, acceleration: float, along: float) -> float:
     """Force [N] that he gives for an acceleration while gravity pulls with `along` [m/s^2]: as tyres and engine can."""
     driven = max(p[P.DRIVE_FRONT], 1.0 - p[P.DRIVE_FRONT])
-    most = min(PULL * d[D.BELIEF] * GRAVITY * min(1.0, 0.5 / driven), strongest_pull(p, vx) / p[P.MASS])
+    most = min(PULL * d[Driver.BELIEF] * GRAVITY * min(1.0, 0.5 / driven), strongest_pull(p, vx) / p[P.MASS])
     return float(p[P.MASS] * min(acceleration - along, max(most, acceleration)))
 
 
 @compiled
 def wished_steer(x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float) -> float:
     """Mean road-wheel angle [rad] of the circle through a point ahead, as far as the front tyres follow."""
-    vx, base = max(x[Body.VX], SLOWEST), p[P.TO_FRONT] + p[P.TO_REAR]
+    vx, base = max(x[Motion.VX], SLOWEST), p[P.TO_FRONT] + p[P.TO_REAR]
     number, beyond = ahead(d, g, lanes, 2.5 + 0.45 * vx)
     row = lanes[0][number]
-    offset = d[D.WOBBLE] * math.sin(2.0 * math.pi * WOBBLE_HZ * t + 1e3 * d[D.WOBBLE])
-    dx = row[L.X] + row[L.COS] * beyond - row[L.SIN] * offset - x[Body.X]
-    dy = row[L.Y] + row[L.SIN] * beyond + row[L.COS] * offset - x[Body.Y]
-    c, s = math.cos(x[Body.YAW]), math.sin(x[Body.YAW])
+    offset = d[Driver.WOBBLE] * math.sin(2.0 * math.pi * WOBBLE_HZ * t + 1e3 * d[Driver.WOBBLE])
+    dx = row[LanePoint.X] + row[LanePoint.COS] * beyond - row[LanePoint.SIN] * offset - x[Motion.X]
+    dy = row[LanePoint.Y] + row[LanePoint.SIN] * beyond + row[LanePoint.COS] * offset - x[Motion.Y]
+    c, s = math.cos(x[Motion.YAW]), math.sin(x[Motion.YAW])
     forward, left = c * dx + s * dy + p[P.TO_REAR], c * dy - s * dx
     if forward < 0.0:  # spun round: turn about, or the point stays straight behind for ever
         return math.copysign(LARGEST_STEER, left)
     steer = math.atan(2.0 * base * left / max(forward * forward + left * left, 1.0))
-    drift = math.atan2(x[Body.VY] + p[P.TO_FRONT] * x[Body.YAW_RATE], vx)
+    drift = math.atan2(x[Motion.VY] + p[P.TO_FRONT] * x[Motion.YAW_RATE], vx)
     steer = min(max(steer, drift - LARGEST_SLIP_ANGLE), drift + LARGEST_SLIP_ANGLE)
     return min(max(steer, -LARGEST_STEER), LARGEST_STEER)
 
@@ -238,13 +240,13 @@ def drive(
     d, g = driver
     lanes, friction = world
     t, dt, along = now
-    d[D.SHORT] = follow(x, g, lanes, keys[0])
-    number, _ = ahead(d, g, lanes, max(LOOKING_S * x[Body.VX], 0.0))
+    d[Driver.SHORT] = follow(x, g, lanes, keys[0])
+    number, _ = ahead(d, g, lanes, max(LOOKING_S * x[Motion.VX], 0.0))
     point = lanes[0][number]
-    believe(d, look_up(friction, F.LOOKS, t, point[L.X], point[L.Y]), w, dt)
+    believe(d, look_up(friction, PatchColumn.LOOKS, t, point[LanePoint.X], point[LanePoint.Y]), w, dt)
     acceleration = wished_acceleration(x, d, g, lanes, p, t, keys[1])
-    force = wished_force(p, d, x[Body.VX], acceleration, along)
-    if x[Body.VX] < RESTING and stops(t, d[D.STOPS], keys[1]):
+    force = wished_force(p, d, x[Motion.VX], acceleration, along)
+    if x[Motion.VX] < RESTING and stops(t, d[Driver.STOPS], keys[1]):
         force = -p[P.MASS] * (STOPPING * budget(d) + abs(along))
-    d[D.FORCE] += (force - d[D.FORCE]) * -math.expm1(-dt / FOOT_S)
-    d[D.STEER] += (wished_steer(x, d, g, lanes, p, t) - d[D.STEER]) * -math.expm1(-dt / ARMS_S)
+    d[Driver.FORCE] += (force - d[Driver.FORCE]) * -math.expm1(-dt / FOOT_S)
+    d[Driver.STEER] += (wished_steer(x, d, g, lanes, p, t) - d[Driver.STEER]) * -math.expm1(-dt / ARMS_S)

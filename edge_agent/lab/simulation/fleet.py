@@ -8,17 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from edge_agent.lab.simulation.chance import checked_seed, key_of
-from edge_agent.lab.simulation.driver import ALERT_STREAM, ROUTE_STREAM, D, G, KeyArray, Lanes, drive
-from edge_agent.lab.simulation.friction import F, look_up
+from edge_agent.lab.simulation.driver import ALERT_STREAM, ROUTE_STREAM, Driver, KeyArray, Lanes, Route, drive
+from edge_agent.lab.simulation.friction import PatchColumn, look_up
 from edge_agent.lab.simulation.misaligned import memory_of
 from edge_agent.lab.simulation.plant import (
     INPUTS,
     RECORD,
     STATES,
-    Body,
-    R,
-    U,
-    W,
+    Control,
+    Motion,
+    RecordColumn,
+    Wheel,
     advance,
     command,
     gravity,
@@ -29,9 +29,17 @@ from edge_agent.lab.simulation.plant import (
 )
 from edge_agent.lab.simulation.presets import nominal, one_of_a_fleet
 from edge_agent.lab.simulation.relief import gradient, tilt
-from edge_agent.lab.simulation.roads import L, Network
+from edge_agent.lab.simulation.roads import LanePoint, Network
 from edge_agent.lab.simulation.scenarios import Scenario, scenario_named
-from edge_agent.lab.simulation.sensors import ROUGH_FLEET, E, Sensors, error_row, noise_keys, sense, sensors_named
+from edge_agent.lab.simulation.sensors import (
+    ROUGH_FLEET,
+    ErrorColumn,
+    Sensors,
+    error_row,
+    noise_keys,
+    sense,
+    sensors_named,
+)
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.jit import compiled
@@ -82,15 +90,20 @@ def run(
         x, d, g, w, p = vehicles[n], drivers[n], routes[n], wheels[n], parameters[n]
         for k in range(steps):
             t = (first + k) * period
-            lane = lanes[0][lanes[1][g[G.LANE]] + g[G.POINT]]
-            east, north = gradient(relief, (x[Body.X], x[Body.Y]), (lane[L.COS], lane[L.SIN]), lane[L.CURVATURE])
-            u[U.TILT, 0], u[U.TILT, 1] = tilt(east, north, x[Body.YAW])
+            lane = lanes[0][lanes[1][g[Route.LANE]] + g[Route.POINT]]
+            east, north = gradient(
+                relief,
+                (x[Motion.X], x[Motion.Y]),
+                (lane[LanePoint.COS], lane[LanePoint.SIN]),
+                lane[LanePoint.CURVATURE],
+            )
+            u[Control.TILT, 0], u[Control.TILT, 1] = tilt(east, north, x[Motion.YAW])
             now = (t, period, gravity(u)[0])
             drive(x, (d, g), (lanes, friction), p, w, now, (keys[0][n], keys[1][n]))
-            command(p, u, d[D.STEER], d[D.FORCE])
+            command(p, u, d[Driver.STEER], d[Driver.FORCE])
             for i in range(4):
                 px, py = wheel_place(x, p, i)
-                u[U.MU, i] = look_up(friction, F.MU, t, px, py)
+                u[Control.MU, i] = look_up(friction, PatchColumn.MU, t, px, py)
             observe(x, p, u, w, records[k, n])
             advance(x, p, u, w, period / substeps, substeps)
     return records
@@ -141,7 +154,7 @@ class SimulatedFleet:
             np.array([key_of(seed, k, ALERT_STREAM) for k in range(vehicles)]),
         )
         self._states = _start(self.scenario.network, self._parameters, rngs)
-        self._states[1][:, D.STOPS] = np.where(self.rough, STOPS, 0.0)
+        self._states[1][:, Driver.STOPS] = np.where(self.rough, STOPS, 0.0)
         self._before = np.empty((0, vehicles, RECORD))  # what late clocks may still speak of
         self._wander = np.zeros((vehicles, 3))
         self._relief = self.scenario.relief.table
@@ -161,7 +174,7 @@ class SimulatedFleet:
         known, lead = np.concatenate([self._before, records]), len(self._before)
         clock = (self._next, self.rate_hz, lead)
         signals = sense(known, self._errors, self._wander, place, self._noise, clock)
-        memory = memory_of(self._errors[:, E.MOUNTED :], self.rate_hz)
+        memory = memory_of(self._errors[:, ErrorColumn.MOUNTED :], self.rate_hz)
         self._before = known[len(known) - min(memory, len(known)) :]
         t = np.repeat((np.arange(self._next, self._next + steps) / self.rate_hz)[:, None], len(self.names), axis=1)
         self._next += steps
@@ -176,9 +189,17 @@ def rough_ones(vehicles: int, share: float) -> BoolArray:
 
 
 def _truth(records: FloatArray) -> Truth:
-    x, y, yaw, vx, vy = (records[..., column] for column in (R.X, R.Y, R.YAW, R.VX, R.VY))
-    wheels = (records[..., R.MU : R.MU + 4], records[..., R.UTILISATION : R.UTILISATION + 4])
-    felt = (records[..., column] for column in (R.YAW_RATE, R.AX, R.AY, R.SLOPE))
+    x, y, yaw, vx, vy = (
+        records[..., column]
+        for column in (RecordColumn.X, RecordColumn.Y, RecordColumn.YAW, RecordColumn.VX, RecordColumn.VY)
+    )
+    wheels = (
+        records[..., RecordColumn.MU : RecordColumn.MU + 4],
+        records[..., RecordColumn.UTILISATION : RecordColumn.UTILISATION + 4],
+    )
+    felt = (
+        records[..., column] for column in (RecordColumn.YAW_RATE, RecordColumn.AX, RecordColumn.AY, RecordColumn.SLOPE)
+    )
     return Truth(x, y, yaw, vx, vy, *wheels, *felt)
 
 
@@ -187,18 +208,23 @@ def _start(
 ) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
     """Vehicles spread over the roads, rolling at walking pace, each with a driver of his own."""
     count = len(rngs)
-    vehicles, wheels = np.zeros((count, STATES)), np.zeros((count, len(W), 4))
-    drivers, routes = np.zeros((count, len(D))), np.zeros((count, len(G)), dtype=np.int64)
+    vehicles, wheels = np.zeros((count, STATES)), np.zeros((count, len(Wheel), 4))
+    drivers, routes = np.zeros((count, len(Driver))), np.zeros((count, len(Route)), dtype=np.int64)
     end = np.cumsum(network.size[: network.roads])
     for k, rng in enumerate(rngs):
         place = int((k + 0.5) * GOLDEN % 1.0 * end[-1])
         lane = int(np.searchsorted(end, place, side="right"))
         point = network.points[place]
         routes[k] = (lane, place - network.first[lane], 0, 0)
-        start_at(vehicles[k], parameters[k], (point[L.X], point[L.Y], math.atan2(point[L.SIN], point[L.COS])), 5.0)
-        drivers[k, D.BELIEF] = 0.3
-        drivers[k, D.STYLE] = rng.uniform(0.65, 0.88)
-        drivers[k, D.COMFORT] = rng.uniform(4.0, 6.5)
-        drivers[k, D.CRUISE] = rng.uniform(12.0, 15.5)
-        drivers[k, D.WOBBLE] = rng.uniform(0.1, 0.3)
+        start_at(
+            vehicles[k],
+            parameters[k],
+            (point[LanePoint.X], point[LanePoint.Y], math.atan2(point[LanePoint.SIN], point[LanePoint.COS])),
+            5.0,
+        )
+        drivers[k, Driver.BELIEF] = 0.3
+        drivers[k, Driver.STYLE] = rng.uniform(0.65, 0.88)
+        drivers[k, Driver.COMFORT] = rng.uniform(4.0, 6.5)
+        drivers[k, Driver.CRUISE] = rng.uniform(12.0, 15.5)
+        drivers[k, Driver.WOBBLE] = rng.uniform(0.1, 0.3)
     return vehicles, drivers, routes, wheels

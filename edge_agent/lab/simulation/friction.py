@@ -47,7 +47,7 @@ class Patch:
             raise InputError("patch", f"{self.name} covers nothing", "give positive sizes, and start before end")
 
 
-class F(IntEnum):
+class PatchColumn(IntEnum):
     """Columns of a friction table (one row per patch, float64)."""
 
     X = 0
@@ -65,7 +65,7 @@ class F(IntEnum):
 def friction_table(background: float, patches: tuple[Patch, ...]) -> FloatArray:
     """Rows for `look_up`, shape (1 + patches, 10); the background is the first, endless patch."""
     everywhere = Patch("background", 0.0, 0.0, math.inf, math.inf, background, looks=background)
-    table = np.empty((1 + len(patches), len(F)))
+    table = np.empty((1 + len(patches), len(PatchColumn)))
     for row, p in zip(table, (everywhere, *patches), strict=True):
         looks = math.nan if p.looks is None else p.looks
         box = (p.x, p.y, math.cos(p.angle), math.sin(p.angle), p.length / 2, p.width / 2)
@@ -78,11 +78,14 @@ def look_up(table: FloatArray, column: int, t: float, x: float, y: float) -> flo
     """Column F.MU or F.LOOKS of the topmost patch at (x, y) [m] and t [s] that says something about it."""
     for i in range(table.shape[0] - 1, 0, -1):
         row = table[i]
-        if t < row[F.START] or t >= row[F.END] or math.isnan(row[column]):
+        if t < row[PatchColumn.START] or t >= row[PatchColumn.END] or math.isnan(row[column]):
             continue
-        dx, dy = x - row[F.X], y - row[F.Y]
-        along, across = dx * row[F.COS] + dy * row[F.SIN], dy * row[F.COS] - dx * row[F.SIN]
-        if abs(along) <= row[F.HALF_LENGTH] and abs(across) <= row[F.HALF_WIDTH]:
+        dx, dy = x - row[PatchColumn.X], y - row[PatchColumn.Y]
+        along, across = (
+            dx * row[PatchColumn.COS] + dy * row[PatchColumn.SIN],
+            dy * row[PatchColumn.COS] - dx * row[PatchColumn.SIN],
+        )
+        if abs(along) <= row[PatchColumn.HALF_LENGTH] and abs(across) <= row[PatchColumn.HALF_WIDTH]:
             return float(row[column])
     return float(table[0, column])
 

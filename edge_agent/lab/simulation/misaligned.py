@@ -23,7 +23,7 @@ from typing import Final
 import numpy as np
 
 from edge_agent.lab.simulation.chance import key_of, normal, uniform
-from edge_agent.lab.simulation.plant import R
+from edge_agent.lab.simulation.plant import RecordColumn
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
@@ -56,7 +56,7 @@ MISALIGNED: Final = {
 }  # fmt: skip
 
 
-class M(IntEnum):
+class Misaligned(IntEnum):
     """Columns of a vehicle's misalignment."""
 
     ROUGH = 0  # whether there is any
@@ -73,25 +73,25 @@ class M(IntEnum):
 
 
 def misalignment_row(size: Misalignment, seed: int, index: int) -> FloatArray:
-    """Misalignment of vehicle `index`, shape (COLUMNS,), columns M."""
+    """Misalignment of vehicle `index`, shape (COLUMNS,), columns `Misaligned`."""
     key, row = key_of(seed, index, MOUNT_STREAM), np.zeros(COLUMNS)
-    row[M.ROUGH] = float(size != ALIGNED)
+    row[Misaligned.ROUGH] = float(size != ALIGNED)
     stds = (*(GRAVITY * tilt for tilt in size.tilt[:2]), size.tilt[2], *size.steering, *[size.radius] * 4)
     for k, std in enumerate(stds):
-        row[M.AX + k] = std * normal(key, k)
-    row[M.STEP] = size.step * uniform(key, 100)
+        row[Misaligned.AX + k] = std * normal(key, k)
+    row[Misaligned.STEP] = size.step * uniform(key, 100)
     for device in range(DEVICES):
-        row[M.LAG + device] = size.lag_s * uniform(key, 101 + device)
-    row[M.TORQUELESS] = float(uniform(key, 110) < size.torqueless)
+        row[Misaligned.LAG + device] = size.lag_s * uniform(key, 101 + device)
+    row[Misaligned.TORQUELESS] = float(uniform(key, 110) < size.torqueless)
     return row
 
 
-COLUMNS: Final = int(M.TORQUELESS) + 1
+COLUMNS: Final = int(Misaligned.TORQUELESS) + 1
 
 
 def memory_of(rows: FloatArray, rate_hz: float) -> int:
     """How many samples back the latest clock of the rows (N, COLUMNS) speaks of, and one more."""
-    lag = float(rows[:, M.LAG : M.LAG + DEVICES].max())
+    lag = float(rows[:, Misaligned.LAG : Misaligned.LAG + DEVICES].max())
     return math.ceil(lag * rate_hz) + 1 if lag > 0.0 else 0
 
 
@@ -109,23 +109,25 @@ def late(records: FloatArray, now: int, samples: float, record: FloatArray) -> N
 def misalign(mounted: FloatArray, signals: FloatArray) -> None:
     """Turn true readings (18,) into those of misaligned devices, in place."""
     ax, ay = signals[S.AX], signals[S.AY]
-    signals[S.AX] = ax + mounted[M.AX] + mounted[M.TURN] * ay
-    signals[S.AY] = ay + mounted[M.AY] - mounted[M.TURN] * ax
+    signals[S.AX] = ax + mounted[Misaligned.AX] + mounted[Misaligned.TURN] * ay
+    signals[S.AY] = ay + mounted[Misaligned.AY] - mounted[Misaligned.TURN] * ax
     for i in range(2):
         angle = signals[S.DELTA + i]
-        signals[S.DELTA + i] = mounted[M.ZERO] + angle * (1.0 + mounted[M.GAIN] + mounted[M.BEND] * abs(angle) / WIDE)
+        signals[S.DELTA + i] = mounted[Misaligned.ZERO] + angle * (
+            1.0 + mounted[Misaligned.GAIN] + mounted[Misaligned.BEND] * abs(angle) / WIDE
+        )
     for i in range(4):
-        signals[S.OMEGA + i] *= 1.0 + mounted[M.RADIUS + i]
+        signals[S.OMEGA + i] *= 1.0 + mounted[Misaligned.RADIUS + i]
 
 
 @compiled
 def counted(record: FloatArray, mounted: FloatArray, signals: FloatArray) -> None:
     """Wheel speeds in steps, none of a wheel that stands; and no torque where there is none."""
-    step = mounted[M.STEP]
+    step = mounted[Misaligned.STEP]
     for i in range(4):
-        if record[R.OMEGA + i] == 0.0:
+        if record[RecordColumn.OMEGA + i] == 0.0:
             signals[S.OMEGA + i] = 0.0
         elif step > 0.0:
             signals[S.OMEGA + i] = math.floor(signals[S.OMEGA + i] / step + 0.5) * step
-        if mounted[M.TORQUELESS] > 0.0:
+        if mounted[Misaligned.TORQUELESS] > 0.0:
             signals[S.TORQUE + i] = math.nan

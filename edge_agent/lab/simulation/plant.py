@@ -49,7 +49,7 @@ BRAKED: Final = 0.1  # [rad/s] below it a brake does, so that it holds a wheel a
 STILL: Final = 0.02  # [m/s, rad/s] slower than this in every direction, brakes hold the vehicle where it is
 
 
-class Body(IntEnum):
+class Motion(IntEnum):
     """State of one vehicle."""
 
     VX = 0  # [m/s]
@@ -66,7 +66,7 @@ class Body(IntEnum):
 STATES: Final = 12
 
 
-class Q(IntEnum):
+class TrueParameter(IntEnum):
     """What only the true vehicle has; these continue the row of `edge_agent.dynamics.parameters.P`."""
 
     SHAPE = len(P)  # c and e of the tyre curve
@@ -85,10 +85,10 @@ class Q(IntEnum):
     REAR_STEER = len(P) + 13  # angle of the rear wheels over that of the front wheels; 0: they do not steer
 
 
-PARAMETERS: Final = len(P) + len(Q)
+PARAMETERS: Final = len(P) + len(TrueParameter)
 
 
-class U(IntEnum):
+class Control(IntEnum):
     """Rows of what is done to the four wheels, and of the road under the vehicle, shape (5, 4)."""
 
     STEER = 0  # [rad at the road wheel]
@@ -98,10 +98,10 @@ class U(IntEnum):
     TILT = 4  # rise of the road per metre ahead of the vehicle, and to its left; two numbers are of no use
 
 
-INPUTS: Final = len(U)
+INPUTS: Final = len(Control)
 
 
-class W(IntEnum):
+class Wheel(IntEnum):
     """Rows of what the four wheels do at an instant, shape (8, 4)."""
 
     FX = 0  # [N] in the wheel's axes
@@ -117,7 +117,7 @@ class W(IntEnum):
 @compiled
 def gravity(u: FloatArray) -> tuple[float, float, float]:
     """(g_x, g_y) in the body's axes [m/s^2], and the share of gravity that presses on the road."""
-    ahead, left = u[U.TILT, 0], u[U.TILT, 1]
+    ahead, left = u[Control.TILT, 0], u[Control.TILT, 1]
     share = 1.0 / math.sqrt(1.0 + ahead * ahead + left * left)
     return -GRAVITY * ahead * share, -GRAVITY * left * share, share
 
@@ -137,38 +137,42 @@ def allowed(slip: float, limit: float) -> float:
 @compiled
 def slip_limit(p: FloatArray, i: int) -> float:
     """Slip at which the control of wheel `i` begins to let go."""
-    return float(p[Q.SLIP_LIMIT] if i < 2 else REAR_LIMIT * p[Q.SLIP_LIMIT])
+    return float(p[TrueParameter.SLIP_LIMIT] if i < 2 else REAR_LIMIT * p[TrueParameter.SLIP_LIMIT])
 
 
 @compiled
 def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> None:
     """Fill `w` (8, 4) for the state `x` (12,), parameters `p` (26,) and inputs `u` (5, 4)."""
-    loads = wheel_loads(body(p), x[Body.AX_LAGGED], x[Body.AY_LAGGED])
+    loads = wheel_loads(body(p), x[Motion.AX_LAGGED], x[Motion.AY_LAGGED])
     at_rest = wheel_loads(body(p), 0.0, 0.0)
     _, _, share = gravity(u)
     for i in range(4):
-        load, omega = share * loads[i], x[Body.OMEGA + i]
-        along, across = wheel_velocity(p, i, x[Body.VX], x[Body.VY], x[Body.YAW_RATE], u[U.STEER, i])
+        load, omega = share * loads[i], x[Motion.OMEGA + i]
+        along, across = wheel_velocity(p, i, x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE], u[Control.STEER, i])
         slip_x, slip_y = slips(p[P.RADIUS], omega, along, across)
-        slope_x = stiffness_per_load(p[P.SLOPE_X], p[Q.DEGRESSION], load, at_rest[i])
-        slope_y = stiffness_per_load(p[P.SLOPE_Y], p[Q.DEGRESSION], load, at_rest[i])
-        if p[Q.SOFTENING] > 0.0:
-            soft = (u[U.MU, i] / FIRM) ** p[Q.SOFTENING]
+        slope_x = stiffness_per_load(p[P.SLOPE_X], p[TrueParameter.DEGRESSION], load, at_rest[i])
+        slope_y = stiffness_per_load(p[P.SLOPE_Y], p[TrueParameter.DEGRESSION], load, at_rest[i])
+        if p[TrueParameter.SOFTENING] > 0.0:
+            soft = (u[Control.MU, i] / FIRM) ** p[TrueParameter.SOFTENING]
             slope_x, slope_y = soft * slope_x, soft * slope_y
-        theta_x, theta_y = slope_x * slip_x / u[U.MU, i], slope_y * slip_y / u[U.MU, i]
+        theta_x, theta_y = slope_x * slip_x / u[Control.MU, i], slope_y * slip_y / u[Control.MU, i]
         theta = math.hypot(theta_x, theta_y)
-        curve = brush(theta) if p[Q.BRUSH] > 0.0 else magic_formula(theta, p[Q.SHAPE], p[Q.CURVATURE])
+        curve = (
+            brush(theta)
+            if p[TrueParameter.BRUSH] > 0.0
+            else magic_formula(theta, p[TrueParameter.SHAPE], p[TrueParameter.CURVATURE])
+        )
         secant = curve / theta if theta > TINY else 1.0
-        pull = secant * u[U.MU, i] * load
-        drive, brake = u[U.DRIVE, i], u[U.BRAKE, i]
+        pull = secant * u[Control.MU, i] * load
+        drive, brake = u[Control.DRIVE, i], u[Control.BRAKE, i]
         if slip_x > 0.0:
             drive *= allowed(slip_x, slip_limit(p, i))
         else:
             brake *= allowed(slip_x, slip_limit(p, i))
-        w[W.FX, i], w[W.FY, i], w[W.FZ, i] = pull * theta_x, pull * theta_y, load
-        w[W.SPEED, i], w[W.SLIP, i], w[W.THETA, i] = along, slip_x, theta
-        w[W.SLOPE, i] = secant * slope_x * load * p[P.RADIUS] / max(abs(along), SLOWEST_M_S)
-        w[W.TORQUE, i] = drive - brake * omega / max(abs(omega), BRAKED)
+        w[Wheel.FX, i], w[Wheel.FY, i], w[Wheel.FZ, i] = pull * theta_x, pull * theta_y, load
+        w[Wheel.SPEED, i], w[Wheel.SLIP, i], w[Wheel.THETA, i] = along, slip_x, theta
+        w[Wheel.SLOPE, i] = secant * slope_x * load * p[P.RADIUS] / max(abs(along), SLOWEST_M_S)
+        w[Wheel.TORQUE, i] = drive - brake * omega / max(abs(omega), BRAKED)
 
 
 @compiled
@@ -177,8 +181,8 @@ def body_accelerations(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArra
 
     `w` is filled.
     """
-    ax, ay, yaw_acceleration = accelerations(p, w[W.FX], w[W.FY], u[U.STEER])
-    return ax - p[Q.DRAG] * x[Body.VX] * abs(x[Body.VX]) / p[P.MASS], ay, yaw_acceleration
+    ax, ay, yaw_acceleration = accelerations(p, w[Wheel.FX], w[Wheel.FY], u[Control.STEER])
+    return ax - p[TrueParameter.DRAG] * x[Motion.VX] * abs(x[Motion.VX]) / p[P.MASS], ay, yaw_acceleration
 
 
 @compiled
@@ -192,30 +196,30 @@ def turn_wheels(
     radius = p[P.RADIUS]
     for i in range(4):
         ground = gain - wheel_position(p, i)[1] * yaw_acceleration
-        omega, slip = x[Body.OMEGA + i], abs(w[W.SLIP, i])
+        omega, slip = x[Motion.OMEGA + i], abs(w[Wheel.SLIP, i])
         slow = max(abs(omega), STANDING)
-        resistance = p[Q.ROLLING] * radius * w[W.FZ, i] * omega / slow
-        excess = w[W.TORQUE, i] - resistance - radius * w[W.FX, i] + dt * w[W.SLOPE, i] * ground
-        damping = radius * w[W.SLOPE, i]
+        resistance = p[TrueParameter.ROLLING] * radius * w[Wheel.FZ, i] * omega / slow
+        excess = w[Wheel.TORQUE, i] - resistance - radius * w[Wheel.FX, i] + dt * w[Wheel.SLOPE, i] * ground
+        damping = radius * w[Wheel.SLOPE, i]
         if slip_limit(p, i) < slip < 2.0 * slip_limit(p, i):
-            asked = u[U.DRIVE, i] if w[W.SLIP, i] > 0.0 else u[U.BRAKE, i]
-            damping += asked * radius / (max(abs(w[W.SPEED, i]), SLOWEST_M_S) * slip_limit(p, i))
+            asked = u[Control.DRIVE, i] if w[Wheel.SLIP, i] > 0.0 else u[Control.BRAKE, i]
+            damping += asked * radius / (max(abs(w[Wheel.SPEED, i]), SLOWEST_M_S) * slip_limit(p, i))
         if abs(omega) < BRAKED:
-            damping += u[U.BRAKE, i] / BRAKED
-        x[Body.OMEGA + i] = omega + dt * excess / (p[P.WHEEL_INERTIA] + dt * damping)
+            damping += u[Control.BRAKE, i] / BRAKED
+        x[Motion.OMEGA + i] = omega + dt * excess / (p[P.WHEEL_INERTIA] + dt * damping)
 
 
 @compiled
 def held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
     """Whether the brakes hold a vehicle that stands: they are stronger than engine and slope, and so are the tyres."""
-    if abs(x[Body.VX]) > STILL or abs(x[Body.VY]) > STILL or abs(x[Body.YAW_RATE]) > STILL:
+    if abs(x[Motion.VX]) > STILL or abs(x[Motion.VY]) > STILL or abs(x[Motion.YAW_RATE]) > STILL:
         return False
     along, across, share = gravity(u)
     brake = pull = grip = 0.0
     for i in range(4):
-        brake += u[U.BRAKE, i] / p[P.RADIUS]
-        pull += u[U.DRIVE, i] / p[P.RADIUS]
-        grip += 0.25 * u[U.MU, i] * p[P.MASS] * GRAVITY * share
+        brake += u[Control.BRAKE, i] / p[P.RADIUS]
+        pull += u[Control.DRIVE, i] / p[P.RADIUS]
+        grip += 0.25 * u[Control.MU, i] * p[P.MASS] * GRAVITY * share
     pull += p[P.MASS] * along
     return bool(brake > 0.0 and abs(pull) <= brake and math.hypot(pull, p[P.MASS] * across) <= grip)
 
@@ -224,11 +228,11 @@ def held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
 def stand(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
     """One step of a vehicle that is `held`: only the suspension still moves, to where the slope wants it."""
     along, across, _ = gravity(u)
-    x[Body.VX] = x[Body.VY] = x[Body.YAW_RATE] = 0.0
-    x[Body.OMEGA : Body.OMEGA + 4] = 0.0
-    follow = min(dt / p[Q.LAG], 1.0)
-    x[Body.AX_LAGGED] += follow * (-along - x[Body.AX_LAGGED])
-    x[Body.AY_LAGGED] += follow * (-across - x[Body.AY_LAGGED])
+    x[Motion.VX] = x[Motion.VY] = x[Motion.YAW_RATE] = 0.0
+    x[Motion.OMEGA : Motion.OMEGA + 4] = 0.0
+    follow = min(dt / p[TrueParameter.LAG], 1.0)
+    x[Motion.AX_LAGGED] += follow * (-along - x[Motion.AX_LAGGED])
+    x[Motion.AY_LAGGED] += follow * (-across - x[Motion.AY_LAGGED])
 
 
 @compiled
@@ -241,18 +245,18 @@ def advance(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: floa
             continue
         wheel_forces(x, p, u, w)
         ax, ay, yaw_acceleration = body_accelerations(x, p, u, w)
-        vx, vy, r = x[Body.VX], x[Body.VY], x[Body.YAW_RATE]
+        vx, vy, r = x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE]
         turn_wheels(x, p, u, w, dt, ax + r * vy + along, yaw_acceleration)
-        c, s = math.cos(x[Body.YAW] + 0.5 * dt * r), math.sin(x[Body.YAW] + 0.5 * dt * r)
-        x[Body.X] += dt * (c * vx - s * vy)
-        x[Body.Y] += dt * (s * vx + c * vy)
-        x[Body.YAW] += dt * r
-        x[Body.VX] += dt * (ax + r * vy + along)
-        x[Body.VY] += dt * (ay - r * vx + across)
-        x[Body.YAW_RATE] += dt * yaw_acceleration
-        follow = min(dt / p[Q.LAG], 1.0)
-        x[Body.AX_LAGGED] += follow * (ax - x[Body.AX_LAGGED])
-        x[Body.AY_LAGGED] += follow * (ay - x[Body.AY_LAGGED])
+        c, s = math.cos(x[Motion.YAW] + 0.5 * dt * r), math.sin(x[Motion.YAW] + 0.5 * dt * r)
+        x[Motion.X] += dt * (c * vx - s * vy)
+        x[Motion.Y] += dt * (s * vx + c * vy)
+        x[Motion.YAW] += dt * r
+        x[Motion.VX] += dt * (ax + r * vy + along)
+        x[Motion.VY] += dt * (ay - r * vx + across)
+        x[Motion.YAW_RATE] += dt * yaw_acceleration
+        follow = min(dt / p[TrueParameter.LAG], 1.0)
+        x[Motion.AX_LAGGED] += follow * (ax - x[Motion.AX_LAGGED])
+        x[Motion.AY_LAGGED] += follow * (ay - x[Motion.AY_LAGGED])
 
 
 @compiled
@@ -264,18 +268,20 @@ def command(p: FloatArray, u: FloatArray, steer: float, force: float) -> None:
     """
     base = p[P.TO_FRONT] + p[P.TO_REAR]
     curvature = math.tan(steer) / base
-    front = base * curvature / (1.0 - p[Q.REAR_STEER])
+    front = base * curvature / (1.0 - p[TrueParameter.REAR_STEER])
     for i in range(4):
         side = 1.0 if i % 2 == 0 else -1.0
         inner = 1.0 - side * 0.5 * p[P.TRACK_FRONT] * curvature
-        u[U.STEER, i] = math.atan(front / inner) if i < 2 else p[Q.REAR_STEER] * math.atan(front / inner)
+        u[Control.STEER, i] = (
+            math.atan(front / inner) if i < 2 else p[TrueParameter.REAR_STEER] * math.atan(front / inner)
+        )
         drive_share = p[P.DRIVE_FRONT] if i < 2 else 1.0 - p[P.DRIVE_FRONT]
-        brake_share = p[Q.BRAKE_FRONT] if i < 2 else 1.0 - p[Q.BRAKE_FRONT]
-        u[U.DRIVE, i] = 0.5 * drive_share * max(force, 0.0) * p[P.RADIUS]
-        u[U.BRAKE, i] = 0.5 * brake_share * max(-force, 0.0) * p[P.RADIUS]
+        brake_share = p[TrueParameter.BRAKE_FRONT] if i < 2 else 1.0 - p[TrueParameter.BRAKE_FRONT]
+        u[Control.DRIVE, i] = 0.5 * drive_share * max(force, 0.0) * p[P.RADIUS]
+        u[Control.BRAKE, i] = 0.5 * brake_share * max(-force, 0.0) * p[P.RADIUS]
 
 
-class R(IntEnum):
+class RecordColumn(IntEnum):
     """Columns of a record: the truth of one sample of one vehicle."""
 
     AX = 0  # [m/s^2] that an accelerometer at the centre of gravity feels, as the road lies
@@ -305,20 +311,26 @@ def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: 
     """Fill `record` (32,) with what is true at this instant under the inputs `u`; fills `w` too."""
     wheel_forces(x, p, u, w)
     ax, ay, _ = body_accelerations(x, p, u, w)
-    record[R.AX], record[R.AY] = ax, ay
-    record[R.AX_FELT] = ax + p[Q.PITCH_LEAK] * x[Body.AX_LAGGED]
-    record[R.AY_FELT] = ay + p[Q.ROLL_LEAK] * x[Body.AY_LAGGED]
-    record[R.YAW_RATE], record[R.VX], record[R.VY] = x[Body.YAW_RATE], x[Body.VX], x[Body.VY]
-    record[R.X], record[R.Y], record[R.YAW] = x[Body.X], x[Body.Y], x[Body.YAW]
+    record[RecordColumn.AX], record[RecordColumn.AY] = ax, ay
+    record[RecordColumn.AX_FELT] = ax + p[TrueParameter.PITCH_LEAK] * x[Motion.AX_LAGGED]
+    record[RecordColumn.AY_FELT] = ay + p[TrueParameter.ROLL_LEAK] * x[Motion.AY_LAGGED]
+    record[RecordColumn.YAW_RATE], record[RecordColumn.VX], record[RecordColumn.VY] = (
+        x[Motion.YAW_RATE],
+        x[Motion.VX],
+        x[Motion.VY],
+    )
+    record[RecordColumn.X], record[RecordColumn.Y], record[RecordColumn.YAW] = x[Motion.X], x[Motion.Y], x[Motion.YAW]
     for i in range(4):
-        record[R.DELTA + i], record[R.OMEGA + i], record[R.TORQUE + i] = (
-            u[U.STEER, i],
-            x[Body.OMEGA + i],
-            w[W.TORQUE, i],
+        record[RecordColumn.DELTA + i], record[RecordColumn.OMEGA + i], record[RecordColumn.TORQUE + i] = (
+            u[Control.STEER, i],
+            x[Motion.OMEGA + i],
+            w[Wheel.TORQUE, i],
         )
-        record[R.MU + i] = u[U.MU, i]
-        record[R.UTILISATION + i] = math.hypot(w[W.FX, i], w[W.FY, i]) / (u[U.MU, i] * w[W.FZ, i])
-    record[R.SLOPE], record[R.BANK] = u[U.TILT, 0], u[U.TILT, 1]
+        record[RecordColumn.MU + i] = u[Control.MU, i]
+        record[RecordColumn.UTILISATION + i] = math.hypot(w[Wheel.FX, i], w[Wheel.FY, i]) / (
+            u[Control.MU, i] * w[Wheel.FZ, i]
+        )
+    record[RecordColumn.SLOPE], record[RecordColumn.BANK] = u[Control.TILT, 0], u[Control.TILT, 1]
     if held(x, p, u):
         _observe_held(x, p, u, record)
 
@@ -327,24 +339,24 @@ def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: 
 def _observe_held(x: FloatArray, p: FloatArray, u: FloatArray, record: FloatArray) -> None:
     """What is true of a vehicle that is held: brakes and tyres give what the slope asks for."""
     along, across, share = gravity(u)
-    record[R.AX], record[R.AY] = -along, -across
-    record[R.AX_FELT] = -along + p[Q.PITCH_LEAK] * x[Body.AX_LAGGED]
-    record[R.AY_FELT] = -across + p[Q.ROLL_LEAK] * x[Body.AY_LAGGED]
-    record[R.YAW_RATE] = record[R.VX] = record[R.VY] = 0.0
+    record[RecordColumn.AX], record[RecordColumn.AY] = -along, -across
+    record[RecordColumn.AX_FELT] = -along + p[TrueParameter.PITCH_LEAK] * x[Motion.AX_LAGGED]
+    record[RecordColumn.AY_FELT] = -across + p[TrueParameter.ROLL_LEAK] * x[Motion.AY_LAGGED]
+    record[RecordColumn.YAW_RATE] = record[RecordColumn.VX] = record[RecordColumn.VY] = 0.0
     for i in range(4):
-        brake_share = p[Q.BRAKE_FRONT] if i < 2 else 1.0 - p[Q.BRAKE_FRONT]
-        record[R.OMEGA + i] = 0.0
-        record[R.TORQUE + i] = -0.5 * brake_share * p[P.MASS] * along * p[P.RADIUS]
-        record[R.UTILISATION + i] = math.hypot(along, across) / (u[U.MU, i] * GRAVITY * share)
+        brake_share = p[TrueParameter.BRAKE_FRONT] if i < 2 else 1.0 - p[TrueParameter.BRAKE_FRONT]
+        record[RecordColumn.OMEGA + i] = 0.0
+        record[RecordColumn.TORQUE + i] = -0.5 * brake_share * p[P.MASS] * along * p[P.RADIUS]
+        record[RecordColumn.UTILISATION + i] = math.hypot(along, across) / (u[Control.MU, i] * GRAVITY * share)
 
 
 @compiled
 def start_at(x: FloatArray, p: FloatArray, place: tuple[float, float, float], speed: float) -> None:
     """Set the state `x` to rolling straight on at `speed` [m/s] from place (x [m], y [m], yaw [rad])."""
     x[:] = 0.0
-    x[Body.VX] = speed
-    x[Body.X], x[Body.Y], x[Body.YAW] = place
-    x[Body.OMEGA : Body.OMEGA + 4] = speed / p[P.RADIUS]
+    x[Motion.VX] = speed
+    x[Motion.X], x[Motion.Y], x[Motion.YAW] = place
+    x[Motion.OMEGA : Motion.OMEGA + 4] = speed / p[P.RADIUS]
 
 
 def substeps_of(rate_hz: float) -> int:
@@ -356,11 +368,11 @@ def substeps_of(rate_hz: float) -> int:
 def wheel_place(x: FloatArray, p: FloatArray, i: int) -> tuple[float, float]:
     """Where wheel `i` stands on the ground, (x, y) [m]."""
     ahead, left = wheel_position(p, i)
-    c, s = math.cos(x[Body.YAW]), math.sin(x[Body.YAW])
-    return x[Body.X] + c * ahead - s * left, x[Body.Y] + s * ahead + c * left
+    c, s = math.cos(x[Motion.YAW]), math.sin(x[Motion.YAW])
+    return x[Motion.X] + c * ahead - s * left, x[Motion.Y] + s * ahead + c * left
 
 
 @compiled
 def strongest_pull(p: FloatArray, vx: float) -> float:
     """Largest driving force of the engine [N]: its power, and below 5 m/s the gearbox."""
-    return float(p[Q.POWER] / max(vx, 5.0))
+    return float(p[TrueParameter.POWER] / max(vx, 5.0))

@@ -39,7 +39,7 @@ class TrueVehicle:
     rear_steer: float = 0.0  # angle of the rear wheels over that of the front wheels; negative at low speed
 
     def row(self) -> FloatArray:
-        """The parameters for `plant`, shape (PARAMETERS,), in the order of P and Q."""
+        """The parameters for `plant`, shape (PARAMETERS,), in the order of `P` and `TrueParameter`."""
         drive = self.vehicle.drive_split_front
         nominal = parameter_row(self.vehicle.model_copy(update={"drive_split_front": 1.0 if drive is None else drive}))
         own = (self.shape, self.curvature, self.degression, self.lag, self.roll_leak, self.pitch_leak)

@@ -55,7 +55,7 @@ class Relief:
     @property
     def table(self) -> FloatArray:
         """Rows for `gradient`, shape (1 + waves, 6): crossfall and banking, then the waves with columns A."""
-        table = np.zeros((1 + len(self.waves), len(A)))
+        table = np.zeros((1 + len(self.waves), len(WaveColumn)))
         table[0, :2] = self.crossfall, self.banking
         for row, wave in zip(table[1:], self.waves, strict=True):
             number = 2.0 * math.pi / wave.length
@@ -63,7 +63,7 @@ class Relief:
         return table
 
 
-class A(IntEnum):
+class WaveColumn(IntEnum):
     """Columns of a wave."""
 
     PEAK = 0
@@ -83,12 +83,12 @@ def gradient(
     east, north = -left * lane[1], left * lane[0]
     for k in range(1, table.shape[0]):
         row = table[k]
-        along = place[0] * row[A.EAST] + place[1] * row[A.NORTH]
-        slope = math.cos(row[A.NUMBER] * along + row[A.PHASE])
-        if row[A.STEPPED] > 0.0:
+        along = place[0] * row[WaveColumn.EAST] + place[1] * row[WaveColumn.NORTH]
+        slope = math.cos(row[WaveColumn.NUMBER] * along + row[WaveColumn.PHASE])
+        if row[WaveColumn.STEPPED] > 0.0:
             slope = 1.0 if slope >= 0.0 else -1.0
-        east += row[A.PEAK] * slope * row[A.EAST]
-        north += row[A.PEAK] * slope * row[A.NORTH]
+        east += row[WaveColumn.PEAK] * slope * row[WaveColumn.EAST]
+        north += row[WaveColumn.PEAK] * slope * row[WaveColumn.NORTH]
     steep = math.hypot(east, north)
     if steep > STEEPEST:
         east, north = east * STEEPEST / steep, north * STEEPEST / steep

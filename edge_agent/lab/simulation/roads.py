@@ -28,7 +28,7 @@ YIELD_M: Final = 16.0  # v²/q within a junction, where one looks left and right
 HANDLE: Final = 0.39  # of the chord: a cubic Bezier curve of 90 degrees is then nearly a circle
 
 
-class L(IntEnum):
+class LanePoint(IntEnum):
     """Columns of a lane point."""
 
     X = 0  # [m]
@@ -175,7 +175,7 @@ def _network(lanes: list[FloatArray], ways: list[list[int]], roads: int) -> Netw
     for k, targets in enumerate(ways):
         onward[k, : len(targets)] = targets
     tables = [_lane_table(lane) for lane in lanes]
-    limits = [np.maximum(np.abs(table[:, L.CURVATURE]), STRAIGHTEST) ** -1 for table in tables]
+    limits = [np.maximum(np.abs(table[:, LanePoint.CURVATURE]), STRAIGHTEST) ** -1 for table in tables]
     for k in range(roads, len(lanes)):
         limits[k] = np.minimum(limits[k], YIELD_M)
     _plan(tables, limits, ways, spacing)
@@ -199,14 +199,14 @@ def _plan(tables: list[FloatArray], limits: list[FloatArray], ways: list[list[in
     No point may need more braking than the budget leaves beside the cornering there.
     """
     while True:
-        before = [table[0, L.PROFILE :].copy() for table in tables]
+        before = [table[0, LanePoint.PROFILE :].copy() for table in tables]
         for k, table in enumerate(tables):
             for way, target in enumerate(ways[k]):
-                allowed = float(tables[target][0, L.PROFILE :].min())
+                allowed = float(tables[target][0, LanePoint.PROFILE :].min())
                 for i in range(len(table) - 1, -1, -1):
                     allowed = min(allowed, float(limits[k][i]))
-                    table[i, L.PROFILE + way] = allowed
-                    across = min(allowed * abs(float(table[i, L.CURVATURE])), 1.0)
+                    table[i, LanePoint.PROFILE + way] = allowed
+                    across = min(allowed * abs(float(table[i, LanePoint.CURVATURE])), 1.0)
                     allowed += 2.0 * BRAKING * math.sqrt(1.0 - across * across) * spacing[k]
-        if all(np.array_equal(old, table[0, L.PROFILE :]) for old, table in zip(before, tables, strict=True)):
+        if all(np.array_equal(old, table[0, LanePoint.PROFILE :]) for old, table in zip(before, tables, strict=True)):
             return

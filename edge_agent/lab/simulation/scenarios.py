@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from edge_agent.lab.simulation.chance import checked_seed, key_of, uniform
-from edge_agent.lab.simulation.friction import DRY, ICE, SNOW, WET, F, Patch, friction_table, look_up_many
+from edge_agent.lab.simulation.friction import DRY, ICE, SNOW, WET, Patch, PatchColumn, friction_table, look_up_many
 from edge_agent.lab.simulation.place import GOTHENBURG, Origin
 from edge_agent.lab.simulation.relief import LEVEL, Relief, Wave
 from edge_agent.lab.simulation.roads import Network, Road, build_network
@@ -53,7 +53,7 @@ class Scenario:
         """μ at the times t [s] and points (x, y) [m], in the arrays' common shape."""
         # copies: numpy warns who looks whether a broadcast view may be written, and the compiler does at a first call
         t, x, y = (np.array(a, dtype=np.float64, order="C") for a in np.broadcast_arrays(t, x, y))
-        return look_up_many(self.table, int(F.MU), t.ravel(), x.ravel(), y.ravel()).reshape(x.shape)
+        return look_up_many(self.table, int(PatchColumn.MU), t.ravel(), x.ravel(), y.ravel()).reshape(x.shape)
 
     def to_latlon(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(latitude, longitude) [deg]."""

@@ -22,7 +22,7 @@ from edge_agent.lab.simulation.misaligned import (
     DEVICE_OF,
     DEVICES,
     MISALIGNED,
-    M,
+    Misaligned,
     Misalignment,
     counted,
     late,
@@ -30,7 +30,7 @@ from edge_agent.lab.simulation.misaligned import (
     misalignment_row,
 )
 from edge_agent.lab.simulation.place import Origin
-from edge_agent.lab.simulation.plant import R
+from edge_agent.lab.simulation.plant import RecordColumn
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
@@ -95,7 +95,7 @@ GROUPS: Final = ("inertial", "steering", "wheel_fl", "wheel_fr", "wheel_rl", "wh
 GROUP_OF: Final = np.array([0, 0, 0, 1, 1, 1, 1, 2, 3, 4, 5, 6, 6, 6, 6, 7, 7, 7])
 
 
-class E(IntEnum):
+class ErrorColumn(IntEnum):
     """Columns of a vehicle's sensor errors: white std, then offset and gain, of every channel; then the rest."""
 
     WHITE = 0
@@ -104,10 +104,10 @@ class E(IntEnum):
     WANDER = 3 * len(CHANNELS)  # std of the three wandering errors: latitude, longitude, yaw
     LEAK = 3 * len(CHANNELS) + 3
     DROPOUTS = 3 * len(CHANNELS) + 4
-    MOUNTED = 3 * len(CHANNELS) + 5  # from here on, columns M of `misaligned.py`
+    MOUNTED = 3 * len(CHANNELS) + 5  # from here on, columns of `misaligned.Misaligned`
 
 
-ERRORS: Final = int(E.MOUNTED) + COLUMNS
+ERRORS: Final = int(ErrorColumn.MOUNTED) + COLUMNS
 
 
 def sensors_named(name: str | Sensors) -> Sensors:
@@ -152,17 +152,17 @@ def noise_keys(seed: int, index: int) -> tuple[np.uint64, np.uint64]:
 @compiled
 def read_out(record: FloatArray, error: FloatArray, place: FloatArray, signals: FloatArray) -> None:
     """Fill `signals` (18,) with the truth of `record`; place = (lat0, lon0, deg per m north, deg per m east)."""
-    felt = error[E.LEAK] > 0.0
-    signals[S.AX] = record[R.AX_FELT] if felt else record[R.AX]
-    signals[S.AY] = record[R.AY_FELT] if felt else record[R.AY]
-    signals[S.YAW_RATE] = record[R.YAW_RATE]
+    felt = error[ErrorColumn.LEAK] > 0.0
+    signals[S.AX] = record[RecordColumn.AX_FELT] if felt else record[RecordColumn.AX]
+    signals[S.AY] = record[RecordColumn.AY_FELT] if felt else record[RecordColumn.AY]
+    signals[S.YAW_RATE] = record[RecordColumn.YAW_RATE]
     for i in range(4):
-        signals[S.DELTA + i] = record[R.DELTA + i]
-        signals[S.OMEGA + i] = record[R.OMEGA + i]
-        signals[S.TORQUE + i] = record[R.TORQUE + i]
-    signals[S.LATITUDE] = place[0] + place[2] * record[R.Y]
-    signals[S.LONGITUDE] = place[1] + place[3] * record[R.X]
-    signals[S.YAW] = record[R.YAW]
+        signals[S.DELTA + i] = record[RecordColumn.DELTA + i]
+        signals[S.OMEGA + i] = record[RecordColumn.OMEGA + i]
+        signals[S.TORQUE + i] = record[RecordColumn.TORQUE + i]
+    signals[S.LATITUDE] = place[0] + place[2] * record[RecordColumn.Y]
+    signals[S.LONGITUDE] = place[1] + place[3] * record[RecordColumn.X]
+    signals[S.YAW] = record[RecordColumn.YAW]
 
 
 @compiled
@@ -172,12 +172,12 @@ def read_late(
     """Fill `signals` (18,) with what each device says of its own past; records (T, 32), of which row `lead` is now."""
     record, told = np.empty(records.shape[1]), np.empty(signals.size)
     for device in range(DEVICES):
-        late(records, lead, error[E.MOUNTED + M.LAG + device] * rate_hz, record)
+        late(records, lead, error[ErrorColumn.MOUNTED + Misaligned.LAG + device] * rate_hz, record)
         read_out(record, error, place, told)
         for c in range(signals.size):
             if DEVICE_OF[c] == device:
                 signals[c] = told[c]
-    misalign(error[E.MOUNTED :], signals)
+    misalign(error[ErrorColumn.MOUNTED :], signals)
 
 
 @compiled
@@ -185,7 +185,7 @@ def wander_on(error: FloatArray, wander: FloatArray, key: np.uint64, sample: int
     """Move the receiver's slow errors `wander` (3,) on to the next fix; the first has their long-run spread."""
     keep = 0.0 if sample == 0 else math.exp(-FIX_S / WANDER_S)
     for i in range(3):
-        kick = error[E.WANDER + i] * math.sqrt(1.0 - keep * keep)
+        kick = error[ErrorColumn.WANDER + i] * math.sqrt(1.0 - keep * keep)
         wander[i] = keep * wander[i] + kick * normal(key, sample * DRAWS + WANDER_DRAW + i)
 
 
@@ -210,7 +210,7 @@ def sense(
         for k in range(steps):
             sample = first + k
             row = signals[k, n]
-            rough = error[E.MOUNTED + M.ROUGH] > 0.0
+            rough = error[ErrorColumn.MOUNTED + Misaligned.ROUGH] > 0.0
             if rough:
                 read_late(records[:, n], lead + k, error, place, rate_hz, row)
             else:
@@ -222,16 +222,16 @@ def sense(
                 if c >= S.LATITUDE and not fix:
                     row[c] = math.nan
                     continue
-                if error[E.WHITE + c] > 0.0:
-                    row[c] = row[c] * error[E.GAIN + c] + error[E.OFFSET + c]
-                    row[c] += error[E.WHITE + c] * normal(white[n], sample * DRAWS + c)
+                if error[ErrorColumn.WHITE + c] > 0.0:
+                    row[c] = row[c] * error[ErrorColumn.GAIN + c] + error[ErrorColumn.OFFSET + c]
+                    row[c] += error[ErrorColumn.WHITE + c] * normal(white[n], sample * DRAWS + c)
                 if c >= S.LATITUDE:
                     row[c] += wander[n, c - S.LATITUDE]
             if rough:
-                counted(records[lead + k, n], error[E.MOUNTED :], row)
-            if error[E.DROPOUTS] > 0.0:
+                counted(records[lead + k, n], error[ErrorColumn.MOUNTED :], row)
+            if error[ErrorColumn.DROPOUTS] > 0.0:
                 window = sample // per_silence
                 for c in range(len(CHANNELS)):
-                    if uniform(silence[n], window * len(GROUPS) + GROUP_OF[c]) < error[E.DROPOUTS]:
+                    if uniform(silence[n], window * len(GROUPS) + GROUP_OF[c]) < error[ErrorColumn.DROPOUTS]:
                         row[c] = math.nan
     return signals

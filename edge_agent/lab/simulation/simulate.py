@@ -17,10 +17,10 @@ from edge_agent.lab.simulation.place import GOTHENBURG, Origin
 from edge_agent.lab.simulation.plant import (
     RECORD,
     STATES,
-    Body,
-    R,
-    U,
-    W,
+    Control,
+    Motion,
+    RecordColumn,
+    Wheel,
     advance,
     command,
     gravity,
@@ -39,11 +39,12 @@ from schemas.signals import CHANNELS, per_wheel
 from schemas.vehicle import Vehicle
 
 TRUTH: Final = (
-    ("true_vx", R.VX), ("true_vy", R.VY), ("true_yaw_rate", R.YAW_RATE), ("true_x", R.X), ("true_y", R.Y),
-    ("true_yaw", R.YAW), ("true_ax", R.AX), ("true_ay", R.AY),
-    *((name, R.MU + i) for i, name in enumerate(per_wheel("true_mu"))),
-    *((name, R.UTILISATION + i) for i, name in enumerate(per_wheel("true_utilisation"))),
-    ("true_slope", R.SLOPE), ("true_bank", R.BANK),
+    ("true_vx", RecordColumn.VX), ("true_vy", RecordColumn.VY), ("true_yaw_rate", RecordColumn.YAW_RATE),
+    ("true_x", RecordColumn.X), ("true_y", RecordColumn.Y),
+    ("true_yaw", RecordColumn.YAW), ("true_ax", RecordColumn.AX), ("true_ay", RecordColumn.AY),
+    *((name, RecordColumn.MU + i) for i, name in enumerate(per_wheel("true_mu"))),
+    *((name, RecordColumn.UTILISATION + i) for i, name in enumerate(per_wheel("true_utilisation"))),
+    ("true_slope", RecordColumn.SLOPE), ("true_bank", RecordColumn.BANK),
 )  # fmt: skip
 STEERING_LAG_S: Final = 0.1  # from the wish to the road wheel
 PEDAL_LAG_S: Final = 0.15
@@ -119,31 +120,31 @@ def _drive(
     manoeuvre: Manoeuvre, truth: TrueVehicle, world: TestTrack, speed: float, rate_hz: float, samples: int
 ) -> FloatArray:
     """True records (T, 32) of the drive; the driver gives as much more gas as a slope takes."""
-    p, x, u, w = truth.row(), np.zeros(STATES), np.zeros((len(U), 4)), np.zeros((len(W), 4))
+    p, x, u, w = truth.row(), np.zeros(STATES), np.zeros((len(Control), 4)), np.zeros((len(Wheel), 4))
     records = np.empty((samples, RECORD))
     substeps, dt = substeps_of(rate_hz), 1.0 / rate_hz
     start_at(x, p, (0.0, 0.0, 0.0), speed)
     steer = force = 0.0
     for k in range(samples):
-        east, north = gradient(world.relief, (x[Body.X], x[Body.Y]), (1.0, 0.0), 0.0)
-        u[U.TILT, :2] = tilt(east, north, x[Body.YAW])
+        east, north = gradient(world.relief, (x[Motion.X], x[Motion.Y]), (1.0, 0.0), 0.0)
+        u[Control.TILT, :2] = tilt(east, north, x[Motion.YAW])
         wish, acceleration = manoeuvre.control(_moment(k * dt, x, speed))
         acceleration -= gravity(u)[0]
         if k == 0 and speed == 0.0:
             force = float(p[P.MASS]) * acceleration  # who stands has had his foot down before
         steer += (wish - steer) * -math.expm1(-dt / STEERING_LAG_S)
         force += (float(p[P.MASS]) * acceleration - force) * -math.expm1(-dt / PEDAL_LAG_S)
-        force = min(force, strongest_pull(p, float(x[Body.VX])))
+        force = min(force, strongest_pull(p, float(x[Motion.VX])))
         command(p, u, steer, force)
         for i in range(4):
-            u[U.MU, i] = world.friction(*wheel_place(x, p, i))
+            u[Control.MU, i] = world.friction(*wheel_place(x, p, i))
         observe(x, p, u, w, records[k])
         advance(x, p, u, w, dt / substeps, substeps)
     return records
 
 
 def _moment(t: float, x: FloatArray, speed: float) -> Moment:
-    return Moment(t, float(x[Body.X]), float(x[Body.Y]), float(x[Body.YAW]), float(x[Body.VX]), speed)
+    return Moment(t, float(x[Motion.X]), float(x[Motion.Y]), float(x[Motion.YAW]), float(x[Motion.VX]), speed)
 
 
 def _sensed(records: FloatArray, sensors: Sensors, origin: Origin, seed: int, rate_hz: float) -> FloatArray:

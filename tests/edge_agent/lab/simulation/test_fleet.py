@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from edge_agent.lab.simulation import SCENARIOS, SimulatedFleet
 from edge_agent.lab.simulation.fleet import Truth
 from edge_agent.lab.simulation.friction import ICE
-from edge_agent.lab.simulation.roads import L
+from edge_agent.lab.simulation.roads import LanePoint
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S
@@ -71,7 +71,7 @@ def test_ideal_signals_are_those_of_the_truth(drive: tuple[SimulatedFleet, Float
 
 def test_everybody_stays_on_the_road(drive: tuple[SimulatedFleet, FloatArray, FloatArray, Truth]) -> None:
     fleet, _, _, truth = drive
-    lanes = fleet.scenario.network.points[:, [L.X, L.Y]]
+    lanes = fleet.scenario.network.points[:, [LanePoint.X, LanePoint.Y]]
     off = np.asarray(cKDTree(lanes).query(np.column_stack([truth.x.ravel(), truth.y.ravel()]))[0])
     assert np.quantile(off, 0.99) < 1.5
     assert off.max() < 8.0  # black ice
@@ -81,7 +81,7 @@ def test_everybody_stays_on_the_road(drive: tuple[SimulatedFleet, FloatArray, Fl
 def test_the_fleet_moves_and_covers_the_network(drive: tuple[SimulatedFleet, FloatArray, FloatArray, Truth]) -> None:
     fleet, _, _, truth = drive
     assert 7.0 < truth.vx.mean() < 13.0
-    lanes = fleet.scenario.network.points[:, [L.X, L.Y]]
+    lanes = fleet.scenario.network.points[:, [LanePoint.X, LanePoint.Y]]
     cells = {(round(x / 10), round(y / 10)) for x, y in lanes}
     seen = {(round(x / 10), round(y / 10)) for x, y in zip(truth.x[::5].ravel(), truth.y[::5].ravel(), strict=True)}
     assert len(cells & seen) / len(cells) > 0.95

@@ -11,10 +11,10 @@ from edge_agent.dynamics.parameters import P
 from edge_agent.lab.simulation import PRESETS, simulate_manoeuvre
 from edge_agent.lab.simulation.plant import (
     STATES,
-    Body,
-    Q,
-    U,
-    W,
+    Control,
+    Motion,
+    TrueParameter,
+    Wheel,
     advance,
     body_accelerations,
     command,
@@ -32,44 +32,44 @@ ROUNDING = 1e-9
 def some_instant(rng: np.random.Generator, mu: float = 0.6) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """State, parameters, inputs and filled wheels of a vehicle in the middle of something rough."""
     p = PRESETS["sedan"].row()
-    x, u, w = np.zeros(STATES), np.zeros((len(U), 4)), np.zeros((len(W), 4))
-    x[Body.VX], x[Body.VY], x[Body.YAW_RATE] = rng.uniform(3, 30), rng.normal(0, 1), rng.normal(0, 0.4)
-    x[Body.OMEGA : Body.OMEGA + 4] = x[Body.VX] / p[P.RADIUS] * rng.uniform(0.8, 1.2, 4)
-    x[Body.AX_LAGGED], x[Body.AY_LAGGED] = rng.uniform(-4, 4, 2)
-    u[U.STEER], u[U.MU] = rng.normal(0, 0.1, 4), mu
+    x, u, w = np.zeros(STATES), np.zeros((len(Control), 4)), np.zeros((len(Wheel), 4))
+    x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE] = rng.uniform(3, 30), rng.normal(0, 1), rng.normal(0, 0.4)
+    x[Motion.OMEGA : Motion.OMEGA + 4] = x[Motion.VX] / p[P.RADIUS] * rng.uniform(0.8, 1.2, 4)
+    x[Motion.AX_LAGGED], x[Motion.AY_LAGGED] = rng.uniform(-4, 4, 2)
+    u[Control.STEER], u[Control.MU] = rng.normal(0, 0.1, 4), mu
     wheel_forces(x, p, u, w)
     return x, p, u, w
 
 
 def rolling(speed: float, mu: float, vehicle: TrueVehicle | None = None) -> tuple[FloatArray, FloatArray, FloatArray]:
     """State, parameters and inputs of a vehicle rolling straight on."""
-    p, x, u = (vehicle or PRESETS["sedan"]).row(), np.zeros(STATES), np.zeros((len(U), 4))
+    p, x, u = (vehicle or PRESETS["sedan"]).row(), np.zeros(STATES), np.zeros((len(Control), 4))
     start_at(x, p, (0.0, 0.0, 0.0), speed)
-    u[U.MU] = mu
+    u[Control.MU] = mu
     return x, p, u
 
 
 def run(x: FloatArray, p: FloatArray, u: FloatArray, seconds: float, dt: float = 1e-3) -> FloatArray:
     """Wheels at the end of so many seconds with the inputs held."""
-    w = np.zeros((len(W), 4))
+    w = np.zeros((len(Wheel), 4))
     advance(x, p, u, w, dt, round(seconds / dt))
     return w
 
 
 def kinetic_energy(x: FloatArray, p: FloatArray) -> float:
-    wheels = p[P.WHEEL_INERTIA] * (x[Body.OMEGA : Body.OMEGA + 4] ** 2).sum()
-    body = p[P.MASS] * (x[Body.VX] ** 2 + x[Body.VY] ** 2) + p[P.YAW_INERTIA] * x[Body.YAW_RATE] ** 2
+    wheels = p[P.WHEEL_INERTIA] * (x[Motion.OMEGA : Motion.OMEGA + 4] ** 2).sum()
+    body = p[P.MASS] * (x[Motion.VX] ** 2 + x[Motion.VY] ** 2) + p[P.YAW_INERTIA] * x[Motion.YAW_RATE] ** 2
     return float(0.5 * (body + wheels))
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_accelerations_are_the_wheel_forces_over_mass_and_inertia(seed: int) -> None:
     x, p, u, w = some_instant(np.random.default_rng(seed))
-    force = (w[W.FX] + 1j * w[W.FY]) * np.exp(1j * u[U.STEER])  # the body's axes as the complex plane
+    force = (w[Wheel.FX] + 1j * w[Wheel.FY]) * np.exp(1j * u[Control.STEER])  # the body's axes as the complex plane
     half = 0.5 * np.repeat([p[P.TRACK_FRONT], p[P.TRACK_REAR]], 2) * [1, -1, 1, -1]
     place = np.repeat([p[P.TO_FRONT], -p[P.TO_REAR]], 2) + 1j * half
     ax, ay, yaw_acceleration = body_accelerations(x, p, u, w)
-    total = force.sum() - p[Q.DRAG] * x[Body.VX] ** 2
+    total = force.sum() - p[TrueParameter.DRAG] * x[Motion.VX] ** 2
     assert complex(ax, ay) == pytest.approx(total / p[P.MASS], rel=ROUNDING)
     assert yaw_acceleration == pytest.approx((place.conj() * force).imag.sum() / p[P.YAW_INERTIA], rel=ROUNDING)
 
@@ -78,23 +78,23 @@ def test_accelerations_are_the_wheel_forces_over_mass_and_inertia(seed: int) -> 
 def test_no_wheel_pulls_more_than_its_grip(mu: float) -> None:
     for seed in range(50):
         _, _, _, w = some_instant(np.random.default_rng(seed), mu)
-        assert (np.hypot(w[W.FX], w[W.FY]) <= mu * w[W.FZ] * (1 + ROUNDING)).all()
+        assert (np.hypot(w[Wheel.FX], w[Wheel.FY]) <= mu * w[Wheel.FZ] * (1 + ROUNDING)).all()
 
 
 def test_loads_add_up_to_the_weight_whatever_the_accelerations() -> None:
     for seed in range(20):
         _, p, _, w = some_instant(np.random.default_rng(seed))
-        assert w[W.FZ].sum() == pytest.approx(p[P.MASS] * GRAVITY, rel=ROUNDING)
+        assert w[Wheel.FZ].sum() == pytest.approx(p[P.MASS] * GRAVITY, rel=ROUNDING)
 
 
 def test_small_slip_does_not_know_the_friction() -> None:
     forces = []
     for mu in (0.3, 0.9):
         x, p, u = rolling(20.0, mu)
-        x[Body.OMEGA : Body.OMEGA + 4] *= 1.0005
-        w = np.zeros((len(W), 4))
+        x[Motion.OMEGA : Motion.OMEGA + 4] *= 1.0005
+        w = np.zeros((len(Wheel), 4))
         wheel_forces(x, p, u, w)
-        forces.append(w[W.FX].sum())
+        forces.append(w[Wheel.FX].sum())
     assert forces[0] == pytest.approx(forces[1], rel=0.01)
 
 
@@ -113,12 +113,12 @@ def test_steering_left_turns_left_and_loads_the_right_wheels() -> None:
     x, p, u = rolling(15.0, 0.9)
     command(p, u, 0.04, 0.0)
     w = run(x, p, u, 2.0)
-    assert x[Body.YAW_RATE] > 0.1
-    assert x[Body.Y] > 1.0
-    assert x[Body.AY_LAGGED] > 1.0
-    assert w[W.FZ, 1] > w[W.FZ, 0]
-    assert w[W.FZ, 3] > w[W.FZ, 2]
-    assert u[U.STEER, 0] > u[U.STEER, 1]  # the inner wheel turns more
+    assert x[Motion.YAW_RATE] > 0.1
+    assert x[Motion.Y] > 1.0
+    assert x[Motion.AY_LAGGED] > 1.0
+    assert w[Wheel.FZ, 1] > w[Wheel.FZ, 0]
+    assert w[Wheel.FZ, 3] > w[Wheel.FZ, 2]
+    assert u[Control.STEER, 0] > u[Control.STEER, 1]  # the inner wheel turns more
 
 
 @pytest.mark.parametrize("share", [-0.4, 0.3])
@@ -127,14 +127,14 @@ def test_rear_wheels_that_steer_keep_the_circle_and_swing_the_tail(share: float)
     circles = []
     for rear in (0.0, share):
         p = replace(PRESETS["sedan"], rear_steer=rear).row()
-        x, u, w = np.zeros(STATES), np.zeros((len(U), 4)), np.zeros((len(W), 4))
+        x, u, w = np.zeros(STATES), np.zeros((len(Control), 4)), np.zeros((len(Wheel), 4))
         start_at(x, p, (0.0, 0.0, 0.0), 2.0)
-        u[U.MU] = 0.9
+        u[Control.MU] = 0.9
         command(p, u, 0.1, 0.0)
-        assert u[U.STEER, 2:] == pytest.approx(rear * u[U.STEER, :2])
+        assert u[Control.STEER, 2:] == pytest.approx(rear * u[Control.STEER, :2])
         for _ in range(1000):
             advance(x, p, u, w, 1e-3, 1)
-        circles.append((x[Body.YAW_RATE] / x[Body.VX], x[Body.VY] / x[Body.VX]))
+        circles.append((x[Motion.YAW_RATE] / x[Motion.VX], x[Motion.VY] / x[Motion.VX]))
     assert circles[1][0] == pytest.approx(circles[0][0], rel=0.02)
     assert (circles[1][1] - circles[0][1]) * share > 0.0
 
@@ -143,9 +143,9 @@ def test_driving_goes_forward_and_loads_the_rear() -> None:
     x, p, u = rolling(10.0, 0.9)
     command(p, u, 0.0, 4000.0)
     w = run(x, p, u, 1.0)
-    assert x[Body.VX] > 11.0
-    assert w[W.FZ, 2:].sum() > w[W.FZ, :2].sum() * p[P.TO_FRONT] / p[P.TO_REAR]
-    assert (w[W.TORQUE] > 0).all()
+    assert x[Motion.VX] > 11.0
+    assert w[Wheel.FZ, 2:].sum() > w[Wheel.FZ, :2].sum() * p[P.TO_FRONT] / p[P.TO_REAR]
+    assert (w[Wheel.TORQUE] > 0).all()
 
 
 @pytest.mark.parametrize("mu", [0.15, 0.5, 0.9])
@@ -153,11 +153,11 @@ def test_an_anti_lock_stop_uses_most_of_the_grip_and_never_more(mu: float) -> No
     x, p, u = rolling(20.0, mu)
     command(p, u, 0.0, -1.2 * p[P.MASS] * GRAVITY)
     run(x, p, u, 0.3)
-    fast = x[Body.VX]
+    fast = x[Motion.VX]
     run(x, p, u, 0.5)
-    deceleration = (fast - x[Body.VX]) / 0.5
-    assert 0.7 * mu * GRAVITY < deceleration < mu * GRAVITY + p[Q.DRAG] * fast**2 / p[P.MASS]
-    assert (x[Body.OMEGA : Body.OMEGA + 4] > 0.5 * x[Body.VX] / p[P.RADIUS]).all()
+    deceleration = (fast - x[Motion.VX]) / 0.5
+    assert 0.7 * mu * GRAVITY < deceleration < mu * GRAVITY + p[TrueParameter.DRAG] * fast**2 / p[P.MASS]
+    assert (x[Motion.OMEGA : Motion.OMEGA + 4] > 0.5 * x[Motion.VX] / p[P.RADIUS]).all()
 
 
 def test_without_slip_control_the_wheels_lock_and_brake_less() -> None:
@@ -166,7 +166,7 @@ def test_without_slip_control_the_wheels_lock_and_brake_less() -> None:
         x, p, u = rolling(20.0, 0.4, replace(PRESETS["sedan"], slip_limit=limit))
         command(p, u, 0.0, -1.0 * p[P.MASS] * GRAVITY)
         run(x, p, u, 1.5)
-        stops[limit] = x[Body.VX], x[Body.OMEGA]
+        stops[limit] = x[Motion.VX], x[Motion.OMEGA]
     assert abs(stops[np.inf][1]) < 0.5
     assert stops[np.inf][0] > stops[0.08][0] + 0.2
 
@@ -183,10 +183,10 @@ def test_a_stopped_vehicle_stays_where_it_is() -> None:
     x, p, u = rolling(3.0, 0.9)
     command(p, u, 0.05, -8000.0)
     run(x, p, u, 3.0)
-    place = x[[Body.X, Body.Y, Body.YAW]].copy()
+    place = x[[Motion.X, Motion.Y, Motion.YAW]].copy()
     run(x, p, u, 5.0)
-    assert abs(x[Body.VX]) < 1e-3
-    np.testing.assert_allclose(x[[Body.X, Body.Y, Body.YAW]], place, atol=1e-3)
+    assert abs(x[Motion.VX]) < 1e-3
+    np.testing.assert_allclose(x[[Motion.X, Motion.Y, Motion.YAW]], place, atol=1e-3)
 
 
 def test_a_wheel_has_the_inertia_that_it_has() -> None:
@@ -199,7 +199,7 @@ def test_a_wheel_has_the_inertia_that_it_has() -> None:
         before = x.copy()
         run(x, p, u, 0.1)
         heavy = p[P.MASS] + 4 * p[P.WHEEL_INERTIA] / p[P.RADIUS] ** 2
-        assert (x[Body.VX] - before[Body.VX]) / 0.1 == pytest.approx(3000.0 / heavy, rel=2e-3)
+        assert (x[Motion.VX] - before[Motion.VX]) / 0.1 == pytest.approx(3000.0 / heavy, rel=2e-3)
 
 
 def test_finer_steps_give_the_same_drive() -> None:

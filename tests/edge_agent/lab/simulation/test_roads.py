@@ -7,7 +7,7 @@ import pytest
 
 from edge_agent.lab.simulation import SCENARIOS, Scenario
 from edge_agent.lab.simulation.friction import ICE, Patch
-from edge_agent.lab.simulation.roads import BRAKING, L, Network, Road, build_network, rounded
+from edge_agent.lab.simulation.roads import BRAKING, LanePoint, Network, Road, build_network, rounded
 from schemas.errors import InputError
 
 EVERY = pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS.keys())
@@ -31,7 +31,7 @@ def test_every_lane_joins_the_next_without_a_gap_or_a_kink(scenario: Scenario) -
         for way in onward(network, k):
             end, start = network.lane(k)[-1], network.lane(way)[0]
             assert np.hypot(*(end[:2] - start[:2])) < 0.01
-            assert end[L.COS] * start[L.COS] + end[L.SIN] * start[L.SIN] > 0.95
+            assert end[LanePoint.COS] * start[LanePoint.COS] + end[LanePoint.SIN] * start[LanePoint.SIN] > 0.95
 
 
 @EVERY
@@ -55,7 +55,7 @@ def test_one_keeps_to_the_right_four_metres_from_the_other_lane(scenario: Scenar
         for point in there[10:-10]:
             offset = back[:, :2] - point[:2]
             nearest = offset[np.hypot(*offset.T).argmin()]
-            assert nearest @ (-point[L.SIN], point[L.COS]) == pytest.approx(4.0, abs=0.2)  # to the left
+            assert nearest @ (-point[LanePoint.SIN], point[LanePoint.COS]) == pytest.approx(4.0, abs=0.2)  # to the left
 
 
 @EVERY
@@ -63,10 +63,10 @@ def test_the_speed_profile_asks_for_no_more_than_the_budget(scenario: Scenario) 
     network = scenario.network
     for k in range(len(network.size)):
         for number, way in enumerate(onward(network, k)):
-            lane, profile = network.lane(k), network.lane(k)[:, L.PROFILE + number]
-            assert (profile * np.abs(lane[:, L.CURVATURE]) <= 1 + 1e-9).all()
+            lane, profile = network.lane(k), network.lane(k)[:, LanePoint.PROFILE + number]
+            assert (profile * np.abs(lane[:, LanePoint.CURVATURE]) <= 1 + 1e-9).all()
             assert (profile[:-1] - profile[1:] <= 2 * BRAKING * network.spacing[k] + 1e-9).all()
-            assert profile[-1] <= network.lane(way)[0, L.PROFILE :].min() + 1e-9
+            assert profile[-1] <= network.lane(way)[0, LanePoint.PROFILE :].min() + 1e-9
 
 
 def test_the_demonstration_is_small_enough_to_be_covered_many_times() -> None:
@@ -114,10 +114,10 @@ def test_friction_takes_arrays_of_any_shape() -> None:
 def test_the_demonstration_has_dry_wet_snowy_icy_and_split_roads() -> None:
     scenario = SCENARIOS["demo"]
     points = scenario.network.points
-    mu = scenario.friction(0.0, points[:, L.X], points[:, L.Y])
+    mu = scenario.friction(0.0, points[:, LanePoint.X], points[:, LanePoint.Y])
     assert set(mu.tolist()) == {0.9, 0.6, 0.35, 0.18}
-    right = points[:, [L.X, L.Y]] + 0.8 * points[:, [L.SIN, L.COS]] * [1, -1]
-    left = points[:, [L.X, L.Y]] - 0.8 * points[:, [L.SIN, L.COS]] * [1, -1]
+    right = points[:, [LanePoint.X, LanePoint.Y]] + 0.8 * points[:, [LanePoint.SIN, LanePoint.COS]] * [1, -1]
+    left = points[:, [LanePoint.X, LanePoint.Y]] - 0.8 * points[:, [LanePoint.SIN, LanePoint.COS]] * [1, -1]
     sides = [scenario.friction(0.0, *side.T) for side in (left, right)]
     assert (sides[0] > sides[1] + 0.1).sum() > 50  # [m] of lane
 

@@ -19,10 +19,21 @@ from edge_agent.lab.simulation import (
     Wave,
     simulate_manoeuvre,
 )
-from edge_agent.lab.simulation.misaligned import DEVICE_OF, DEVICES, WIDE, M, Misalignment, misalignment_row
-from edge_agent.lab.simulation.plant import INPUTS, STATES, Body, U, W, advance, command, held, start_at, wheel_forces
+from edge_agent.lab.simulation.misaligned import DEVICE_OF, DEVICES, WIDE, Misaligned, Misalignment, misalignment_row
+from edge_agent.lab.simulation.plant import (
+    INPUTS,
+    STATES,
+    Control,
+    Motion,
+    Wheel,
+    advance,
+    command,
+    held,
+    start_at,
+    wheel_forces,
+)
 from edge_agent.lab.simulation.relief import STEEPEST, gradient, tilt
-from edge_agent.lab.simulation.roads import L
+from edge_agent.lab.simulation.roads import LanePoint
 from edge_agent.lab.simulation.scenarios import scenario_named
 from edge_agent.lab.simulation.sensors import ROUGH_FLEET, Sensors
 from schemas.errors import InputError
@@ -45,9 +56,9 @@ def sine(slope: float) -> float:
 def still(slope: float, bank: float = 0.0, mu: float = 0.85) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """State, parameters, inputs and wheels of a standing sedan."""
     p, x = PRESETS["sedan"].row(), np.zeros(STATES)
-    u, w = np.zeros((INPUTS, 4)), np.zeros((len(W), 4))
+    u, w = np.zeros((INPUTS, 4)), np.zeros((len(Wheel), 4))
     start_at(x, p, (0.0, 0.0, 0.0), 0.0)
-    u[U.MU], u[U.TILT, 0], u[U.TILT, 1] = mu, slope, bank
+    u[Control.MU], u[Control.TILT, 0], u[Control.TILT, 1] = mu, slope, bank
     return x, p, u, w
 
 
@@ -86,20 +97,20 @@ def test_straight_driving_on_a_bank_feels_its_sine(bank: float) -> None:
 @pytest.mark.parametrize("slope", [-0.06, 0.03])
 def test_a_coasting_vehicle_gains_what_it_falls_and_no_more(slope: float) -> None:
     p = replace(PRESETS["sedan"], drag=0.0, rolling=0.0).row()
-    x, u, w = np.zeros(STATES), np.zeros((INPUTS, 4)), np.zeros((len(W), 4))
+    x, u, w = np.zeros(STATES), np.zeros((INPUTS, 4)), np.zeros((len(Wheel), 4))
     start_at(x, p, (0.0, 0.0, 0.0), 15.0)
-    u[U.MU], u[U.TILT, 0] = 0.9, slope
+    u[Control.MU], u[Control.TILT, 0] = 0.9, slope
     command(p, u, 0.0, 0.0)
 
     def energy() -> float:
-        turning = 0.5 * p[P.WHEEL_INERTIA] * (x[Body.OMEGA : Body.OMEGA + 4] ** 2).sum()
-        return float(0.5 * p[P.MASS] * x[Body.VX] ** 2 + turning + p[P.MASS] * GRAVITY * sine(slope) * x[Body.X])
+        turning = 0.5 * p[P.WHEEL_INERTIA] * (x[Motion.OMEGA : Motion.OMEGA + 4] ** 2).sum()
+        return float(0.5 * p[P.MASS] * x[Motion.VX] ** 2 + turning + p[P.MASS] * GRAVITY * sine(slope) * x[Motion.X])
 
     before = energy()
     for _ in range(50):
         advance(x, p, u, w, 1e-3, 100)
         assert before * (1 - 1e-3) < energy() <= before * (1 + 1e-5)
-    assert (x[Body.VX] - 15.0) * slope < 0.0
+    assert (x[Motion.VX] - 15.0) * slope < 0.0
 
 
 def test_loads_add_up_to_the_weight_that_is_normal_to_the_road_and_move_downhill() -> None:
@@ -107,12 +118,12 @@ def test_loads_add_up_to_the_weight_that_is_normal_to_the_road_and_move_downhill
     command(p, u, 0.0, -8000.0)
     advance(x, p, u, w, 1e-3, 1000)
     wheel_forces(x, p, u, w)
-    assert w[W.FZ].sum() == pytest.approx(p[P.MASS] * GRAVITY / np.sqrt(1 + 0.08**2 + 0.05**2), rel=1e-9)
+    assert w[Wheel.FZ].sum() == pytest.approx(p[P.MASS] * GRAVITY / np.sqrt(1 + 0.08**2 + 0.05**2), rel=1e-9)
     level, *_ = still(0.0)
-    flat = np.zeros((len(W), 4))
-    wheel_forces(level, p, np.zeros((INPUTS, 4)) + 0.85 * (np.arange(INPUTS) == U.MU)[:, None], flat)
-    assert (w[W.FZ, 2:] > flat[W.FZ, 2:])[0]  # uphill the rear carries more, and here the left lies lower
-    assert w[W.FZ, 0] > w[W.FZ, 1]
+    flat = np.zeros((len(Wheel), 4))
+    wheel_forces(level, p, np.zeros((INPUTS, 4)) + 0.85 * (np.arange(INPUTS) == Control.MU)[:, None], flat)
+    assert (w[Wheel.FZ, 2:] > flat[Wheel.FZ, 2:])[0]  # uphill the rear carries more, and here the left lies lower
+    assert w[Wheel.FZ, 0] > w[Wheel.FZ, 1]
 
 
 def test_brakes_hold_what_they_can_and_tyres_what_the_road_allows() -> None:
@@ -121,8 +132,8 @@ def test_brakes_hold_what_they_can_and_tyres_what_the_road_allows() -> None:
         command(p, u, 0.0, force)
         assert held(x, p, u) == stays
         advance(x, p, u, w, 1e-3, 2000)
-        assert (x[Body.VX] == 0.0) == stays
-        assert (x[Body.X] < -0.1) == (not stays)
+        assert (x[Motion.VX] == 0.0) == stays
+        assert (x[Motion.X] < -0.1) == (not stays)
 
 
 @pytest.mark.parametrize("slope", [-0.08, 0.0, 0.08])
@@ -182,12 +193,17 @@ def test_the_town_on_hills_reaches_eight_per_cent_and_is_gentle_where_it_is_icy(
     points, table = scenario.network.points, scenario.relief.table
     along = []
     for row in points:
-        east, north = gradient(table, (row[L.X], row[L.Y]), (row[L.COS], row[L.SIN]), row[L.CURVATURE])
-        along.append(east * row[L.COS] + north * row[L.SIN])
+        east, north = gradient(
+            table,
+            (row[LanePoint.X], row[LanePoint.Y]),
+            (row[LanePoint.COS], row[LanePoint.SIN]),
+            row[LanePoint.CURVATURE],
+        )
+        along.append(east * row[LanePoint.COS] + north * row[LanePoint.SIN])
     steep = np.abs(along)
     assert 0.07 < steep.max() <= STEEPEST
     assert 0.02 < np.std(along) < 0.045
-    icy = scenario.friction(100.0, points[:, L.X], points[:, L.Y]) < 0.2
+    icy = scenario.friction(100.0, points[:, LanePoint.X], points[:, LanePoint.Y]) < 0.2
     assert icy.any()
     assert steep[icy].max() < 0.055
 
@@ -216,23 +232,23 @@ def test_a_misalignment_is_exactly_what_its_row_says_and_touches_nothing_else(na
     wanted = {key: value.copy() for key, value in exact.items()}
     t = np.arange(len(exact["ax"])) / 100.0
     if name == "tilt":
-        wanted["ax"] = exact["ax"] + row[M.AX] + row[M.TURN] * exact["ay"]
-        wanted["ay"] = exact["ay"] + row[M.AY] - row[M.TURN] * exact["ax"]
+        wanted["ax"] = exact["ax"] + row[Misaligned.AX] + row[Misaligned.TURN] * exact["ay"]
+        wanted["ay"] = exact["ay"] + row[Misaligned.AY] - row[Misaligned.TURN] * exact["ax"]
     for i, wheel in enumerate(("fl", "fr", "rl", "rr")):
         angle, speed = exact[f"delta_{wheel}"], exact[f"omega_{wheel}"]
         if name == "steering" and i < 2:
-            bend = 1.0 + row[M.GAIN] + row[M.BEND] * np.abs(angle) / WIDE
-            wanted[f"delta_{wheel}"] = row[M.ZERO] + bend * angle
+            bend = 1.0 + row[Misaligned.GAIN] + row[Misaligned.BEND] * np.abs(angle) / WIDE
+            wanted[f"delta_{wheel}"] = row[Misaligned.ZERO] + bend * angle
         if name == "radius":
-            wanted[f"omega_{wheel}"] = speed * (1.0 + row[M.RADIUS + i])
+            wanted[f"omega_{wheel}"] = speed * (1.0 + row[Misaligned.RADIUS + i])
         if name == "step":
-            wanted[f"omega_{wheel}"] = np.floor(speed / row[M.STEP] + 0.5) * row[M.STEP]
+            wanted[f"omega_{wheel}"] = np.floor(speed / row[Misaligned.STEP] + 0.5) * row[Misaligned.STEP]
         if name == "torque":
             wanted[f"torque_{wheel}"] = np.full_like(speed, np.nan)
     if name == "lag":
         for c, channel in enumerate(CHANNELS[: S.LATITUDE]):
-            wanted[channel] = np.interp(t - row[M.LAG + DEVICE_OF[c]], t, exact[channel])
-        assert np.ptp(row[M.LAG : M.LAG + DEVICES]) > 0.005
+            wanted[channel] = np.interp(t - row[Misaligned.LAG + DEVICE_OF[c]], t, exact[channel])
+        assert np.ptp(row[Misaligned.LAG : Misaligned.LAG + DEVICES]) > 0.005
     for channel in CHANNELS[: S.LATITUDE]:
         np.testing.assert_allclose(told[channel], wanted[channel], rtol=1e-9, atol=1e-9, err_msg=channel)
     assert any(not np.array_equal(told[c], exact[c], equal_nan=True) for c in CHANNELS)
@@ -242,20 +258,22 @@ def test_one_misalignment_does_not_move_another_and_sizes_are_those_of_the_table
     whole = SENSORS["rough"].mounted
     rows = np.array([misalignment_row(whole, 1, k) for k in range(400)])
     alone = np.array([misalignment_row(ONLY["radius"], 1, k) for k in range(400)])
-    np.testing.assert_array_equal(rows[:, M.RADIUS : M.RADIUS + 4], alone[:, M.RADIUS : M.RADIUS + 4])
-    assert rows[:, M.AX].std() == pytest.approx(GRAVITY * whole.tilt[0], rel=0.1)
-    assert 0.25 < rows[:, M.AX].std() < 0.5
-    assert 0.12 < rows[:, M.AY].std() < 0.25
-    assert rows[:, M.ZERO].std() == pytest.approx(whole.steering[0], rel=0.1)
-    assert rows[:, M.STEP].max() <= whole.step
-    assert rows[:, M.LAG : M.LAG + DEVICES].max() <= whole.lag_s
-    assert rows[:, M.LAG : M.LAG + DEVICES].max() > 0.9 * whole.lag_s
+    np.testing.assert_array_equal(
+        rows[:, Misaligned.RADIUS : Misaligned.RADIUS + 4], alone[:, Misaligned.RADIUS : Misaligned.RADIUS + 4]
+    )
+    assert rows[:, Misaligned.AX].std() == pytest.approx(GRAVITY * whole.tilt[0], rel=0.1)
+    assert 0.25 < rows[:, Misaligned.AX].std() < 0.5
+    assert 0.12 < rows[:, Misaligned.AY].std() < 0.25
+    assert rows[:, Misaligned.ZERO].std() == pytest.approx(whole.steering[0], rel=0.1)
+    assert rows[:, Misaligned.STEP].max() <= whole.step
+    assert rows[:, Misaligned.LAG : Misaligned.LAG + DEVICES].max() <= whole.lag_s
+    assert rows[:, Misaligned.LAG : Misaligned.LAG + DEVICES].max() > 0.9 * whole.lag_s
 
 
 def test_a_wheel_that_stands_reads_zero_and_one_that_turns_reads_steps() -> None:
     log, _ = simulate_manoeuvre("stop-and-go", sensors="rough-coarse", road="hilly", seed=3)
     stands = column(log, "true_vx") == 0.0
-    step = misalignment_row(SENSORS["rough-coarse"].mounted, 3, 0)[M.STEP]
+    step = misalignment_row(SENSORS["rough-coarse"].mounted, 3, 0)[Misaligned.STEP]
     for name in per_wheel("omega"):
         assert not column(log, name)[stands].any()
         np.testing.assert_allclose(column(log, name) / step, np.round(column(log, name) / step), atol=1e-6)
@@ -280,7 +298,7 @@ def test_a_rough_fleet_on_hills_is_the_same_whatever_its_blocks_and_its_number()
 
 
 def test_torque_is_missing_in_about_half_of_a_rough_fleet() -> None:
-    missing = [misalignment_row(ROUGH_FLEET.mounted, 2, k)[M.TORQUELESS] for k in range(300)]
+    missing = [misalignment_row(ROUGH_FLEET.mounted, 2, k)[Misaligned.TORQUELESS] for k in range(300)]
     assert 0.4 < np.mean(missing) < 0.6
 
 
