@@ -40,7 +40,7 @@ def infer(mismatch: float, inputs: FloatArray, outputs: FloatArray) -> float:
 @compiled
 def adapted(factor: float, actual: float, theoretical: float, inputs: FloatArray, outputs: FloatArray) -> float:
     """The next factor on R: factor*exp(infer(actual/theoretical - 1)), bounded."""
-    return adapted_within(factor, actual, theoretical, inputs, outputs, 1.0, LEAST_FACTOR, LARGEST_FACTOR)
+    return adapted_within(factor, actual, theoretical, inputs, outputs, 1.0, (LEAST_FACTOR, LARGEST_FACTOR))
 
 
 @compiled
@@ -51,11 +51,10 @@ def adapted_within(
     inputs: FloatArray,
     outputs: FloatArray,
     pace: float,
-    least: float,
-    largest: float,
+    bounds: tuple[float, float],
 ) -> float:
-    """`adapted` with other bounds, and with `pace` as many steps as the sets were made for."""
+    """`adapted` within other bounds, and with `pace` as many steps as the sets were made for."""
     if not theoretical > 0.0:
         return factor
     step = pace * infer(actual / theoretical - 1.0, inputs, outputs)
-    return min(max(factor * math.exp(step), least), largest)
+    return min(max(factor * math.exp(step), bounds[0]), bounds[1])

@@ -7,6 +7,7 @@ adhesion per wheel [1], delta steering [rad], omega wheel speed [rad/s], F_x, F_
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,11 +22,11 @@ DUGOFF = 0.0  # in place of a Magic Formula shape c, which is above 1
 
 
 @compiled
-def turned(delta: FloatArray) -> FloatArray:
-    """Steering angles (4,) [rad] as (4, 2): cosine and sine, which many states share."""
-    out = np.empty((4, 2))
+def wheel_inputs(delta: FloatArray, omega: FloatArray) -> FloatArray:
+    """(4, 3): cosine and sine of the steering (4,) [rad], which many states share, and wheel speed (4,) [rad/s]."""
+    out = np.empty((4, 3))
     for wheel in range(4):
-        out[wheel, 0], out[wheel, 1] = math.cos(delta[wheel]), math.sin(delta[wheel])
+        out[wheel, 0], out[wheel, 1], out[wheel, 2] = math.cos(delta[wheel]), math.sin(delta[wheel]), omega[wheel]
     return out
 
 
@@ -41,8 +42,7 @@ def _slips(radius: float, ahead: float, aside: float, cos: float, sin: float, om
 def tyre_forces(
     row: FloatArray,
     motion: FloatArray,
-    steering: FloatArray,
-    omega: FloatArray,
+    wheels: FloatArray,
     mu: FloatArray,
     shape: float,
     force_x: FloatArray,
@@ -50,49 +50,58 @@ def tyre_forces(
 ) -> None:
     """Fill force_x, force_y (4,) [N] at motion (5,) = v_x, v_y, r, a_x, a_y; the accelerations give the loads.
 
-    steering: (4, 2) of `turned`; omega, mu (4,); shape: c of the Magic Formula (e = 0), or DUGOFF. A wheel whose speed
-    is NaN rolls freely.
+    wheels: (4, 3) of `wheel_inputs`, a wheel whose speed is NaN rolls freely; mu (4,); shape: c of the Magic Formula
+    (e = 0), or DUGOFF.
     """
     loads = wheel_loads(body(row), motion[3], motion[4])
     for wheel in range(4):
         x, y = wheel_position(row, wheel)
         ahead, aside = motion[0] - y * motion[2], motion[1] + x * motion[2]
-        slip_x, slip_y = _slips(row[P.RADIUS], ahead, aside, steering[wheel, 0], steering[wheel, 1], omega[wheel])
-        stiff_x, stiff_y = row[P.SLOPE_X] * loads[wheel], row[P.SLOPE_Y] * loads[wheel]
+        slip = _slips(row[P.RADIUS], ahead, aside, wheels[wheel, 0], wheels[wheel, 1], wheels[wheel, 2])
+        stiffness = row[P.SLOPE_X] * loads[wheel], row[P.SLOPE_Y] * loads[wheel]
         if shape == DUGOFF:
-            pair = combined_dugoff(slip_x, slip_y, stiff_x, stiff_y, mu[wheel], loads[wheel])
+            force = combined_dugoff(slip, stiffness, mu[wheel], loads[wheel])
         else:
-            pair = combined_magic(slip_x, slip_y, stiff_x, stiff_y, mu[wheel], loads[wheel], shape, 0.0)
-        force_x[wheel], force_y[wheel] = pair
+            force = combined_magic(slip, stiffness, mu[wheel], loads[wheel], shape, 0.0)
+        force_x[wheel], force_y[wheel] = force
+
+
+class Motion(NamedTuple):
+    """How the body moves."""
+
+    vx: float
+    vy: float
+    yaw_rate: float
+    ax: float
+    ay: float
+
+
+class WheelInputs(NamedTuple):
+    """What acts on the four wheels."""
+
+    cos: Four  # of the steering
+    sin: Four
+    omega: Four  # NaN rolls freely
+    force_x: Four  # [N] in place of the tyre's longitudinal force where it is not NaN
+    mu: Four
 
 
 @inlined
-def response(
-    body: Body,
-    vx: float,
-    vy: float,
-    rate: float,
-    ax: float,
-    ay: float,
-    cos: Four,
-    sin: Four,
-    omega: Four,
-    known_x: Four,
-    mu: Four,
-) -> tuple[float, float, float]:
-    """(a_x, a_y [m/s^2], yaw acceleration [rad/s^2]) of four Dugoff tyres' forces; cos, sin (4,) of the steering.
+def response(body: Body, motion: Motion, wheels: WheelInputs) -> tuple[float, float, float]:
+    """(a_x, a_y [m/s^2], yaw acceleration [rad/s^2]) of four Dugoff tyres' forces.
 
-    known_x (4,) [N] replaces the tyre's longitudinal force where it is not NaN. Written out per wheel, with numbers and
-    no arrays between: this is where the papers' filters spend their time.
+    Written out per wheel, with numbers and no arrays between: this is where the papers' filters spend their time.
     """
+    vx, vy, rate, ax, ay = motion
+    cos, sin, omega, force_x, mu = wheels
     fl, fr, rl, rr = wheel_loads(body, ax, ay)
     a, b, front, rear = body.to_front, body.to_rear, 0.5 * body.track_front, 0.5 * body.track_rear
     aside = vy + a * rate
-    x_fl, y_fl = _pull(body, fl, mu[0], vx - front * rate, aside, cos[0], sin[0], omega[0], known_x[0])
-    x_fr, y_fr = _pull(body, fr, mu[1], vx + front * rate, aside, cos[1], sin[1], omega[1], known_x[1])
+    x_fl, y_fl = _pull(body, vx - front * rate, aside, (fl, mu[0], cos[0], sin[0], omega[0], force_x[0]))
+    x_fr, y_fr = _pull(body, vx + front * rate, aside, (fr, mu[1], cos[1], sin[1], omega[1], force_x[1]))
     aside = vy - b * rate
-    x_rl, y_rl = _pull(body, rl, mu[2], vx - rear * rate, aside, cos[2], sin[2], omega[2], known_x[2])
-    x_rr, y_rr = _pull(body, rr, mu[3], vx + rear * rate, aside, cos[3], sin[3], omega[3], known_x[3])
+    x_rl, y_rl = _pull(body, vx - rear * rate, aside, (rl, mu[2], cos[2], sin[2], omega[2], force_x[2]))
+    x_rr, y_rr = _pull(body, vx + rear * rate, aside, (rr, mu[3], cos[3], sin[3], omega[3], force_x[3]))
     moment = a * (y_fl + y_fr) - b * (y_rl + y_rr) + front * (x_fr - x_fl) + rear * (x_rr - x_rl)
     per_mass, per_inertia = 1.0 / body.mass, 1.0 / body.yaw_inertia
     return (x_fl + x_fr + x_rl + x_rr) * per_mass, (y_fl + y_fr + y_rl + y_rr) * per_mass, moment * per_inertia
@@ -100,18 +109,11 @@ def response(
 
 @inlined
 def _pull(
-    body: Body,
-    load: float,
-    mu: float,
-    ahead: float,
-    aside: float,
-    cos: float,
-    sin: float,
-    omega: float,
-    known_x: float,
+    body: Body, ahead: float, aside: float, wheel: tuple[float, float, float, float, float, float]
 ) -> tuple[float, float]:
-    """Force (ahead, left) [N] in body axes of one wheel."""
-    slip_x, slip_y = _slips(body.radius, ahead, aside, cos, sin, omega)
-    force_x, force_y = combined_dugoff(slip_x, slip_y, body.slope_x * load, body.slope_y * load, mu, load)
-    force_x = force_x if math.isnan(known_x) else known_x
+    """Force (ahead, left) [N] in body axes of a wheel with load, mu, cos, sin, omega and given longitudinal force."""
+    load, mu, cos, sin, omega, given_x = wheel
+    slip = _slips(body.radius, ahead, aside, cos, sin, omega)
+    force_x, force_y = combined_dugoff(slip, (body.slope_x * load, body.slope_y * load), mu, load)
+    force_x = force_x if math.isnan(given_x) else given_x
     return cos * force_x - sin * force_y, sin * force_x + cos * force_y

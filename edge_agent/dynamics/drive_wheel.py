@@ -14,6 +14,7 @@ voltage. (31) prints the derivative of F where that of F' belongs, and takes the
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
@@ -23,13 +24,21 @@ SLIDING_GAIN, SLIDING_RATE = 2000.0, 10.0  # k1, k2; not given
 SOFT_N_S = 500.0  # the sign is smoothed over so much
 
 
+class WheelState(NamedTuple):
+    """State of a driven wheel."""
+
+    torque: float  # tau
+    omega: float
+    force: float  # F
+    slope: float  # F'
+
+
 @compiled
-def drive_wheel(
-    torque: float, omega: float, force: float, slope: float, settled: float, inertia: float, radius: float, step: float
-) -> tuple[float, float, float, float]:
-    """(tau, omega, F, F') after `step` [s] by Euler's rule, as printed (32)."""
+def drive_wheel(state: WheelState, settled: float, inertia: float, radius: float, step: float) -> WheelState:
+    """The state after `step` [s] by Euler's rule, as printed (32); settled is tau_u."""
+    torque, omega, force, slope = state
     pull = SLIDING_GAIN * math.tanh(slope / SOFT_N_S) + SLIDING_RATE * slope
-    return (
+    return WheelState(
         torque + step * (settled - torque) / ELECTRIC_S,
         omega + step * (torque - radius * force) / inertia,
         force + step * slope,

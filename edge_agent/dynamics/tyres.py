@@ -48,17 +48,17 @@ def brush(theta: float) -> float:
 
 @compiled
 def combined_magic(
-    slip_x: float, slip_y: float, stiffness_x: float, stiffness_y: float, mu: float, load: float, c: float, e: float
+    slip: tuple[float, float], stiffness: tuple[float, float], mu: float, load: float, c: float, e: float
 ) -> tuple[float, float]:
     """(Fx, Fy) [N] of one wheel in its own frame by similarity with the Magic Formula.
 
-    slip_x [1], slip_y = tan(alpha) [1], stiffness_x [N], stiffness_y [N/rad], mu [1], load [N].
+    slip (along, tan of the slip angle) [1], stiffness (along [N], across [N/rad]), mu [1], load [N].
     """
     grip = mu * load
     if grip <= 0.0:
         return 0.0, 0.0
-    theta_x = stiffness_x * slip_x / grip
-    theta_y = stiffness_y * slip_y / grip
+    theta_x = stiffness[0] * slip[0] / grip
+    theta_y = stiffness[1] * slip[1] / grip
     theta = math.sqrt(theta_x * theta_x + theta_y * theta_y)
     if theta < TINY:
         return 0.0, 0.0
@@ -68,14 +68,14 @@ def combined_magic(
 
 @inlined
 def combined_dugoff(
-    slip_x: float, slip_y: float, stiffness_x: float, stiffness_y: float, mu: float, load: float
+    slip: tuple[float, float], stiffness: tuple[float, float], mu: float, load: float
 ) -> tuple[float, float]:
     """(Fx, Fy) [N] of one wheel in its own frame by similarity with the Dugoff curve; arguments as `combined_magic`.
 
     The curve is theta up to one half, where the force is K*slip itself, then 1 - 1/(4*theta); it has no falling branch.
     """
     grip = max(mu * load, 0.0)
-    free_x, free_y = stiffness_x * slip_x, stiffness_y * slip_y
+    free_x, free_y = stiffness[0] * slip[0], stiffness[1] * slip[1]
     free = math.sqrt(free_x * free_x + free_y * free_y)
     share = grip / free  # 1/theta
     gain = 1.0 if 2.0 * free <= grip else share * (1.0 - 0.25 * share)

@@ -18,12 +18,15 @@ from schemas.numeric import BoolArray, FloatArray
 from schemas.runtime.jit import entry_point
 from schemas.runtime.records import RecordArray
 
-Kernel: TypeAlias = Callable[..., None]
-"""kernel(filters, desks, t, signals, told, share, first, last), or with (closes, evidence) after told.
+Part: TypeAlias = tuple[int, int, int]
+"""Which context a thread has to itself, and its vehicles [first, last)."""
 
-Takes t (T, N) and signals (T, N, 18) of the vehicles [first, last), changes their filters (N,), writes told (T, N, …)
-indexed by Y and, where closes (T, N) says so, evidence (T, N, 32); closes (0, N) says nowhere. `desks[share]` holds the
-tables that all filters read, and room for what a step writes before it reads it; it is of this thread alone.
+Kernel: TypeAlias = Callable[..., None]
+"""kernel(filters, contexts, t, signals, outputs, part), or with visits = (closes, evidence) before part.
+
+Takes t (T, N) and signals (T, N, 18) of the vehicles of `part`, changes their filters (N,), writes outputs (T, N, …)
+indexed by Column and, where closes (T, N) says so, evidence (T, N, 32); closes (0, N) is nowhere. A context holds the
+tables that all filters read, and arrays that a step writes before it reads them.
 """
 
 
@@ -33,15 +36,15 @@ class EstimatorBank:
     def __init__(
         self,
         filters: RecordArray,
-        desk: RecordArray,
+        context: RecordArray,
         kernel: Kernel,
         *,
-        tells: int = ONE_FRICTION,
+        columns: int = ONE_FRICTION,
         evidence: bool = False,
     ) -> None:
-        self._filters, self._desks, self._kernel, self._tells = filters, desk, kernel, tells
+        self._filters, self._contexts, self._kernel, self._columns = filters, context, kernel, columns
         self._entered, count = kernel, len(filters)
-        self._nowhere = (np.zeros((0, count), np.bool_), np.zeros((0, count, BINS))) if evidence else ()
+        self._nowhere = ((np.zeros((0, count), np.bool_), np.zeros((0, count, BINS))),) if evidence else ()
 
     def advance(
         self, t: FloatArray, signals: FloatArray, closes: BoolArray | None = None, *, threads: int = 1
@@ -63,17 +66,17 @@ class EstimatorBank:
         count = len(self._filters)
         t, signals = checked(t, signals, closes, count)
         samples, visits, evidence = t.shape[0], self._nowhere, None
-        told = np.empty((samples, count, self._tells))
+        values = np.empty((samples, count, self._columns))
         if visits and closes is not None:
             evidence = np.full((samples, count, BINS), np.nan)
-            visits = np.ascontiguousarray(closes, np.bool_), evidence
+            visits = ((np.ascontiguousarray(closes, np.bool_), evidence),)
         if threads == 1:
-            self._entered(self._filters, self._desks, t, signals, told, *visits, 0, 0, count)
+            self._entered(self._filters, self._contexts, t, signals, values, *visits, (0, 0, count))
             if self._entered is self._kernel:
                 self._entered = entry_point(self._kernel)  # `checked` sees to it that all arguments are of one kind
-            return Estimates(told, evidence)
-        if threads > len(self._desks):
-            self._desks = np.repeat(self._desks[:1], threads)
-        whole = (self._filters, self._desks, t, signals, told, *visits)
-        in_shares(lambda share, first, last: self._kernel(*whole, share, first, last), count, threads)
-        return Estimates(told, evidence)
+            return Estimates(values, evidence)
+        if threads > len(self._contexts):
+            self._contexts = np.repeat(self._contexts[:1], threads)
+        whole = (self._filters, self._contexts, t, signals, values, *visits)
+        in_shares(lambda share, first, last: self._kernel(*whole, (share, first, last)), count, threads)
+        return Estimates(values, evidence)

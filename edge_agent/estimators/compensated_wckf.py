@@ -7,7 +7,7 @@ WCKF-A: 19 states [v_x, v_y, r, tau x 4, omega x 4, F_x x 4, F_x' x 4], measurem
 (32), see `drive_wheel`. Forces: Magic Formula (12), compensated by (33). WCKF-B: [v_x, v_y, r], measurement
 [r, a_x, a_y] (35), (36). Both with R from a weighted moving window (25), see `adaptation.windows`.
 
-Friction is no state: it is set by hand, here to DRY, and the prior is told of it.
+Friction is no state: it is set by hand, here to DRY, and the prior is reported.
 
 Departures, after the errata: 1/m on the whole bracket (4), (5); loads and half tracks (13), (14), (16) as in
 `dynamics`; weights 1/(2n) and points scaled once (20); deviations from the mean (23), (27); bounded diagonal R (24),
@@ -27,33 +27,24 @@ import numpy as np
 
 from edge_agent.adaptation.windows import push, weighted_noise
 from edge_agent.dynamics.body import accelerations
-from edge_agent.dynamics.chassis import turned, tyre_forces
-from edge_agent.dynamics.drive_wheel import blended, drive_wheel, slip_share
+from edge_agent.dynamics.chassis import tyre_forces, wheel_inputs
+from edge_agent.dynamics.drive_wheel import WheelState, blended, drive_wheel, slip_share
 from edge_agent.dynamics.parameters import P
 from edge_agent.dynamics.slip import wheel_velocity
-from edge_agent.estimators import flags
 from edge_agent.estimators.adaptive_federated_ckf import DRY
 from edge_agent.estimators.bank import EstimatorBank
+from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD, diverged
+from edge_agent.estimators.common.output import write_prior, write_states
 from edge_agent.estimators.common.readings import rolling_speed
-from edge_agent.estimators.estimates import Y
-from edge_agent.estimators.gaussian.intake import BEGUN, STEPPED, Track, new_filters, take
-from edge_agent.estimators.gaussian.telling import (
-    FIRST_V_STD,
-    UNKNOWN_V_STD,
-    lost,
-    sliding,
-    tell_motion,
-    tell_nothing,
-    tell_prior,
-    tell_rest,
-)
+from edge_agent.estimators.common.run import PaperMemory, kernel_of, new_filters
+from edge_agent.estimators.estimates import Column
 from edge_agent.filters.cholesky import variance
 from edge_agent.filters.householder import predict, update
 from edge_agent.filters.points import deviations, sigma_points, weighted_mean
 from edge_agent.filters.sigma import cubature
 from schemas.numeric import FloatArray
-from schemas.runtime.jit import compiled, nogil
-from schemas.runtime.records import Records, records
+from schemas.runtime.jit import compiled
+from schemas.runtime.records import records
 from schemas.signals import S
 from schemas.vehicle import Vehicle
 
@@ -70,7 +61,7 @@ B_PROCESS = np.array([0.1, 0.1, 0.1])
 B_NOISE = np.array([1e-4, 0.04, 0.04])  # variances of r, a_x, a_y, with some model error
 
 
-class X(IntEnum):
+class DriveWheelState(IntEnum):
     """Index of a state of both filters; of a wheel quantity of A, its first wheel."""
 
     VX = 0
@@ -82,77 +73,37 @@ class X(IntEnum):
     SLOPE = 15
 
 
-class Memory:
+class CompensatedMemory(PaperMemory):
     """One pair of filters."""
 
-    row: Annotated[FloatArray, len(P)]  # parameters of the vehicle
-    track: Track
     mean: Annotated[FloatArray, A_STATES]
     root: Annotated[FloatArray, A_STATES, A_STATES]
     window: Annotated[FloatArray, A_ROWS, WINDOW]  # innovations
     fused: Annotated[FloatArray, B_STATES]
     fused_root: Annotated[FloatArray, B_STATES, B_STATES]
     fused_window: Annotated[FloatArray, B_STATES, WINDOW]
-    nis: float
-    log_likelihood: float
-    largest: float  # factor on R
 
 
-class Design:
-    """What is set by hand."""
+class FrictionSet:
+    """What is set by hand, and arrays that a step writes before it reads them."""
 
     friction: Annotated[FloatArray, 4]
+    points: Annotated[FloatArray, 2 * A_STATES, A_STATES]
+    work: Annotated[FloatArray, A_ROWS + A_STATES, 4 * A_STATES]
 
 
 def bank(vehicles: Sequence[Vehicle], friction: float = DRY) -> EstimatorBank:
     """N of these filters on a road whose friction is set."""
-    design = records(Design, 1)
-    design["friction"] = friction
-    return EstimatorBank(new_filters(Memory, vehicles), design, _advance)
-
-
-@nogil
-def _advance(
-    filters: Records[Memory], desks: Records[Design], t: FloatArray, signals: FloatArray, tolds: FloatArray,
-    share: int, first: int, last: int,
-) -> None:  # fmt: skip
-    design = desks[share]
-    points, work = np.empty((2 * A_STATES, A_STATES)), np.empty((A_ROWS + A_STATES, 4 * A_STATES))
-    force_y = np.empty(4)
-    for n in range(first, last):
-        memory = filters[n]
-        track, row = memory.track, memory.row
-        for k in range(t.shape[0]):
-            told = tolds[k, n]
-            health, kind, gone = take(track, row, t[k, n], signals[k, n])
-            memory.log_likelihood = 0.0
-            if kind == STEPPED:
-                _preliminary(memory, design, gone, force_y, points, work)
-                _fuse(memory, design, gone, work)
-                if lost(memory.fused, memory.fused_root, X.VX, X.VY, X.YAW_RATE) or lost(
-                    memory.mean, memory.root, X.VX, X.VY, X.YAW_RATE
-                ):
-                    health, kind = health | flags.RESET, BEGUN
-            if kind == BEGUN:
-                _begin(memory, signals[k, n])
-            if track.started:
-                x, root = memory.fused, memory.fused_root
-                tell_motion(
-                    told, x[X.VX], x[X.VY], x[X.YAW_RATE],
-                    variance(root, X.VX), variance(root, X.VY), variance(root, X.YAW_RATE),
-                )  # fmt: skip
-                tell_prior(told)
-                tell_rest(told, track.used, memory.nis, memory.largest, memory.log_likelihood)
-                health |= sliding(row, track, x[X.VX], x[X.VY], design.friction[0])
-            else:
-                tell_nothing(told)
-            told[Y.HEALTH] = health
+    context = records(FrictionSet, 1)
+    context["friction"] = friction
+    return EstimatorBank(new_filters(CompensatedMemory, vehicles), context, KERNEL)
 
 
 @compiled
-def _begin(memory: Memory, sample: FloatArray) -> None:
-    row, mean, root, use = memory.row, memory.mean, memory.root, memory.track.use
-    speed = rolling_speed(row, sample)
+def _begin(memory: CompensatedMemory, context: FrictionSet) -> None:  # noqa: ARG001 the context is the step's
+    row, mean, root, use = memory.row, memory.mean, memory.root, memory.track.inputs
+    X = DriveWheelState
+    speed = rolling_speed(row, memory.track.now)
     known = not math.isnan(speed)
     mean[:] = 0.0
     root[:, :] = 0.0
@@ -168,7 +119,14 @@ def _begin(memory: Memory, sample: FloatArray) -> None:
     root[X.YAW_RATE, X.YAW_RATE] = 0.1
     memory.fused[:], memory.fused_root[:] = mean[:B_STATES], root[:B_STATES, :B_STATES]
     memory.window[:], memory.fused_window[:] = math.nan, math.nan
-    memory.nis, memory.log_likelihood, memory.largest = 0.0, 0.0, 1.0
+
+
+@compiled
+def _step(memory: CompensatedMemory, context: FrictionSet, dt: float) -> bool:
+    _preliminary(memory, context, dt)
+    _fuse(memory, context, dt)
+    rate = DriveWheelState.YAW_RATE
+    return not (diverged(memory.fused, memory.fused_root, rate) or diverged(memory.mean, memory.root, rate))
 
 
 @compiled
@@ -177,9 +135,10 @@ def _forces(
     force_y: FloatArray,
 ) -> None:  # fmt: skip
     """Compensated forces (4,) [N] in the motion x (3,), from the tyre model and the forces `observed` by A."""
+    X = DriveWheelState
     motion = np.array([x[X.VX], x[X.VY], x[X.YAW_RATE], use[S.AX], use[S.AY]])
     delta, omega, share = use[S.DELTA : S.DELTA + 4], use[S.OMEGA : S.OMEGA + 4], np.empty(4)
-    tyre_forces(row, motion, turned(delta), omega, mu, SHAPE, force_x, force_y)
+    tyre_forces(row, motion, wheel_inputs(delta, omega), mu, SHAPE, force_x, force_y)
     for wheel in range(4):
         along, _ = wheel_velocity(row, wheel, x[X.VX], x[X.VY], x[X.YAW_RATE], delta[wheel])
         # a wheel whose speed is missing has no slip to judge by: its force is the observed one
@@ -188,29 +147,26 @@ def _forces(
 
 
 @compiled
-def _preliminary(
-    memory: Memory, design: Design, gone: float, force_y: FloatArray, points: FloatArray, work: FloatArray
-) -> None:
+def _preliminary(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
     """WCKF-A: lateral forces come from the tyre model in B's last motion."""
-    row, mean, root = memory.row, memory.mean, memory.root
-    use, now = memory.track.before, memory.track.now
-    force_x, noise = np.empty(4), np.zeros((A_STATES, A_STATES))
-    _forces(row, memory.fused, use, design.friction, mean[X.FORCE : X.FORCE + 4], force_x, force_y)
+    row, mean, root, points, work = memory.row, memory.mean, memory.root, context.points, context.work
+    use, now, X = memory.track.inputs_before, memory.track.now, DriveWheelState
+    force_x, force_y, noise = np.empty(4), np.empty(4), np.zeros((A_STATES, A_STATES))
+    _forces(row, memory.fused, use, context.friction, mean[X.FORCE : X.FORCE + 4], force_x, force_y)
     delta = use[S.DELTA : S.DELTA + 4]
     sigma_points(mean, root, A_XI, points)
     for p in range(points.shape[0]):
         x = points[p]
         _, _, turn = accelerations(row, x[X.FORCE : X.FORCE + 4], force_y, delta)
         vx, vy, rate = x[X.VX], x[X.VY], x[X.YAW_RATE]
-        x[X.VX], x[X.VY] = vx + gone * (use[S.AX] + rate * vy), vy + gone * (use[S.AY] - rate * vx)
-        x[X.YAW_RATE] = rate + gone * turn
+        x[X.VX], x[X.VY] = vx + dt * (use[S.AX] + rate * vy), vy + dt * (use[S.AY] - rate * vx)
+        x[X.YAW_RATE] = rate + dt * turn
         for w in range(4):
-            x[X.TORQUE + w], x[X.OMEGA + w], x[X.FORCE + w], x[X.SLOPE + w] = drive_wheel(
-                x[X.TORQUE + w], x[X.OMEGA + w], x[X.FORCE + w], x[X.SLOPE + w], use[S.TORQUE + w],
-                row[P.WHEEL_INERTIA], row[P.RADIUS], gone,
-            )  # fmt: skip
+            state = WheelState(x[X.TORQUE + w], x[X.OMEGA + w], x[X.FORCE + w], x[X.SLOPE + w])
+            state = drive_wheel(state, use[S.TORQUE + w], row[P.WHEEL_INERTIA], row[P.RADIUS], dt)
+            x[X.TORQUE + w], x[X.OMEGA + w], x[X.FORCE + w], x[X.SLOPE + w] = state
     for i in range(A_STATES):
-        noise[i, i] = A_PROCESS[i] * math.sqrt(gone)
+        noise[i, i] = A_PROCESS[i] * math.sqrt(dt)
     predict(points, A_WEIGHT, A_WEIGHT, noise, mean, root, work)
     innovation, std, rows = np.empty(A_ROWS), np.empty(A_ROWS), np.empty((A_ROWS, A_STATES))
     for r in range(A_ROWS):
@@ -225,10 +181,10 @@ def _preliminary(
 
 
 @compiled
-def _fuse(memory: Memory, design: Design, gone: float, work: FloatArray) -> None:
+def _fuse(memory: CompensatedMemory, context: FrictionSet, dt: float) -> None:
     """WCKF-B: motion by the compensated forces."""
     row, track, mean, root = memory.row, memory.track, memory.fused, memory.fused_root
-    use, now = track.use, track.now
+    use, now, X = track.inputs, track.now, DriveWheelState
     observed, count = memory.mean[X.FORCE : X.FORCE + 4], 2 * B_STATES
     points, outcomes, predicted = np.empty((count, B_STATES)), np.empty((count, B_STATES)), np.empty(B_STATES)
     state, measured = np.empty((B_STATES, count)), np.empty((B_STATES, count))
@@ -239,18 +195,18 @@ def _fuse(memory: Memory, design: Design, gone: float, work: FloatArray) -> None
         sigma_points(mean, root, B_XI, points)
         for p in range(count):
             x = points[p]
-            _forces(row, x, track.before if act == 0 else use, design.friction, observed, force_x, force_y)
+            _forces(row, x, track.inputs_before if act == 0 else use, context.friction, observed, force_x, force_y)
             ax, ay, turn = accelerations(row, force_x, force_y, delta)
             if act == 0:
                 vx, vy, rate = x[X.VX], x[X.VY], x[X.YAW_RATE]
-                x[X.VX], x[X.VY] = vx + gone * (ax + rate * vy), vy + gone * (ay - rate * vx)
-                x[X.YAW_RATE] = rate + gone * turn
+                x[X.VX], x[X.VY] = vx + dt * (ax + rate * vy), vy + dt * (ay - rate * vx)
+                x[X.YAW_RATE] = rate + dt * turn
             else:
                 outcomes[p, 0], outcomes[p, 1], outcomes[p, 2] = x[X.YAW_RATE], ax, ay
         if act == 0:
             for i in range(B_STATES):
-                noise[i, i] = B_PROCESS[i] * math.sqrt(gone)
-            predict(points, B_WEIGHT, B_WEIGHT, noise, mean, root, work)
+                noise[i, i] = B_PROCESS[i] * math.sqrt(dt)
+            predict(points, B_WEIGHT, B_WEIGHT, noise, mean, root, context.work)
     weighted_mean(outcomes, B_WEIGHT, predicted)
     deviations(points, mean, B_WEIGHT, state, 0)
     deviations(outcomes, predicted, B_WEIGHT, measured, 0)
@@ -265,5 +221,15 @@ def _fuse(memory: Memory, design: Design, gone: float, work: FloatArray) -> None
         adapted = weighted_noise(memory.fused_window[r], spread, B_NOISE[r], LEAST, LARGEST)
         std[r] = math.sqrt(adapted)
         largest = max(largest, adapted / B_NOISE[r])
-    used, log_likelihood, square = update(mean, root, state, measured, innovation, std, work)
-    memory.nis, memory.log_likelihood, memory.largest = square / max(used, 1), log_likelihood, largest
+    used, log_likelihood, square = update(mean, root, state, measured, innovation, std, context.work)
+    memory.nis, memory.log_likelihood, memory.adaptation = square / max(used, 1), log_likelihood, largest
+
+
+@compiled
+def _report(memory: CompensatedMemory, context: FrictionSet, output: FloatArray) -> float:
+    write_states(output, memory.fused, memory.fused_root, DriveWheelState.YAW_RATE)
+    write_prior(output, Column.MU)
+    return float(context.friction[0])
+
+
+KERNEL = kernel_of(_begin, _step, _report)

@@ -1,4 +1,4 @@
-"""What a bank says: numbers per sample and vehicle, written by the kernels, and its columns by name."""
+"""What a bank reports: numbers per sample and vehicle, written by the kernels, and its columns by name."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from schemas.numeric import FloatArray
 FlagArray: TypeAlias = NDArray[np.int64]
 
 
-class Y(IntEnum):
-    """Index of a number told; none of them is NaN."""
+class Column(IntEnum):
+    """Index of a number that a bank reports of a sample; none of them is NaN."""
 
     VX = 0  # [m/s]
     VY = 1  # [m/s]
@@ -35,57 +35,57 @@ class Y(IntEnum):
     WHEELS = 16  # median, lower, upper of each wheel, where the estimator has them
 
 
-COLUMNS = tuple(y.name.lower() for y in Y if y < Y.WHEELS)
-ONE_FRICTION, FOUR_FRICTIONS = int(Y.WHEELS), int(Y.WHEELS) + 12  # how many numbers an estimator tells
+COLUMNS = tuple(column.name.lower() for column in Column if column < Column.WHEELS)
+ONE_FRICTION, FOUR_FRICTIONS = int(Column.WHEELS), int(Column.WHEELS) + 12  # how many numbers an estimator reports
 
 
-class _Column:
+class _View:
     """A number of all samples, as a view: made when asked for, since a live loop reads few."""
 
-    def __init__(self, place: Y) -> None:
+    def __init__(self, place: Column) -> None:
         self._place = int(place)
 
-    def __get__(self, said: Estimates, owner: type) -> FloatArray:
-        return said.told[..., self._place]
+    def __get__(self, estimates: Estimates, owner: type) -> FloatArray:
+        return estimates.values[..., self._place]
 
 
-def _column(place: Y) -> Any:  # noqa: ANN401 the annotation beside it says the type
-    return _Column(place)
+def _column(place: Column) -> Any:  # noqa: ANN401 the annotation beside it says the type
+    return _View(place)
 
 
 class Estimates:
-    """What a bank says of T samples of N vehicles; columns are arrays of shape (T, N), documented in `Y`."""
+    """What a bank reports of T samples of N vehicles; columns are arrays of shape (T, N), documented in `Column`."""
 
-    __slots__ = ("evidence", "told")
+    __slots__ = ("evidence", "values")
 
-    vx: FloatArray = _column(Y.VX)
-    vy: FloatArray = _column(Y.VY)
-    yaw_rate: FloatArray = _column(Y.YAW_RATE)
-    sideslip: FloatArray = _column(Y.SIDESLIP)
-    vx_std: FloatArray = _column(Y.VX_STD)
-    vy_std: FloatArray = _column(Y.VY_STD)
-    yaw_rate_std: FloatArray = _column(Y.YAW_RATE_STD)
-    sideslip_std: FloatArray = _column(Y.SIDESLIP_STD)
-    mu: FloatArray = _column(Y.MU)
-    mu_lower: FloatArray = _column(Y.MU_LOWER)
-    mu_upper: FloatArray = _column(Y.MU_UPPER)
-    mu_utilised: FloatArray = _column(Y.MU_UTILISED)
-    innovation_nis: FloatArray = _column(Y.INNOVATION_NIS)
-    adaptation: FloatArray = _column(Y.ADAPTATION)
-    innovation_log_likelihood: FloatArray = _column(Y.INNOVATION_LOG_LIKELIHOOD)
+    vx: FloatArray = _column(Column.VX)
+    vy: FloatArray = _column(Column.VY)
+    yaw_rate: FloatArray = _column(Column.YAW_RATE)
+    sideslip: FloatArray = _column(Column.SIDESLIP)
+    vx_std: FloatArray = _column(Column.VX_STD)
+    vy_std: FloatArray = _column(Column.VY_STD)
+    yaw_rate_std: FloatArray = _column(Column.YAW_RATE_STD)
+    sideslip_std: FloatArray = _column(Column.SIDESLIP_STD)
+    mu: FloatArray = _column(Column.MU)
+    mu_lower: FloatArray = _column(Column.MU_LOWER)
+    mu_upper: FloatArray = _column(Column.MU_UPPER)
+    mu_utilised: FloatArray = _column(Column.MU_UTILISED)
+    innovation_nis: FloatArray = _column(Column.INNOVATION_NIS)
+    adaptation: FloatArray = _column(Column.ADAPTATION)
+    innovation_log_likelihood: FloatArray = _column(Column.INNOVATION_LOG_LIKELIHOOD)
 
-    def __init__(self, told: FloatArray, evidence: FloatArray | None = None) -> None:
-        self.told = told  # (T, N, ONE_FRICTION or FOUR_FRICTIONS) indexed by Y
+    def __init__(self, values: FloatArray, evidence: FloatArray | None = None) -> None:
+        self.values = values  # (T, N, ONE_FRICTION or FOUR_FRICTIONS) indexed by Column
         self.evidence = evidence  # (T, N, 32) at closes, else NaN: log-likelihood of the visit on the friction grid
 
     @property
     def health(self) -> FlagArray:
         """(T, N) of schemas.signals.Health."""
-        return self.told[..., Y.HEALTH].astype(np.int64)
+        return self.values[..., Column.HEALTH].astype(np.int64)
 
     @property
     def mu_wheel(self) -> FloatArray | None:
         """(T, N, 4, 3) median, lower, upper per wheel; None where the estimator has one friction."""
-        if self.told.shape[-1] == ONE_FRICTION:
+        if self.values.shape[-1] == ONE_FRICTION:
             return None
-        return self.told[..., Y.WHEELS :].reshape(*self.told.shape[:-1], 4, 3)
+        return self.values[..., Column.WHEELS :].reshape(*self.values.shape[:-1], 4, 3)

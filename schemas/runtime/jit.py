@@ -102,7 +102,16 @@ def _compile(
 
 
 class _Cache(FunctionCache):
-    """Numba's own, but for a full disk: it raises there, and would take the process with it."""
+    """Numba's own, but for a full disk, where it raises and would take the process with it, and for closures."""
+
+    def _index_key(self, sig: object, codegen: Any) -> object:  # noqa: ANN401 numba's own types
+        """A closure is known by the names of what it closes over: numba pickles it, differently in each process."""
+        cells = self._py_func.__closure__
+        if cells is None:
+            return super()._index_key(sig, codegen)  # type: ignore[no-untyped-call]
+        held = (cell.cell_contents for cell in cells)
+        names = tuple(f"{getattr(one, '__module__', '')}.{getattr(one, '__qualname__', one)}" for one in held)
+        return sig, codegen.magic_tuple(), (self._py_func.__code__.co_code, names)
 
     def save_overload(self, sig: object, data: object) -> None:
         """Save, if the disk lets us."""

@@ -2,7 +2,8 @@
 
    State x = [v_x, v_y, a_x, a_y, r, mu], four Dugoff tyres, twelve cubature points carried by Heun's rule, covariance
    summed and factorized, Carlson's triangular update, R adapted by five fuzzy sets. One vehicle is one struct.
-   Equations and legend: edge_agent/estimators/paper_aco_fckf.py, gaussian/planar.py, dynamics, filters/columns.py. */
+   Equations and legend: edge_agent/estimators/paper_aco_fckf.py, gaussian/planar.py, dynamics,
+   filters/columns.py, filters/sequential.py. */
 
 #include <math.h>
 

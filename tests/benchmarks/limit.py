@@ -1,8 +1,9 @@
-"""The limit for an estimator: kernel.c, compiled when the benchmark runs, driven over the same samples."""
+"""The limits for an estimator, compiled when the benchmark runs: kernel.c for one, kernel_simd.c for a bank of them."""
 
 from __future__ import annotations
 
 import ctypes
+import math
 import subprocess
 import tempfile
 from functools import cache
@@ -11,62 +12,111 @@ from pathlib import Path
 import numpy as np
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.estimators.gaussian.telling import PRIOR_MU_STD
+from edge_agent.estimators.common.output import PRIOR_MU_STD
 from edge_agent.estimators.paper_aco_fckf import LARGEST_FACTOR, LEAST_FACTOR, STEP_S, WINDOW_S, Setting
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
 
-SOURCE = Path(__file__).with_name("kernel.c")
+FOLDER = Path(__file__).parent
 STATES, ROWS, WHEELS = 6, 3, 4
 FACTOR = STATES + STATES * STATES + ROWS * 2  # place of `factor` in the struct's doubles
+# what lets gcc take roots and select in vectors; none of them changes a result
+VECTORS = ("-fno-math-errno", "-fno-trapping-math", "-fopenmp-simd", "-lmvec")
 
 
 @cache
-def library() -> ctypes.CDLL:
-    """The kernel, by gcc -O3 -march=native -fopenmp.
+def library(source: str, *options: str) -> ctypes.CDLL:
+    """A kernel, by gcc -O3 -march=native and `options`.
 
     Raises:
         OSError, subprocess.CalledProcessError: there is no gcc, or it refuses.
     """
     target = Path(tempfile.mkdtemp()) / "kernel.so"
-    words = ["gcc", "-O3", "-march=native", "-fopenmp", "-shared", "-fPIC", str(SOURCE), "-o", str(target), "-lm"]
-    subprocess.run(words, check=True)
+    words = ["gcc", "-O3", "-march=native", "-shared", "-fPIC", str(FOLDER / source), "-o", str(target)]
+    subprocess.run([*words, *options, "-lm"], check=True)
     return ctypes.CDLL(str(target))
 
 
+def setting_row(memberships: Memberships) -> FloatArray:
+    """The kernels' Setting."""
+    setting = Setting()
+    return np.array(
+        [*np.sqrt(setting.process), *setting.noise, *memberships.inputs, *memberships.outputs,
+         LEAST_FACTOR, LARGEST_FACTOR, STEP_S, WINDOW_S, LOWER, UPPER, PRIOR_MU_STD]
+    )  # fmt: skip
+
+
+def first_memory(first: FloatArray, speed: float) -> FloatArray:
+    """Filters (N, doubles) at their first readings (N, 11) and speed [m/s], as both kernels' structs hold them."""
+    setting, (count, inputs) = Setting(), first.shape
+    turned = FACTOR + ROWS + inputs
+    memory = np.zeros((count, turned + 2 * WHEELS))
+    memory[:, 0], memory[:, 2:5], memory[:, 5] = speed, first[:, :3], setting.mu
+    for i in range(STATES):
+        memory[:, STATES + i * STATES + i] = np.sqrt(setting.start[i])
+    memory[:, FACTOR : FACTOR + ROWS] = 1.0
+    memory[:, FACTOR + ROWS : turned] = first
+    steering = first[:, ROWS : ROWS + WHEELS]
+    memory[:, turned:] = np.concatenate([np.cos(steering), np.sin(steering)], axis=1)
+    return memory
+
+
+def pointer(array: FloatArray) -> ctypes.c_void_p:
+    """Where an array lies."""
+    return ctypes.c_void_p(array.ctypes.data)
+
+
 class Limit:
-    """N filters in C, at rest in `memory`, an array of their structs."""
+    """N filters in C, one struct each, on as many threads as OpenMP has."""
 
-    def __init__(self, parameters: FloatArray, first: FloatArray, memberships: Memberships) -> None:
-        """parameters (N, 12); first (N, 11): ax, ay, yaw rate, delta, omega of the first sample."""
-        self._library, self._parameters = library(), np.ascontiguousarray(parameters)
-        setting = Setting()
-        self._setting = np.array(
-            [*np.sqrt(setting.process), *setting.noise, *memberships.inputs, *memberships.outputs,
-             LEAST_FACTOR, LARGEST_FACTOR, STEP_S, WINDOW_S, LOWER, UPPER, PRIOR_MU_STD]
-        )  # fmt: skip
-        doubles = self._library.filter_bytes() // 8
-        self.memory = np.zeros((len(parameters), doubles))
-        self.memory[:, 2:5], self.memory[:, 5] = first[:, :3], setting.mu
-        for i in range(STATES):
-            self.memory[:, STATES + i * STATES + i] = np.sqrt(setting.start[i])
-        self.memory[:, FACTOR : FACTOR + ROWS] = 1.0
-        turned = FACTOR + ROWS + first.shape[1]
-        self.memory[:, FACTOR + ROWS : turned] = first
-        steering = first[:, ROWS : ROWS + WHEELS]
-        self.memory[:, turned:] = np.concatenate([np.cos(steering), np.sin(steering)], axis=1)
-
-    def begin(self, speed: FloatArray) -> None:
-        """The first speed (N,) [m/s]."""
-        self.memory[:, 0] = speed
+    def __init__(self, parameters: FloatArray, first: FloatArray, speed: float, memberships: Memberships) -> None:
+        """parameters (N, 12); first (N, 11): ax, ay, yaw rate, delta, omega of the first sample; speed [m/s]."""
+        self._library, self._parameters = library("kernel.c", "-fopenmp"), np.ascontiguousarray(parameters)
+        self._setting, self._memory = setting_row(memberships), first_memory(first, speed)
 
     def drive(self, readings: FloatArray, gone: float) -> FloatArray:
         """Means (T, N, 6) after each of the readings (T, N, 11), `gone` [s] apart."""
         samples, vehicles, _ = readings.shape
         out = np.empty((samples, vehicles, STATES))
-        pointer = ctypes.c_void_p
         self._library.drive(
-            pointer(self.memory.ctypes.data), pointer(self._parameters.ctypes.data), pointer(self._setting.ctypes.data),
-            pointer(readings.ctypes.data), ctypes.c_double(gone), samples, vehicles, pointer(out.ctypes.data),
+            pointer(self._memory), pointer(self._parameters), pointer(self._setting), pointer(readings),
+            ctypes.c_double(gone), samples, vehicles, pointer(out),
         )  # fmt: skip
         return out
+
+
+class VectorLimit:
+    """N filters in C, side by side in vectors, on one thread; N is a multiple of the lanes."""
+
+    def __init__(self, parameters: FloatArray, first: FloatArray, speed: float, memberships: Memberships) -> None:
+        """Arguments as of `Limit`."""
+        self._library = library("kernel_simd.c", *VECTORS)
+        self._lanes = int(self._library.lanes())
+        self._setting = setting_row(memberships)
+        self._parameters, self._memory = self.side_by_side(parameters), self.side_by_side(first_memory(first, speed))
+
+    def side_by_side(self, values: FloatArray) -> FloatArray:
+        """(..., N, numbers) as (..., N/lanes, numbers, lanes), aligned to a vector."""
+        *rest, vehicles, numbers = values.shape
+        turned = values.reshape(*rest, vehicles // self._lanes, self._lanes, numbers).swapaxes(-1, -2)
+        out = aligned(*turned.shape)
+        out[...] = turned
+        return out
+
+    def drive(self, readings: FloatArray, gone: float) -> FloatArray:
+        """Means (T, N/lanes, 6, lanes) after each of the readings `side_by_side`, `gone` [s] apart."""
+        samples, blocks, _, lanes = readings.shape
+        out = aligned(samples, blocks, STATES, lanes)
+        self._library.drive(
+            pointer(self._memory), pointer(self._parameters), pointer(self._setting), pointer(readings),
+            ctypes.c_double(gone), samples, blocks, pointer(out),
+        )  # fmt: skip
+        return out
+
+
+def aligned(*shape: int, to: int = 64) -> FloatArray:
+    """An empty array whose memory begins at a multiple of `to` bytes."""
+    count = math.prod(shape)
+    raw = np.empty(8 * count + to, np.uint8)
+    begin = -raw.ctypes.data % to
+    return raw[begin : begin + 8 * count].view(np.float64).reshape(shape)

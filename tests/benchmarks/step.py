@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 import time
 from importlib.util import find_spec
+from typing import TypeVar
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from edge_agent.lab.simulation import simulate_manoeuvre
 from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
 from schemas.signals import CHANNELS, S
-from tests.benchmarks.limit import Limit
+from tests.benchmarks.limit import Limit, VectorLimit
 from tests.benchmarks.measure import SEED, median_s, paired
 from tests.benchmarks.peers import PEERS, PYTHON_STEPS, Problem
 
@@ -47,13 +48,13 @@ class Drive:
         return t, np.repeat(self.signals[index, None], vehicles, 1), np.repeat(self.readings[index, None], vehicles, 1)
 
 
-def limit(drive: Drive, vehicles: int, speed: float) -> Limit:
-    """The C filters at the first sample."""
-    made = Limit(
-        parameter_table([drive.vehicle] * vehicles), np.repeat(drive.readings[:1], vehicles, 0), shipped(TUNED[NAME])
-    )
-    made.begin(np.full(vehicles, speed))
-    return made
+Kind = TypeVar("Kind", Limit, VectorLimit)
+
+
+def limit(kind: type[Kind], drive: Drive, vehicles: int, speed: float) -> Kind:
+    """C filters at the first sample."""
+    rows = parameter_table([drive.vehicle] * vehicles)
+    return kind(rows, np.repeat(drive.readings[:1], vehicles, 0), speed, shipped(TUNED[NAME]))
 
 
 def same_filter(drive: Drive) -> float:
@@ -65,7 +66,7 @@ def same_filter(drive: Drive) -> float:
     t, signals, readings = drive.repeated(len(drive.t), 1)
     said: Estimates = bank_of(NAME, [drive.vehicle]).advance(t, signals)
     speed = float(said.vx[0, 0])
-    means = limit(drive, 1, speed).drive(readings[1:], drive.gone)[:, 0]
+    means = limit(Limit, drive, 1, speed).drive(readings[1:], drive.gone)[:, 0]
     ours = np.stack([said.vx, said.vy, said.yaw_rate], axis=-1)[1:, 0]
     apart = float(np.abs(ours - means[:, [0, 1, 4]]).max())
     if not apart < AGREE:
@@ -80,11 +81,15 @@ def step() -> list[Figure]:
     t, signals, readings = drive.repeated(SAMPLES, 1)
     ours, scalar = paired(
         lambda: bank_of(NAME, [drive.vehicle]).advance(t, signals),
-        lambda: limit(drive, 1, speed).drive(readings, drive.gone),
+        lambda: limit(Limit, drive, 1, speed).drive(readings, drive.gone),
     )
     per_call, per_step = call_s(bank_of(NAME, [drive.vehicle]), t, signals), ours / SAMPLES
     found = [
-        Figure("bench.step.us", per_step * 1e6, "us, N = 1, 100 000 samples in a call"),
+        Figure(
+            "bench.step.us",
+            per_step * 1e6,
+            "us, paper-aco-fckf (the default: bench.aco_fckf.us), N = 1, 100 000 samples in a call",
+        ),
         Figure("bench.step.vs_c", ours / scalar, "times scalar C", 1.5),
         Figure("bench.step.call_overhead_us", (per_call - per_step) * 1e6, "us", 2),
     ]
@@ -120,9 +125,45 @@ def bank() -> list[Figure]:
         fleet = [drive.vehicle] * vehicles
         ours, threaded = paired(
             lambda: bank_of(NAME, fleet).advance(t, signals, threads=THREADS),  # noqa: B023 called at once
-            lambda: limit(drive, vehicles, speed).drive(readings, drive.gone),  # noqa: B023
+            lambda: limit(Limit, drive, vehicles, speed).drive(readings, drive.gone),  # noqa: B023
         )
         cost[vehicles] = ours / (vehicles * samples)
         if vehicles > 100:
             found.append(Figure(f"bench.bank.vs_c_openmp.{vehicles}", ours / threaded, "times C on two threads", 1.5))
+    found.append(
+        Figure(
+            "bench.bank.vs_simd_c",
+            vs_simd(drive, speed),
+            "times C in vectors, paper-aco-fckf, N = 1 000, one thread",
+            3,
+        )
+    )
     return [*found, Figure("bench.bank.flatness", cost[100_000] / cost[100], "N = 100 000 over N = 100", 1.2)]
+
+
+def vs_simd(drive: Drive, speed: float, vehicles: int = 1000, samples: int = 200) -> float:
+    """Duration of the bank over that of C with the vehicles side by side in vectors, one thread each.
+
+    Every vehicle has noise of its own, so that no lane may stand for another.
+
+    Raises:
+        ArithmeticError: C is not the same filter.
+    """
+    t, signals, readings = drive.repeated(samples, vehicles)
+    noise = np.random.default_rng(SEED).normal(0.0, 0.01, (samples, vehicles, 3))
+    noise[0] = 0.0
+    signals[..., [S.AX, S.AY, S.YAW_RATE]] += noise
+    readings[..., :3] += noise
+    fleet = [drive.vehicle] * vehicles
+    turned = limit(VectorLimit, drive, vehicles, speed).side_by_side(readings[1:])
+    ours = bank_of(NAME, fleet).advance(t, signals)
+    means = limit(VectorLimit, drive, vehicles, speed).drive(turned, drive.gone).swapaxes(-1, -2)
+    found = np.stack([ours.vx, ours.vy, ours.yaw_rate], axis=-1)[1:]
+    apart = float(np.abs(found - means.reshape(samples - 1, vehicles, -1)[..., [0, 1, 4]]).max())
+    if not apart < AGREE:
+        raise ArithmeticError(f"C in vectors and {NAME} are {apart:g} apart: not the same filter")
+    bank, vectors = paired(
+        lambda: bank_of(NAME, fleet).advance(t, signals),
+        lambda: limit(VectorLimit, drive, vehicles, speed).drive(turned, drive.gone),
+    )
+    return bank / vectors * (samples - 1) / samples

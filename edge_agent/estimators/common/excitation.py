@@ -7,10 +7,10 @@ from typing import Annotated
 
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
+from schemas.thresholds import UTILISED_WINDOW_S
 
 SLOTS = 64
 SLOT_S = 0.02  # a slot is at least so long, so that the ring holds the last second at any rate of samples
-EXCITED_S = 1.0  # memory of the grip used, by contract
 
 
 class Excitation:
@@ -42,7 +42,7 @@ def note_excitation(ring: Excitation, time: float, used: float) -> None:
         ring.used[place] = max(ring.used[place], used)
     if ring.used[place] >= ring.largest:
         ring.largest, ring.largest_time = ring.used[place], ring.time[place]
-    elif not ring.largest_time > time - EXCITED_S:
+    elif not ring.largest_time > time - UTILISED_WINDOW_S:
         _search(ring, time)
 
 
@@ -51,5 +51,5 @@ def _search(ring: Excitation, time: float) -> None:
     """Renew `largest` from all slots: the one it came from has grown old."""
     ring.largest = 0.0
     for k in range(SLOTS):
-        if ring.time[k] > time - EXCITED_S and ring.used[k] >= ring.largest:
+        if ring.time[k] > time - UTILISED_WINDOW_S and ring.used[k] >= ring.largest:
             ring.largest, ring.largest_time = ring.used[k], ring.time[k]

@@ -1,4 +1,4 @@
-"""Which readings of a sample are believed, and the speed that the wheels report."""
+"""Which readings of a sample are believed, and what their lack means for health."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from edge_agent.dynamics.parameters import P
+from edge_agent.estimators import flags
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
@@ -22,23 +23,45 @@ LARGEST_TORQUE = 50_000.0  # [N m]
 LIMITS = np.array(
     [LARGEST_ACCELERATION] * 2 + [LARGEST_YAW_RATE] + [LARGEST_STEER] * 4 + [LARGEST_OMEGA] * 4 + [LARGEST_TORQUE] * 4
 )
+# health flags of a channel without a reading; the rear wheels' steering is optional
+MISSING = np.array(
+    [flags.NO_INERTIAL] * 3 + [flags.NO_STEERING] * 2 + [0] * 2 + [flags.NO_WHEEL_SPEED] * 4 + [flags.NO_TORQUE] * 4
+)
 GAP_S = 0.5  # a longer silence of all channels starts a filter's motion anew
 POSITION_S = 1.5  # a longer silence of the receiver is reported
 
 
 @compiled
-def reading(sample: FloatArray, channel: int) -> float:
-    """The reading, or NaN where it is missing, infinite or unbelievable."""
-    value = sample[channel]
-    return value if abs(value) <= LIMITS[channel] else math.nan
+def believe(sample: FloatArray, now: FloatArray) -> int:
+    """now (15,) = the readings of a sample (18,), NaN where missing, infinite or unbelievable; returns health flags."""
+    odd, missing = 0, 0
+    for channel in range(INPUTS):
+        value = sample[channel]
+        there, believed = value == value, abs(value) <= LIMITS[channel]
+        now[channel] = value if believed else math.nan
+        odd |= flags.OUTLIER if there and not believed else 0
+        missing |= 0 if believed else MISSING[channel]
+    return odd | missing
 
 
 @compiled
-def rolling_speed(row: FloatArray, sample: FloatArray) -> float:
+def position_time(sample: FloatArray, time: float, last: float) -> float:
+    """Time [s] of the last position, after a sample (18,) at `time`."""
+    return time if math.isfinite(sample[S.LATITUDE]) and math.isfinite(sample[S.LONGITUDE]) else last
+
+
+@compiled
+def position_health(time: float, last: float) -> int:
+    """The health flag of a receiver that has been silent for too long."""
+    return 0 if time - last <= POSITION_S else flags.NO_POSITION
+
+
+@compiled
+def rolling_speed(row: FloatArray, now: FloatArray) -> float:
     """Second largest rolling speed [m/s] (two wheels may be locked, one may spin); NaN without any wheel."""
     first = second = math.nan
     for wheel in range(4):
-        speed = row[P.RADIUS] * reading(sample, S.OMEGA + wheel)
+        speed = row[P.RADIUS] * now[S.OMEGA + wheel]
         if math.isnan(speed):
             continue
         if math.isnan(first) or speed > first:

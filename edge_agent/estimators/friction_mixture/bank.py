@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import math
-
-from edge_agent.dynamics.slip import SLOWEST_M_S
-from edge_agent.estimators.bank import EstimatorBank
+from edge_agent.estimators.bank import EstimatorBank, Part
 from edge_agent.estimators.common.arrays import clear, put
-from edge_agent.estimators.estimates import FOUR_FRICTIONS, Y
+from edge_agent.estimators.common.output import write_motion, write_quality, write_unknown
+from edge_agent.estimators.estimates import FOUR_FRICTIONS, Column
 from edge_agent.estimators.friction_mixture.constants import NODES, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.friction_grid import quantile, visit_evidence
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles, new_filters
-from edge_agent.estimators.friction_mixture.restart import UNKNOWN_VX_STD
 from edge_agent.estimators.friction_mixture.split_sides import BOTH, project
 from edge_agent.estimators.friction_mixture.step import step, velocity
 from edge_agent.estimators.friction_mixture.workspace import MixtureContext, Scratch
@@ -28,14 +25,15 @@ def mixture_bank(rows: FloatArray, design: MixtureDesign) -> EstimatorBank:
     """Friction mixtures of vehicles with parameters `rows` (N, 12)."""
     context = records(MixtureContext, 1)
     put_record(context["design"][0], design)
-    return EstimatorBank(new_filters(rows), context, _advance, tells=FOUR_FRICTIONS, evidence=True)
+    return EstimatorBank(new_filters(rows), context, _advance, columns=FOUR_FRICTIONS, evidence=True)
 
 
 @nogil
 def _advance(
     filters: Records[MixtureMemory], contexts: Records[MixtureContext], t: FloatArray, signals: FloatArray,
-    outputs: FloatArray, closes: BoolArray, evidence: FloatArray, share: int, first: int, last: int,
+    outputs: FloatArray, visits: tuple[BoolArray, FloatArray], part: Part,
 ) -> None:  # fmt: skip
+    (closes, evidence), (share, first, last) = visits, part
     context = contexts[share]
     design, scratch = context.design, context.scratch
     for n in range(first, last):
@@ -47,7 +45,7 @@ def _advance(
             output = outputs[k, n]
             health = step(memory, design, scratch, t[k, n], signals[k, n])
             report(memory, design, output)
-            output[Y.HEALTH] = health | memory.health
+            output[Column.HEALTH] = health | memory.health
 
 
 @compiled
@@ -75,18 +73,14 @@ def report(memory: MixtureMemory, design: MixtureDesign, output: FloatArray) -> 
     vx, vy = velocity(memory)
     var_x = memory.overall_covariance[NodeState.VX, NodeState.VX] + (design.constants.radius_std * vx) ** 2
     var_y = memory.overall_covariance[NodeState.VY, NodeState.VY]
-    speed = max(abs(vx), SLOWEST_M_S)
-    output[Y.VX], output[Y.VY], output[Y.YAW_RATE], output[Y.SIDESLIP] = vx, vy, last.yaw_rate, math.atan2(vy, speed)
-    output[Y.VX_STD], output[Y.VY_STD] = math.sqrt(var_x), math.sqrt(var_y)
-    output[Y.YAW_RATE_STD] = math.sqrt(last.yaw_rate_var + YAW_RATE_OFFSET_STD**2)
-    output[Y.SIDESLIP_STD] = math.sqrt(var_y + (vy / speed) ** 2 * var_x) / speed
-    _report_quantiles(memory.friction, output, Y.MU)
+    var_rate = last.yaw_rate_var + YAW_RATE_OFFSET_STD**2
+    write_motion(output, vx, vy, last.yaw_rate, var_x, var_y, var_rate)
+    _report_quantiles(memory.friction, output, Column.MU)
     for wheel in range(4):
         side = memory.friction_left if wheel % 2 == 0 else memory.friction_right
-        _report_quantiles(side, output, Y.WHEELS + 3 * wheel)
-    output[Y.MU_UTILISED], output[Y.INNOVATION_NIS] = memory.excitation.largest, memory.nis
-    output[Y.ADAPTATION] = max(memory.factor[0], memory.factor[1])
-    output[Y.INNOVATION_LOG_LIKELIHOOD] = memory.log_likelihood
+        _report_quantiles(side, output, Column.WHEELS + 3 * wheel)
+    adaptation = max(memory.factor[0], memory.factor[1])
+    write_quality(output, memory.excitation.largest, memory.nis, adaptation, memory.log_likelihood)
 
 
 @compiled
@@ -97,13 +91,9 @@ def _report_quantiles(friction: Quantiles, output: FloatArray, first: int) -> No
 @compiled
 def report_prior(design: MixtureDesign, output: FloatArray) -> None:
     """Write what is known before the first usable sample: the prior, and no motion with a wide spread."""
-    output[Y.VX] = output[Y.VY] = output[Y.YAW_RATE] = output[Y.SIDESLIP] = 0.0
-    output[Y.VX_STD] = UNKNOWN_VX_STD
-    output[Y.VY_STD] = output[Y.YAW_RATE_STD] = output[Y.SIDESLIP_STD] = 1.0
+    write_unknown(output)
     for k, level in enumerate((0.5, 0.05, 0.95)):
         value = quantile(design.mu, design.prior, design.prior, level)
-        output[Y.MU + k] = value
+        output[Column.MU + k] = value
         for wheel in range(4):
-            output[Y.WHEELS + 3 * wheel + k] = value
-    output[Y.MU_UTILISED] = output[Y.INNOVATION_NIS] = output[Y.INNOVATION_LOG_LIKELIHOOD] = 0.0
-    output[Y.ADAPTATION] = 1.0
+            output[Column.WHEELS + 3 * wheel + k] = value

@@ -11,7 +11,7 @@ import math
 from edge_agent.dynamics.body import advance_velocity
 from edge_agent.dynamics.parameters import P
 from edge_agent.estimators import flags
-from edge_agent.estimators.common.readings import GAP_S, INPUTS, LIMITS, POSITION_S, reading
+from edge_agent.estimators.common.readings import GAP_S, INPUTS, believe, position_health, position_time
 from edge_agent.estimators.friction_mixture.constants import NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory, PlanarVector, VelocityGain
@@ -36,20 +36,23 @@ def take_sample(memory: MixtureMemory, design: MixtureDesign, time: float, sampl
     dt = time - last.time
     if not dt > 0.0:
         return flags.TIME_GAP, False
-    health = _check(memory, time, sample)
+    now = last.now
+    health = believe(sample, now) & ~flags.NO_STEERING  # which the block judges: a single angle is bridged
+    last.position_time = position_time(sample, time, last.position_time)
+    health |= position_health(time, last.position_time)
     if dt > GAP_S:
-        health |= flags.TIME_GAP | bridge(memory, design, dt, sample)
+        health |= flags.TIME_GAP | bridge(memory, design, dt)
         last.time = time
         begin_block(memory)
         return health, False
-    _filter_yaw_rate(memory, dt, sample)
-    ax = _believed(reading(sample, S.AX), last.ax, last.read_ax)
-    ay = _believed(reading(sample, S.AY), last.ay, last.read_ay)
-    last.read_ax, last.read_ay = reading(sample, S.AX), reading(sample, S.AY)
+    _filter_yaw_rate(memory, dt)
+    ax = _believed(now[S.AX], last.ax, last.read_ax)
+    ay = _believed(now[S.AY], last.ay, last.read_ay)
+    last.read_ax, last.read_ay = now[S.AX], now[S.AY]
     if math.isnan(ax + ay) and not math.isnan(last.read_ax + last.read_ay):
         health |= flags.OUTLIER
-    _move(memory, time, dt, ax, ay, not math.isnan(reading(sample, S.YAW_RATE)))
-    _add(memory, ax, ay, sample)
+    _move(memory, time, dt, ax, ay, not math.isnan(now[S.YAW_RATE]))
+    _add(memory, ax, ay)
     last.time = time
     return health, time - memory.block.time >= design.constants.block_time - EARLY_S
 
@@ -77,34 +80,13 @@ def _clear(gain: VelocityGain) -> None:
 
 
 @compiled
-def _check(memory: MixtureMemory, time: float, sample: FloatArray) -> int:
-    health = 0
-    for channel in range(INPUTS):
-        value = sample[channel]
-        if not math.isnan(value) and not abs(value) <= LIMITS[channel]:
-            health |= flags.OUTLIER
-    if math.isfinite(sample[S.LATITUDE]) and math.isfinite(sample[S.LONGITUDE]):
-        memory.last.position_time = time
-    if not time - memory.last.position_time <= POSITION_S:
-        health |= flags.NO_POSITION
-    if math.isnan(reading(sample, S.AX) + reading(sample, S.AY) + reading(sample, S.YAW_RATE)):
-        health |= flags.NO_INERTIAL
-    for wheel in range(4):
-        if math.isnan(reading(sample, S.OMEGA + wheel)):
-            health |= flags.NO_WHEEL_SPEED
-        if math.isnan(reading(sample, S.TORQUE + wheel)):
-            health |= flags.NO_TORQUE
-    return health
-
-
-@compiled
-def _filter_yaw_rate(memory: MixtureMemory, dt: float, sample: FloatArray) -> None:
+def _filter_yaw_rate(memory: MixtureMemory, dt: float) -> None:
     """Scalar Kalman filter: random walk, gyroscope, and the rear wheels where it is missing."""
-    last, row = memory.last, memory.row
+    last, now, row = memory.last, memory.last.now, memory.row
     variance = last.yaw_rate_var + YAW_WALK**2 * dt
-    value, noise = reading(sample, S.YAW_RATE), YAW_STD
+    value, noise = now[S.YAW_RATE], YAW_STD
     if math.isnan(value):
-        left, right = reading(sample, S.OMEGA + 2), reading(sample, S.OMEGA + 3)
+        left, right = now[S.OMEGA + 2], now[S.OMEGA + 3]
         value, noise = row[P.RADIUS] * (right - left) / row[P.TRACK_REAR], REAR_STD
     if math.isnan(value):
         last.yaw_rate_var = min(variance, UNKNOWN_YAW_VAR)
@@ -170,15 +152,15 @@ def _accumulate(total: PlanarVector, part: PlanarVector) -> None:
 
 
 @compiled
-def _add(memory: MixtureMemory, ax: float, ay: float, sample: FloatArray) -> None:
-    last, block = memory.last, memory.block
+def _add(memory: MixtureMemory, ax: float, ay: float) -> None:
+    last, now, block = memory.last, memory.last.now, memory.block
     for channel in range(INPUTS):
-        value = ax if channel == S.AX else ay if channel == S.AY else reading(sample, channel)
+        value = ax if channel == S.AX else ay if channel == S.AY else now[channel]
         if not math.isnan(value):
             block.sums[channel] += value
             block.counts[channel] += 1
     for wheel in range(4):
-        omega = reading(sample, S.OMEGA + wheel)
+        omega = now[S.OMEGA + wheel]
         last.omega[wheel] = last.omega[wheel] if math.isnan(omega) else omega
         if block.counts[S.DELTA + wheel] > 0:
             last.delta[wheel] = block.sums[S.DELTA + wheel] / block.counts[S.DELTA + wheel]

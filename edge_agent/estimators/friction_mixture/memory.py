@@ -53,6 +53,7 @@ class LastInputs:
 
     time: float  # of the last sample [s]
     position_time: float  # of the last position [s]
+    now: Annotated[FloatArray, INPUTS]  # readings of the last sample, NaN where there is none
     inertial_time: float  # of the last sample with both accelerations [s]
     ax: float  # last input used [m/s^2]
     ay: float

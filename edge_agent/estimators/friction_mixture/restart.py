@@ -8,7 +8,8 @@ from edge_agent.dynamics.parameters import P
 from edge_agent.estimators import flags
 from edge_agent.estimators.common.arrays import clear, put, put_square
 from edge_agent.estimators.common.excitation import begin_excitation
-from edge_agent.estimators.common.readings import reading, rolling_speed
+from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD
+from edge_agent.estimators.common.readings import believe, rolling_speed
 from edge_agent.estimators.friction_mixture.constants import ALL_NODES, NODES, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign, Nominal
 from edge_agent.estimators.friction_mixture.friction_grid import quantile
@@ -18,8 +19,6 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 
-FIRST_VX_STD, FIRST_VY_STD = 0.3, 0.3  # [m/s]
-UNKNOWN_VX_STD = 15.0  # [m/s] without any wheel speed
 YAW_STD = 0.002  # [rad/s] white noise of a gyroscope sample
 UNKNOWN_YAW_VAR = 1.0  # [rad^2/s^2] without a gyroscope
 GAP_ACCELERATION = 2.0  # [m/s^2] that may have acted during a silence
@@ -35,24 +34,25 @@ def start(memory: MixtureMemory, design: MixtureDesign, time: float, sample: Flo
     """Begin the vehicle at its first sample with a finite time; all of its memory is zero."""
     if not math.isfinite(time):
         return flags.TIME_GAP
-    last, block = memory.last, memory.block
+    last, now, block = memory.last, memory.last.now, memory.block
+    believe(sample, now)
     last.time = block.time = time
     last.position_time = last.inertial_time = -math.inf
     last.read_ax = last.read_ay = math.nan
-    rate = reading(sample, S.YAW_RATE)
+    rate = now[S.YAW_RATE]
     last.yaw_rate = block.start_yaw_rate = 0.0 if math.isnan(rate) else rate
     last.yaw_rate_var = UNKNOWN_YAW_VAR if math.isnan(rate) else YAW_STD**2
     for wheel in range(4):
-        block.start_omega[wheel] = last.omega[wheel] = reading(sample, S.OMEGA + wheel)
-        angle = reading(sample, S.DELTA + wheel)
+        block.start_omega[wheel] = last.omega[wheel] = now[S.OMEGA + wheel]
+        angle = now[S.DELTA + wheel]
         last.delta[wheel] = 0.0 if math.isnan(angle) else angle
-    speed = rolling_speed(memory.row, sample)
+    speed = rolling_speed(memory.row, now)
     known = not math.isnan(speed)
     memory.overall_mean[NodeState.VX] = speed if known else 0.0
     forget_vehicle(memory, design.nominal)
     covariance = memory.overall_covariance
-    covariance[NodeState.VX, NodeState.VX] = (FIRST_VX_STD if known else UNKNOWN_VX_STD) ** 2
-    covariance[NodeState.VY, NodeState.VY] = FIRST_VY_STD**2
+    covariance[NodeState.VX, NodeState.VX] = (FIRST_V_STD if known else UNKNOWN_V_STD) ** 2
+    covariance[NodeState.VY, NodeState.VY] = FIRST_V_STD**2
     for j in range(NODES):
         memory.weight[j] = memory.visit_weight[j] = design.prior[j]
         put(memory.mean[j], memory.overall_mean)
@@ -102,33 +102,33 @@ def put_split_to_sleep(memory: MixtureMemory) -> None:
 def restart_motion(memory: MixtureMemory, speed: float, spread: float) -> None:
     """All nodes go on at `speed` [m/s], or, where that is NaN, at the speed they have within `spread`."""
     if not math.isnan(speed):
-        memory.overall_mean[NodeState.VX], spread = speed, FIRST_VX_STD
+        memory.overall_mean[NodeState.VX], spread = speed, FIRST_V_STD
     memory.overall_mean[NodeState.VY] = 0.0
     covariance = memory.overall_covariance
     for i in range(covariance.shape[0]):
         for axis in range(2):
             covariance[i, axis] = covariance[axis, i] = 0.0
-    covariance[NodeState.VX, NodeState.VX], covariance[NodeState.VY, NodeState.VY] = spread**2, FIRST_VY_STD**2
+    covariance[NodeState.VX, NodeState.VX], covariance[NodeState.VY, NodeState.VY] = spread**2, FIRST_V_STD**2
     for j in range(ALL_NODES):
         put(memory.mean[j], memory.overall_mean)
         put_square(memory.covariance[j], covariance)
 
 
 @compiled
-def bridge(memory: MixtureMemory, design: MixtureDesign, dt: float, sample: FloatArray) -> int:
+def bridge(memory: MixtureMemory, design: MixtureDesign, dt: float) -> int:
     """After a silence of dt [s]: friction is forgotten over the metres driven meanwhile, the motion starts anew."""
-    last, prior = memory.last, design.prior
+    last, now, prior = memory.last, memory.last.now, design.prior
     hazard = 1.0 - math.exp(-abs(memory.overall_mean[NodeState.VX]) * dt * design.constants.hazard)
     put_split_to_sleep(memory)
     for j in range(NODES):
         memory.weight[j] += hazard * (prior[j] - memory.weight[j])
         memory.visit_weight[j] += hazard * (prior[j] - memory.visit_weight[j])
-    restart_motion(memory, rolling_speed(memory.row, sample), min(GAP_ACCELERATION * dt, UNKNOWN_VX_STD))
-    rate = reading(sample, S.YAW_RATE)
+    restart_motion(memory, rolling_speed(memory.row, now), min(GAP_ACCELERATION * dt, UNKNOWN_V_STD))
+    rate = now[S.YAW_RATE]
     if not math.isnan(rate):
         last.yaw_rate, last.yaw_rate_var = rate, YAW_STD**2
     for wheel in range(4):
-        last.omega[wheel] = reading(sample, S.OMEGA + wheel)
+        last.omega[wheel] = now[S.OMEGA + wheel]
     return flags.RESET
 
 

@@ -12,6 +12,7 @@ import math
 from edge_agent.dynamics.parameters import P
 from edge_agent.estimators import flags
 from edge_agent.estimators.common.excitation import note_excitation
+from edge_agent.estimators.common.motion import SLIDING_THETA
 from edge_agent.estimators.friction_mixture.block_features import block_features
 from edge_agent.estimators.friction_mixture.constants import NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
@@ -27,7 +28,6 @@ from edge_agent.estimators.friction_mixture.workspace import Scratch
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
-SLIDING_THETA = 3.0  # normalised slip beyond the peak of every passenger tyre's curve
 SLOWEST_SLIDING_M_S = 1.0  # slip of the health flag is taken against at least this speed
 
 

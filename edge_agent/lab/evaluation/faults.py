@@ -112,7 +112,7 @@ def harmed(batch: DriveSet, case: Case) -> DriveSet:
 def outcome(batch: DriveSet, said: Estimates, case: Case) -> dict[str, FloatArray]:
     """What is measured of a case, per drive: `finite`, `told` (1 or 0), coverage and width from BEGINS on, RMSE."""
     after = batch.t[:, 0] >= BEGINS
-    whole = np.isfinite(said.told).all(axis=-1)
+    whole = np.isfinite(said.values).all(axis=-1)
     ordered = (said.mu_lower <= said.mu) & (said.mu <= said.mu_upper)
     found = {
         "finite": (whole & ordered).all(axis=0).astype(float),

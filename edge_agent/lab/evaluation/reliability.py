@@ -39,7 +39,7 @@ def watched(bank: EstimatorBank, batch: DriveSet) -> tuple[Estimates, FloatArray
 
 def joined(parts: list[Estimates]) -> Estimates:
     """Estimates of one drive, one stretch after the other; evidence is left out."""
-    return Estimates(np.concatenate([part.told for part in parts]))
+    return Estimates(np.concatenate([part.values for part in parts]))
 
 
 def _rank(bank: EstimatorBank, batch: DriveSet, now: int, said: Estimates) -> FloatArray:

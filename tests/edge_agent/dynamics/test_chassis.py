@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from edge_agent.dynamics.body import accelerations
-from edge_agent.dynamics.chassis import DUGOFF, response, turned, tyre_forces
-from edge_agent.dynamics.drive_wheel import ELECTRIC_S, blended, drive_wheel, slip_share
+from edge_agent.dynamics.chassis import DUGOFF, Motion, WheelInputs, response, tyre_forces, wheel_inputs
+from edge_agent.dynamics.drive_wheel import ELECTRIC_S, WheelState, blended, drive_wheel, slip_share
 from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import P, body, four, parameter_row
 from edge_agent.dynamics.tyres import brush
@@ -24,7 +24,7 @@ UNKNOWN = np.full(4, np.nan)
 
 def forces(shape: float, mu: float, omega: FloatArray) -> tuple[FloatArray, FloatArray]:
     x, y = np.empty(4), np.empty(4)
-    tyre_forces(ROW, MOTION, turned(DELTA), omega, np.full(4, mu), shape, x, y)
+    tyre_forces(ROW, MOTION, wheel_inputs(DELTA, omega), np.full(4, mu), shape, x, y)
     return x, y
 
 
@@ -46,11 +46,12 @@ def test_a_wheel_without_speed_rolls_freely() -> None:
 
 
 def test_the_response_is_that_of_the_tyres_unless_a_force_is_known() -> None:
-    omega, (vx, vy, rate, ax, ay), steering = np.full(4, 57.0), MOTION, turned(DELTA)
+    omega = np.full(4, 57.0)
+    inputs = wheel_inputs(DELTA, omega)
 
     def felt(known: FloatArray) -> tuple[float, float, float]:
-        cos, sin, mu = four(steering[:, 0]), four(steering[:, 1]), (0.8, 0.8, 0.8, 0.8)
-        return response(body(ROW), vx, vy, rate, ax, ay, cos, sin, four(omega), four(known), mu)
+        cos, sin, mu = four(inputs[:, 0]), four(inputs[:, 1]), (0.8, 0.8, 0.8, 0.8)
+        return response(body(ROW), Motion(*MOTION), WheelInputs(cos, sin, four(omega), four(known), mu))
 
     tyre_x, tyre_y = forces(DUGOFF, 0.8, omega)
     assert felt(UNKNOWN) == pytest.approx(accelerations(ROW, tyre_x, tyre_y, DELTA), rel=1e-12, abs=1e-12)
@@ -68,15 +69,15 @@ def test_the_brush_curve_starts_with_slope_one_and_stays_at_one_from_three_on() 
 
 def test_in_balance_the_drive_wheel_rests() -> None:
     radius = float(ROW[P.RADIUS])
-    assert drive_wheel(300.0, 50.0, 300.0 / radius, 0.0, 300.0, 1.2, radius, 0.01) == pytest.approx(
-        (300.0, 50.0, 300.0 / radius, 0.0)
-    )
+    rest = WheelState(300.0, 50.0, 300.0 / radius, 0.0)
+    assert drive_wheel(rest, 300.0, 1.2, radius, 0.01) == pytest.approx(rest)
 
 
 def test_the_motor_settles_with_its_electric_time_and_the_force_stops_changing() -> None:
     torque, slope = 0.0, 5000.0
     for _ in range(1000):
-        torque, _, _, slope = drive_wheel(torque, 50.0, 0.0, slope, 100.0, 1.2, 0.3, ELECTRIC_S / 1000)
+        state = WheelState(torque, 50.0, 0.0, slope)
+        torque, _, _, slope = drive_wheel(state, 100.0, 1.2, 0.3, ELECTRIC_S / 1000)
     assert torque == pytest.approx(100.0 * (1.0 - math.exp(-1.0)), rel=1e-2)
     assert abs(slope) < 1000.0
 

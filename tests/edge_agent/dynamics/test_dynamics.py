@@ -33,7 +33,7 @@ def test_a_tyre_curve_starts_with_slope_one_and_peaks_at_one(c: float, e: float)
 
 def test_the_dugoff_curve_is_smooth_where_its_pieces_meet_and_odd() -> None:
     def dugoff(theta: float) -> float:
-        return tyres.combined_dugoff(theta, 0.0, 1.0, 1.0, 1.0, 1.0)[0]
+        return tyres.combined_dugoff((theta, 0.0), (1.0, 1.0), 1.0, 1.0)[0]
 
     step = 1e-7
     assert dugoff(0.5 + step) - dugoff(0.5 - step) == pytest.approx(2 * step, rel=1e-5)
@@ -48,8 +48,8 @@ def test_the_inverse_of_the_curve_undoes_it_and_knows_no_slip_beyond_the_peak() 
 
 
 def test_slip_stiffness_does_not_depend_on_friction() -> None:
-    icy = tyres.combined_magic(1e-6, 2e-6, 6e4, 5e4, 0.1, 3000.0, 1.4, 0.0)
-    dry = tyres.combined_magic(1e-6, 2e-6, 6e4, 5e4, 1.0, 3000.0, 1.4, 0.0)
+    icy = tyres.combined_magic((1e-6, 2e-6), (6e4, 5e4), 0.1, 3000.0, 1.4, 0.0)
+    dry = tyres.combined_magic((1e-6, 2e-6), (6e4, 5e4), 1.0, 3000.0, 1.4, 0.0)
     assert icy == pytest.approx(dry, rel=1e-6)
     assert dry == pytest.approx((0.06, 0.1), rel=1e-6)
 
@@ -57,8 +57,8 @@ def test_slip_stiffness_does_not_depend_on_friction() -> None:
 def test_no_combination_of_slips_gives_more_than_the_friction_circle() -> None:
     rng = np.random.default_rng(3)
     for x, y in rng.normal(0.0, 0.2, (200, 2)):
-        assert math.hypot(*tyres.combined_magic(x, y, 6e4, 5e4, 0.4, 3000.0, 1.6, 0.2)) <= 1200.0 * (1 + 1e-12)
-        assert math.hypot(*tyres.combined_dugoff(x, y, 6e4, 5e4, 0.4, 3000.0)) <= 1200.0 * (1 + 1e-12)
+        assert math.hypot(*tyres.combined_magic((x, y), (6e4, 5e4), 0.4, 3000.0, 1.6, 0.2)) <= 1200.0 * (1 + 1e-12)
+        assert math.hypot(*tyres.combined_dugoff((x, y), (6e4, 5e4), 0.4, 3000.0)) <= 1200.0 * (1 + 1e-12)
 
 
 def test_wheel_loads_carry_the_weight_and_a_left_turn_loads_the_right() -> None:

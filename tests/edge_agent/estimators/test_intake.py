@@ -7,18 +7,19 @@ import math
 import numpy as np
 import pytest
 
-from edge_agent.estimators.gaussian.intake import BEGUN, EXCITED_S, SLOT_S, STEPPED, new_filters, take
-from edge_agent.estimators.paper_aco_fckf import Memory
+from edge_agent.estimators.common.excitation import SLOT_S
+from edge_agent.estimators.common.inputs import BEGUN, STEPPED, take
+from edge_agent.estimators.common.run import PaperMemory, new_filters
 from edge_agent.lab.simulation.presets import PRESETS
 from schemas.signals import CHANNELS, S
-from schemas.thresholds import GRAVITY
+from schemas.thresholds import GRAVITY, UTILISED_WINDOW_S
 
 CAR = PRESETS["sedan"].vehicle
 
 
 @pytest.mark.parametrize("every_s", [0.004, 0.01, 0.05, 0.3])
 def test_the_grip_used_is_the_largest_of_the_slots_of_the_last_second(every_s: float) -> None:
-    (memory,) = new_filters(Memory, [CAR])
+    (memory,) = new_filters(PaperMemory, [CAR])
     rng, slots = np.random.default_rng(5), [(-math.inf, 0.0)]
     for k in range(600):
         sample, time = np.zeros(len(CHANNELS)), -1.0 + k * every_s
@@ -30,18 +31,21 @@ def test_the_grip_used_is_the_largest_of_the_slots_of_the_last_second(every_s: f
             slots[-1] = (slots[-1][0], max(slots[-1][1], used))
         else:
             slots.append((time, used))
-        expected = max(grip for began, grip in slots if began > time - EXCITED_S)
-        assert memory["track"]["used"] == pytest.approx(expected, rel=1e-12)
+        expected = max(grip for began, grip in slots if began > time - UTILISED_WINDOW_S)
+        assert memory["track"]["excitation"]["largest"] == pytest.approx(expected, rel=1e-12)
 
 
 def test_the_cosines_are_those_of_the_angles_in_use_now_and_before() -> None:
-    (memory,) = new_filters(Memory, [CAR])
+    (memory,) = new_filters(PaperMemory, [CAR])
     track = memory["track"]
     for k, angle in enumerate((0.1, 0.1, math.nan, -0.3, 9.0, 0.0)):
         sample = np.zeros(len(CHANNELS))
         sample[S.DELTA] = angle
         take(track, memory["row"], 0.01 * k + (1.0 if k > 4 else 0.0), sample)
-        for turned, inputs in ((track["turned"], track["use"]), (track["turned_before"], track["before"])):
+        for turned, inputs in (
+            (track["steering"], track["inputs"]),
+            (track["steering_before"], track["inputs_before"]),
+        ):
             delta = inputs[S.DELTA : S.DELTA + 4]
             assert turned == pytest.approx(np.stack([np.cos(delta), np.sin(delta)]), abs=1e-15)
-    assert track["use"][S.DELTA] == 0.0
+    assert track["inputs"][S.DELTA] == 0.0

@@ -11,7 +11,7 @@ import pytest
 
 from edge_agent.cli import main
 from edge_agent.estimators import ESTIMATORS, Estimates
-from edge_agent.estimators.estimates import ONE_FRICTION, Y
+from edge_agent.estimators.estimates import ONE_FRICTION, Column
 from edge_agent.lab.evaluation import measures
 from edge_agent.lab.evaluation.bars import BARS, figures
 from edge_agent.lab.evaluation.batch import DriveSet, TestDrive, ideal, realistic, repeated
@@ -51,12 +51,12 @@ ASKED = {
 def fake(mu: float, lower: float, upper: float, like: DriveSet) -> Estimates:
     """Estimates that tell the same friction all the time, and the true motion."""
     told, truth = np.zeros((*like.t.shape, ONE_FRICTION)), like.truth
-    told[..., Y.VX], told[..., Y.VY], told[..., Y.YAW_RATE] = (
+    told[..., Column.VX], told[..., Column.VY], told[..., Column.YAW_RATE] = (
         truth[f"true_{name}"] for name in ("vx", "vy", "yaw_rate")
     )
-    told[..., Y.SIDESLIP] = np.arctan2(truth["true_vy"], truth["true_vx"])
-    told[..., Y.MU], told[..., Y.MU_LOWER], told[..., Y.MU_UPPER] = mu, lower, upper
-    told[..., Y.VX_STD : Y.MU], told[..., Y.INNOVATION_NIS] = 1.0, 1.0
+    told[..., Column.SIDESLIP] = np.arctan2(truth["true_vy"], truth["true_vx"])
+    told[..., Column.MU], told[..., Column.MU_LOWER], told[..., Column.MU_UPPER] = mu, lower, upper
+    told[..., Column.VX_STD : Column.MU], told[..., Column.INNOVATION_NIS] = 1.0, 1.0
     return Estimates(told)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edge_agent.estimators import Estimates
-from edge_agent.estimators.estimates import ONE_FRICTION, Y
+from edge_agent.estimators.estimates import ONE_FRICTION, Column
 from edge_agent.lab.evaluation import oracle, real_world
 from edge_agent.lab.evaluation.batch import DriveSet, realistic
 from edge_agent.lab.evaluation.real_world import PRIOR, SURFACES, Tally
@@ -27,10 +27,10 @@ def driven() -> tuple[DriveSet, FloatArray]:
 def saying(batch: DriveSet, lower: float, upper: float) -> Estimates:
     """Estimates that know the motion and always say the same of friction."""
     told = np.zeros((*batch.t.shape, ONE_FRICTION))
-    for column, name in ((Y.VX, "vx"), (Y.VY, "vy"), (Y.YAW_RATE, "yaw_rate")):
+    for column, name in ((Column.VX, "vx"), (Column.VY, "vy"), (Column.YAW_RATE, "yaw_rate")):
         told[..., column] = batch.truth[f"true_{name}"]
-    told[..., Y.MU], told[..., Y.MU_LOWER], told[..., Y.MU_UPPER] = (lower + upper) / 2, lower, upper
-    told[..., Y.VX_STD : Y.MU] = 1.0
+    told[..., Column.MU], told[..., Column.MU_LOWER], told[..., Column.MU_UPPER] = (lower + upper) / 2, lower, upper
+    told[..., Column.VX_STD : Column.MU] = 1.0
     return Estimates(told)
 
 

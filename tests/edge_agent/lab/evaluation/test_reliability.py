@@ -58,7 +58,7 @@ def test_an_end_that_the_range_cuts_off_does_not_narrow_the_gaussian() -> None:
 def test_watching_a_drive_changes_nothing_that_is_said_of_it(estimator: str, turning: DriveSet) -> None:
     plain = estimates(bank_of(estimator, turning.vehicles), turning)
     said, ranks = watched(bank_of(estimator, turning.vehicles), turning)
-    assert np.array_equal(plain.told, said.told)
+    assert np.array_equal(plain.values, said.values)
     assert ranks.shape == (3, 3)
     assert ((ranks >= 0.0) & (ranks <= 1.0)).all()
 
@@ -78,7 +78,7 @@ def test_consistency_is_full_where_the_spread_is_right_and_none_where_it_is_ten_
 ) -> None:
     said = fake(0.35, 0.3, 0.4, turning)
     rng = np.random.default_rng(2)
-    right, wrong = Estimates(said.told.copy()), Estimates(said.told.copy())
+    right, wrong = Estimates(said.values.copy()), Estimates(said.values.copy())
     for one in (right, wrong):
         one.vx[:] += rng.normal(size=said.vx.shape)
         one.vy[:] += rng.normal(size=said.vy.shape)

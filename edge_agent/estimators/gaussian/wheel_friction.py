@@ -11,13 +11,13 @@ import math
 
 import numpy as np
 
-from edge_agent.estimators.gaussian.telling import PRIOR_MU, PRIOR_MU_STD
+from edge_agent.estimators.common.output import PRIOR_MU, PRIOR_MU_STD
 from edge_agent.filters.householder import triangularize
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 
 FORGET_M = 190.0  # one road change per so many metres (errata)
-LOOK_S = 0.2  # one independent look at the tyre per so much time (errata)
+INDEPENDENT_S = 0.2  # one independent measurement of the tyre per so much time (errata)
 DEMAND_HALF = 0.15  # [g] of force at which half of what a sample could say of friction is believed (errata)
 SIDE_CORRELATION = 0.9  # roads are mostly the same under both sides; the wheels of one side see one road
 
@@ -51,16 +51,16 @@ def return_to_prior(mean: FloatArray, root: FloatArray, metres: float, work: Flo
 
 
 @compiled
-def dependence(demand: float, gone: float) -> float:
-    """Factor on the standard deviation of a sample `gone` [s] after the last, at `demand` [g] of force.
+def dependence(demand: float, dt: float) -> float:
+    """Factor on the standard deviation of a sample `dt` [s] after the last, at `demand` [g] of force.
 
-    Model error lasts: many samples are one look. And without demand slip's noise, not friction, explains what is left.
+    Model error lasts: many samples are one measurement. Without demand slip's noise is what is left, not friction.
     """
-    return math.sqrt(max(LOOK_S / gone, 1.0) * (1.0 + (DEMAND_HALF / max(demand, 1e-2)) ** 4))
+    return math.sqrt(max(INDEPENDENT_S / dt, 1.0) * (1.0 + (DEMAND_HALF / max(demand, 1e-2)) ** 4))
 
 
 @compiled
-def told_share(demand: float) -> float:
+def visible_share(demand: float) -> float:
     """Share of friction's spread that a measurement at `demand` [g] of force may see: none below, all far above."""
     used = (demand / DEMAND_HALF) ** 4
     return used / (1.0 + used)

@@ -1,0 +1,125 @@
+"""Readings of one vehicle made fit for a filter that steps once a sample: refusals, gaps, replacements, grip used.
+
+A reading that is missing, infinite or unbelievable is NaN in `now`, and that row of a measurement is left out. Where a
+filter takes it as an input it is replaced in `inputs`: accelerations by nothing and r*v_x, yaw rate and steering by the
+last value, torque by the share of m*a_x; a wheel without speed stays NaN and is taken to roll freely.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+from edge_agent.dynamics.loads import wheel_loads
+from edge_agent.dynamics.parameters import P, body
+from edge_agent.estimators import flags
+from edge_agent.estimators.common.excitation import Excitation, begin_excitation, note_excitation
+from edge_agent.estimators.common.readings import (
+    GAP_S,
+    INPUTS,
+    believe,
+    position_health,
+    position_time,
+    rolling_speed,
+)
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+from schemas.signals import S
+from schemas.thresholds import GRAVITY
+
+REFUSED, BEGUN, STEPPED = 0, 1, 2  # what became of a sample
+
+
+class InputTrack:
+    """What is carried of the samples of one vehicle."""
+
+    started: bool
+    time: float  # of the last sample [s]
+    position_time: float  # of the last position [s]
+    now: Annotated[FloatArray, INPUTS]  # readings, NaN where there is none
+    inputs: Annotated[FloatArray, INPUTS]
+    inputs_before: Annotated[FloatArray, INPUTS]  # of the sample before
+    steering: Annotated[FloatArray, 2, 4]  # cosine and sine of the steering in `inputs`
+    steering_before: Annotated[FloatArray, 2, 4]
+    excitation: Excitation
+
+
+@compiled
+def take(track: InputTrack, row: FloatArray, time: float, sample: FloatArray) -> tuple[int, int, float]:
+    """Take sample (18,) of a vehicle at `time` [s]: (health flags, REFUSED | BEGUN | STEPPED, seconds gone by)."""
+    begins = not track.started
+    dt = time - track.time
+    if not math.isfinite(time) or not (begins or dt > 0.0):
+        return flags.TIME_GAP, REFUSED, 0.0
+    silent = not begins and dt > GAP_S
+    if begins:
+        _begin(track)
+    health = believe(sample, track.now)
+    track.position_time = position_time(sample, time, track.position_time)
+    health |= position_health(time, track.position_time)
+    _remember(track)
+    _renew(track, row, begins or silent)
+    track.time = time
+    note_excitation(track.excitation, time, _grip_used(track, row))
+    if begins or silent:
+        _remember(track)
+        return health | flags.RESET | (flags.TIME_GAP if silent else 0), BEGUN, 0.0
+    return health, STEPPED, dt
+
+
+@compiled
+def _begin(track: InputTrack) -> None:
+    """Nothing has been seen so far; the wheels are straight."""
+    track.started = True
+    track.position_time = -math.inf
+    for wheel in range(4):
+        track.steering[0, wheel], track.steering[1, wheel] = 1.0, 0.0
+    begin_excitation(track.excitation)
+
+
+@compiled
+def _remember(track: InputTrack) -> None:
+    """The inputs become those of the sample before."""
+    for k in range(INPUTS):
+        track.inputs_before[k] = track.inputs[k]
+    for wheel in range(4):
+        track.steering_before[0, wheel] = track.steering[0, wheel]
+        track.steering_before[1, wheel] = track.steering[1, wheel]
+
+
+@compiled
+def _renew(track: InputTrack, row: FloatArray, anew: bool) -> None:
+    """Fill `inputs`; anew: what they were before counts no more."""
+    now, use = track.now, track.inputs
+    for k in range(S.YAW_RATE, S.OMEGA):
+        value = now[k] if now[k] == now[k] else 0.0 if anew else use[k]
+        if k >= S.DELTA and value != use[k]:
+            track.steering[0, k - S.DELTA], track.steering[1, k - S.DELTA] = math.cos(value), math.sin(value)
+        use[k] = value
+    speed = rolling_speed(row, now)
+    use[S.AX] = 0.0 if math.isnan(now[S.AX]) else now[S.AX]
+    turning = 0.0 if math.isnan(speed) else use[S.YAW_RATE] * speed
+    use[S.AY] = turning if math.isnan(now[S.AY]) else now[S.AY]
+    share = 0.25 * row[P.MASS] * use[S.AX] * row[P.RADIUS]
+    for wheel in range(4):
+        torque = now[S.TORQUE + wheel]
+        use[S.OMEGA + wheel] = now[S.OMEGA + wheel]
+        use[S.TORQUE + wheel] = share if math.isnan(torque) else torque
+
+
+@compiled
+def _grip_used(track: InputTrack, row: FloatArray) -> float:
+    """Grip used by the hardest-working wheel now [1]: hypot of torque over radius and load, and lateral g."""
+    use = track.inputs
+    loads, most = wheel_loads(body(row), use[S.AX], use[S.AY]), 0.0
+    for wheel in range(4):
+        most = max(most, abs(use[S.TORQUE + wheel]) / loads[wheel])
+    return math.sqrt((most / row[P.RADIUS]) ** 2 + (use[S.AY] / GRAVITY) ** 2)
+
+
+@compiled
+def wheel_force(row: FloatArray, track: InputTrack, wheel: int, step: float) -> float:
+    """F_x = (T - J*omega')/R [N] of a wheel from inputs `step` [s] apart (paper 000, equation 10)."""
+    gain = track.inputs[S.OMEGA + wheel] - track.inputs_before[S.OMEGA + wheel]
+    turning = 0.0 if math.isnan(gain) or step <= 0.0 else gain / step
+    return float((track.inputs[S.TORQUE + wheel] - row[P.WHEEL_INERTIA] * turning) / row[P.RADIUS])

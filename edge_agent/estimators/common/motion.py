@@ -1,0 +1,40 @@
+"""What is known of a motion at first, and how its estimate is seen to have gone wrong."""
+
+from __future__ import annotations
+
+import math
+
+from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.slip import SLOWEST_M_S, along_wheel
+from edge_agent.estimators import flags
+from edge_agent.estimators.common.inputs import InputTrack
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+from schemas.signals import S
+
+FIRST_V_STD = 0.3  # [m/s] of the speed from wheels, and of the lateral speed, at the first sample
+UNKNOWN_V_STD = 15.0  # [m/s] without any wheel speed
+SLIDING_THETA = 3.0  # normalised slip beyond the peak of every passenger tyre's curve
+FASTEST_M_S = 150.0  # an estimate beyond has diverged
+FASTEST_TURN = 20.0  # [rad/s]
+
+
+@compiled
+def diverged(mean: FloatArray, root: FloatArray, yaw_rate: int) -> bool:
+    """Whether a filter has diverged whose first states are v_x and v_y, and whose state `yaw_rate` is the yaw rate."""
+    bad = not (abs(mean[0]) < FASTEST_M_S and abs(mean[1]) < FASTEST_M_S)
+    bad = bad or not abs(mean[yaw_rate]) < FASTEST_TURN
+    for i in range(mean.shape[0]):
+        bad = bad or not math.isfinite(mean[i] + root[i, i])
+    return bad
+
+
+@compiled
+def sliding(row: FloatArray, track: InputTrack, vx: float, vy: float, mu: float) -> int:
+    """The health flag of a wheel past its peak by longitudinal slip, at the inputs in use."""
+    health, yaw_rate = 0, track.inputs[S.YAW_RATE]
+    for wheel in range(4):
+        along = along_wheel(row, wheel, vx, vy, yaw_rate, track.steering[0, wheel], track.steering[1, wheel])
+        gliding = abs(row[P.RADIUS] * track.inputs[S.OMEGA + wheel] - along) * row[P.SLOPE_X]
+        health |= flags.SLIDING if gliding > SLIDING_THETA * mu * max(abs(along), SLOWEST_M_S) else 0
+    return health

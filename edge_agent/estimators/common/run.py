@@ -1,0 +1,87 @@
+"""The one way through the samples that every paper's filter goes: take a sample in, begin or step, report.
+
+A paper's file is the record of what its filter carries (`PaperMemory` with its own fields), three compiled functions
+and the citation; `kernel_of` makes a bank's kernel of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Annotated, TypeVar
+
+from edge_agent.dynamics.parameters import P, parameter_table
+from edge_agent.estimators import flags
+from edge_agent.estimators.bank import Kernel, Part
+from edge_agent.estimators.common.inputs import BEGUN, STEPPED, InputTrack, take
+from edge_agent.estimators.common.motion import sliding
+from edge_agent.estimators.common.output import write_quality, write_unknown
+from edge_agent.estimators.estimates import Column
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import nogil
+from schemas.runtime.records import RecordArray, Records, records
+from schemas.vehicle import Vehicle
+
+
+class PaperMemory:
+    """What every paper's filter carries of one vehicle."""
+
+    row: Annotated[FloatArray, len(P)]  # parameters of the vehicle
+    track: InputTrack
+    nis: float  # per row
+    log_likelihood: float  # of what was measured at the sample [nat]
+    adaptation: float  # largest factor on R
+
+
+Memory = TypeVar("Memory", bound=PaperMemory)
+Context = TypeVar("Context")
+
+
+def kernel_of(
+    begin: Callable[[Memory, Context], None],
+    step: Callable[[Memory, Context, float], bool],
+    report: Callable[[Memory, Context, FloatArray], float],
+) -> Kernel:
+    """The kernel of a filter.
+
+    Args:
+        begin: begins the filter at the sample in memory.track.
+        step: predicts by so many seconds and updates; whether the filter has not diverged.
+        report: writes motion and friction into the output; the friction by which wheels are judged to slide.
+    """
+
+    @nogil
+    def advance(
+        filters: Records[Memory], contexts: Records[Context], t: FloatArray, signals: FloatArray, outputs: FloatArray,
+        part: Part,
+    ) -> None:  # fmt: skip
+        share, first, last = part
+        context = contexts[share]
+        for n in range(first, last):
+            memory = filters[n]
+            for k in range(t.shape[0]):
+                output = outputs[k, n]
+                memory.log_likelihood = 0.0
+                health, kind, dt = take(memory.track, memory.row, t[k, n], signals[k, n])
+                if kind == STEPPED and not step(memory, context, dt):
+                    health, kind = health | flags.RESET, BEGUN
+                if kind == BEGUN:
+                    memory.nis, memory.log_likelihood, memory.adaptation = 0.0, 0.0, 1.0
+                    begin(memory, context)
+                if memory.track.started:
+                    mu = report(memory, context, output)
+                    write_quality(
+                        output, memory.track.excitation.largest, memory.nis, memory.adaptation, memory.log_likelihood
+                    )
+                    health |= sliding(memory.row, memory.track, output[Column.VX], output[Column.VY], mu)
+                else:
+                    write_unknown(output)
+                output[Column.HEALTH] = health
+
+    return advance
+
+
+def new_filters(kind: type[PaperMemory], vehicles: Sequence[Vehicle]) -> RecordArray:
+    """A record of `kind` per vehicle, with its `row`; all else is zero, as `take` expects it."""
+    filters = records(kind, len(vehicles))
+    filters["row"] = parameter_table(vehicles)
+    return filters
