@@ -54,7 +54,7 @@ def kept(tmp_path: Path) -> list[Batch]:
         if turn:
             (root / "keys").symlink_to(tmp_path / "archive" / "keys")
         with closing(Engine(ServiceConfig(name=f"shard-{turn}"), root)) as engine:
-            engine.take(
+            engine.ingest(
                 [Message(b.kind, key(b.vehicle), wire.encode(b), wire.ENCODING[b.kind]) for b in shown], time.time_ns()
             )
             engine.flush()

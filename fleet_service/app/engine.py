@@ -1,7 +1,7 @@
 """The service without its network: messages in; alerts, tiles, acknowledgements and answers out.
 
-One worker calls `take`, `begin_flush`, `written`, `flush`, `tiles` and `fading`; queries come from other threads, so
-that a lock guards the map.
+One worker calls `ingest`, `begin_flush`, `written`, `flush`, `tiles` and `fade_alerts`; queries come from other
+threads, so that a lock guards the map.
 """
 
 from __future__ import annotations
@@ -164,7 +164,7 @@ class Engine:
                 tiles.setdefault(int(grid.tile_of(alert.cell)), []).append(alert)
         return [(tile, wire.encode_standing(alerts)) for tile, alerts in tiles.items() if wanted(tile)]
 
-    def take(self, messages: Sequence[Message], now: int, slack: int = 0) -> list[Alert]:
+    def ingest(self, messages: Sequence[Message], now: int, slack: int = 0) -> list[Alert]:
         """Admit and fuse; returns the alerts that this raises or clears. `slack`: the true time may be so far ahead."""
         clock = Clock(now, int(self._config.clock_ahead_s * NS) + slack, int(self._config.oldest_s * NS))
         out: list[Alert] = []
@@ -189,8 +189,8 @@ class Engine:
         self.counts["late"] += int(updated.late.sum())
         return raised
 
-    def overcast(self, now: int) -> None:
-        """Let the weather act that was heard since the last call."""
+    def update_weather(self, now: int) -> None:
+        """Let the weather act that came since the last call."""
         self._heard = max(self._heard, now)
         self._use(self.weather.take(now))
 
@@ -205,13 +205,13 @@ class Engine:
 
         A full disk is counted and tried again at the next call; nothing of it is acknowledged.
         """
-        told = self._settled(self._log.flush)
+        acks = self._acknowledged(self._log.flush)
         if not self.failing and self._checkpoint_wanted.is_set():
             self._checkpoint_wanted.clear()
             with self._guard:
                 alerts = pa.Table.from_pylist([asdict(alert) for alert in self._alerts.standing])
                 self._checkpoints.put((tables_of(self.fusion) | {ALERTS: alerts}, self._heard))
-        return told
+        return acks
 
     def begin_flush(self) -> list[tuple[str, bytes]]:
         """As `flush`, but messages may be taken while segments are written; `written` gives what is acknowledged.
@@ -225,9 +225,9 @@ class Engine:
 
     def written(self) -> list[tuple[str, bytes]]:
         """The acknowledgements to put after a flush that was begun, once it has ended."""
-        return self._settled(self._log.end) if self._log.ended else []
+        return self._acknowledged(self._log.end) if self._log.ended else []
 
-    def _settled(self, durable: Callable[[], list[BatchId]]) -> list[tuple[str, bytes]]:
+    def _acknowledged(self, durable: Callable[[], list[BatchId]]) -> list[tuple[str, bytes]]:
         try:
             self._intake.settled(durable())
         except OSError:
@@ -253,7 +253,7 @@ class Engine:
                 tables.append(cell_table(self.fusion, public, now))
         return pa.concat_tables([*tables, MAP_SCHEMA.empty_table()])
 
-    def fading(self, now: int) -> list[Alert]:
+    def fade_alerts(self, now: int) -> list[Alert]:
         """Alerts that time alone cleared."""
         with self._guard:
             return self._alerts.faded(now)

@@ -1,6 +1,6 @@
 """The running service: Zenoh on one side, the engine on the other, one worker between them.
 
-subscribers ─► inbox ─► worker: take ─► alerts at once
+subscribers ─► inbox ─► worker: ingest ─► alerts at once
                                 flush ─► thread: segment on disk ─► acknowledgements
                                 tiles once a second
 queryables  ─► answers, in Zenoh's threads
@@ -23,7 +23,7 @@ from fleet_service.app.jobs import archive_jobs, upkeep
 from fleet_service.app.metrics import Pulse, metrics, troubles
 from fleet_service.enrolment.fleet import Enrolment
 from fleet_service.ingest.inbox import Inbox, Message
-from fleet_service.ingest.rate_limit import Limits
+from fleet_service.ingest.rate_limit import RateLimiter
 from fleet_service.ingest.weather import Heard
 from fleet_service.serve.queryable import MapQueryable
 from schemas import grid, keys, wire
@@ -57,7 +57,7 @@ class Service:
         known = None if config.fleet is None else set(load(config.fleet, Enrolment).vehicles)
         self.engine = Engine(config, root)
         self._clock = SteadyClock(self.engine.seen)
-        limits = Limits(config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, known, self.engine.counts)
+        limits = RateLimiter(config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, known, self.engine.counts)
         self._replies = MapQueryable(self._answer, self.engine.counts)
         self.inbox = Inbox(config.queue_batches, self.engine.counts, limits)
         self.failure: BaseException | None = None  # of the worker; leaving the session after it may hang
@@ -160,10 +160,10 @@ class Service:
         if now - self._flushed_at >= self._config.segment_s:
             self._flushed_at = now
             self._acknowledge(session, self.engine.begin_flush())
-            self.engine.overcast(self._clock.now())
+            self.engine.update_weather(self._clock.now())
         if now - self._put_at >= self._config.put_s:
             self._put_at = now
-            self._put_alerts(session, self.engine.fading(self._clock.now()))
+            self._put_alerts(session, self.engine.fade_alerts(self._clock.now()))
             self._put_tiles(session)
         if now - self._said_at >= STATUS_S:
             self._status(now)
@@ -182,7 +182,7 @@ class Service:
 
     def _take(self, session: zenoh.Session, messages: list[Message]) -> None:
         if messages:
-            self._put_alerts(session, self.engine.take(messages, self._clock.now(), self._clock.slack()))
+            self._put_alerts(session, self.engine.ingest(messages, self._clock.now(), self._clock.slack()))
 
     def _acknowledge(self, session: zenoh.Session, acks: list[tuple[str, bytes]]) -> None:
         for vehicle, ack in acks:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from schemas import mugrid
-from schemas.thresholds import EXCITED_SHARE, SLIPPERY_MU
+from schemas.thresholds import EXCITED_SHARE, NS, SLIPPERY_MU
 
 BIN_WIDTH: Final = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS
 
@@ -120,4 +120,4 @@ SOURCE_SHARE: Final = 0.6  # P(slippery) from the vote alone, against the unifor
 SOURCE_USED: Final = EXCITED_SHARE
 
 # Trust acts from the next epoch on, so that it depends on the order of time and not of arrival.
-EPOCH_NS: Final = 60_000_000_000
+EPOCH_NS: Final = 60 * NS

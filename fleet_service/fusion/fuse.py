@@ -15,7 +15,7 @@ from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import forget, read, unpack
 from fleet_service.fusion.observations import Observations, SmallArray
 from fleet_service.fusion.store.cells import Cells
-from fleet_service.fusion.store.records import NOBODY, NONE, SECOND, Rows
+from fleet_service.fusion.store.records import NOBODY, NONE, Rows
 from fleet_service.fusion.store.store import Store, distinct
 from fleet_service.fusion.trust import newcomer, trusted
 from fleet_service.fusion.votes import PADDED, SCRATCH, P
@@ -162,7 +162,7 @@ class Fusion:
         """
         row, reporters = self.live.reporters[slots], self.store.state.live.reporters
         who = np.where(row[:, None] == NONE, NOBODY, reporters["source"][row, side])
-        when = reporters["source_time"][row, side].astype(np.int64) * SECOND
+        when = reporters["source_time"][row, side].astype(np.int64) * NS
         trust = self._weights(self.trusts[-1][0], np.maximum(who, 0)) >= c.SOURCE_TRUST
         counted = (who != NOBODY) & trust & (when > np.reshape(since, (-1, 1)))
         return counted.sum(axis=1), np.where(counted, when, 0).max(axis=1)
@@ -183,7 +183,7 @@ class Fusion:
             store = self.store
             for due in store.due_windows(before):
                 commit(store.state, self._weather, store.peers, store.names, due, before)
-            store.forget(before // SECOND)
+            store.forget(before // NS)
             weights = self.trusts[-1][1]
             joined = np.full(store.vehicles - len(weights), newcomer(False), np.float32)
             weights, established = trusted(store.peers, np.append(weights, joined))
@@ -230,7 +230,7 @@ def _votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, Float32
 
 def _recent(reports: Reports, oldest: int) -> Reports:
     """Without those that ended before `oldest` [ns]."""
-    return reports.take(reports.time >= oldest - 4 * 3600 * SECOND)
+    return reports.take(reports.time >= oldest - 4 * 3600 * NS)
 
 
 @compiled

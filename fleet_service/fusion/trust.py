@@ -19,10 +19,11 @@ import math
 import numpy as np
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.store.records import NOBODY, SECOND
+from fleet_service.fusion.store.records import NOBODY
 from schemas.numeric import BoolArray, Float32Array, FloatArray
 from schemas.runtime.jit import refcount_free
 from schemas.runtime.records import RecordArray
+from schemas.thresholds import NS
 
 
 @refcount_free
@@ -36,7 +37,7 @@ def compare(
     here = reporters[row]
     if entries[entry].share < c.HERE_SHARE:
         return
-    vehicle, now = int(entries[entry].vehicle), entries[entry].time // SECOND
+    vehicle, now = int(entries[entry].vehicle), entries[entry].time // NS
     mean, std = float(entries[entry].mean), float(entries[entry].std)
     reporter, reported = here.reporter, here.time
     place = 0

@@ -25,7 +25,7 @@ from fleet_service.fusion.belief import (
     vote,
 )  # fmt: skip
 from fleet_service.fusion.store.pairs import returning
-from fleet_service.fusion.store.records import FINE, GRIP, ICE, NONE, SECOND, SOURCES, Rows
+from fleet_service.fusion.store.records import FINE, GRIP, ICE, NONE, SOURCES, Rows
 from fleet_service.fusion.weather import Weather, aged
 from schemas import mugrid
 from schemas.numeric import Float32Array
@@ -89,7 +89,7 @@ def discount(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
     Times are whole seconds from either, so that it does not matter which.
     """
     kind, pair = int(entries[entry].kind), entries[entry].pair
-    now = entries[entry].time // SECOND
+    now = entries[entry].time // NS
     least = now - now % _HOUR - _FORGOTTEN
     time, mean, std, spent = 0, np.float32(0.0), np.float32(0.0), np.float32(0.0)
     earlier = entries[entry].before
@@ -97,7 +97,7 @@ def discount(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
     while earlier != NONE and entries[earlier].kind != kind:
         earlier = entries[earlier].before
     if earlier != NONE:
-        time, mean = entries[earlier].time // SECOND, _coarse(entries[earlier].last_mean)
+        time, mean = entries[earlier].time // NS, _coarse(entries[earlier].last_mean)
         std, spent = _coarse(entries[earlier].last_std), _coarse(entries[earlier].spent)
     else:
         seen = seen or pairs[pair].time[BOUND] >= max(least, 1) or pairs[pair].time[VALUE] >= max(least, 1)
@@ -232,4 +232,4 @@ def _note_source(reporters: RecordArray, row: int, side: int, vehicle: int, time
         if source_time[side, k] < source_time[side, place]:
             place = k
     source[side, place] = vehicle
-    source_time[side, place] = time // SECOND
+    source_time[side, place] = time // NS

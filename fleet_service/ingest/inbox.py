@@ -21,7 +21,7 @@ from fleet_service.archive.segments import Rows, stepped
 from fleet_service.ingest import validation
 from fleet_service.ingest.acks import Acks
 from fleet_service.ingest.dedup import BatchId, SequenceTracker, SequenceTrackers
-from fleet_service.ingest.rate_limit import Limits
+from fleet_service.ingest.rate_limit import RateLimiter
 from fleet_service.ingest.validation import Clock, Refusal
 from schemas.grid import cell_of
 from schemas.numeric import BoolArray, IntArray
@@ -62,7 +62,7 @@ class Inbox:
         limits: who may send how much.
     """
 
-    def __init__(self, capacity: int, counts: Counter[str], limits: Limits) -> None:
+    def __init__(self, capacity: int, counts: Counter[str], limits: RateLimiter) -> None:
         self._queue: queue.SimpleQueue[Message] = queue.SimpleQueue()  # without locks in Python, a fifth of the cost
         self._capacity, self._counts, self._limits = capacity, counts, limits
 
@@ -71,7 +71,7 @@ class Inbox:
 
         def take(sample: zenoh.Sample) -> None:
             key, payload = str(sample.key_expr), sample.payload
-            if sample.kind == zenoh.SampleKind.PUT and self._limits.lets(key, len(payload)):
+            if sample.kind == zenoh.SampleKind.PUT and self._limits.allows(key, len(payload)):
                 self.put(Message(kind, key, payload.to_bytes(), str(sample.encoding)))
 
         return take

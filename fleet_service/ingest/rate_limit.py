@@ -19,7 +19,7 @@ MOST_NAMES: Final = 100_000
 _OTHERS: Final = ""
 
 
-class Limits:
+class RateLimiter:
     """The buckets of one service.
 
     Args:
@@ -42,7 +42,7 @@ class Limits:
         self._buckets: dict[str, tuple[float, float]] = {}  # what is left, and when that was [s]
         self._swept = -float("inf")
 
-    def lets(self, key: str, size: int) -> bool:
+    def allows(self, key: str, size: int) -> bool:
         """Whether a message of `size` bytes on `key` is to be looked at; else it is counted."""
         name = key.rpartition("/")[2]
         if self._known is not None and name not in self._known:

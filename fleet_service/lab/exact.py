@@ -60,7 +60,7 @@ def replay(rng: Generator) -> float:
         engine = Engine(ServiceConfig(), Path(folder))
         for portion in np.array_split(np.argsort(at), PARTS):
             now = clock_of(float(at[portion].max()))
-            engine.take([sent[k].message for k in (*portion, *portion[::7])], now)
+            engine.ingest([sent[k].message for k in (*portion, *portion[::7])], now)
             engine.flush()
         engine.close()
         again = Engine(ServiceConfig(), Path(folder))

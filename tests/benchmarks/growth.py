@@ -52,7 +52,7 @@ def second_s(rate: int, seconds: int) -> float:
             sent = messages(vehicles, ROWS, now, vehicles, second * vehicles)
             began = time.process_time()
             for at in range(0, len(sent), TURN):
-                engine.take(sent[at : at + TURN], now)
+                engine.ingest(sent[at : at + TURN], now)
             engine.flush()
             engine.tiles(now)
             spent += time.process_time() - began if second >= WARM_S else 0.0

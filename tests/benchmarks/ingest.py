@@ -125,7 +125,7 @@ def _take(sent: list[Message], records: int) -> tuple[float, float]:
         gc.freeze()  # as the service does when it starts: the messages of a benchmark are no garbage to look for
         wall, cpu = time.perf_counter(), time.process_time()
         for at in range(0, len(sent), turn):
-            engine.take(sent[at : at + turn], time.time_ns())
+            engine.ingest(sent[at : at + turn], time.time_ns())
             engine.written()
             if at % FLUSH >= FLUSH - turn:
                 engine.begin_flush()

@@ -67,7 +67,7 @@ def checkpoint_s(engine: Engine, root: Path, sent: list[Message], now: int) -> t
     def work() -> None:
         for number, part in enumerate(parts):
             began = time.perf_counter()
-            engine.take(part, now)
+            engine.ingest(part, now)
             engine.flush()
             turns.append(time.perf_counter() - began)
             if number == len(parts) // 2:
@@ -75,7 +75,7 @@ def checkpoint_s(engine: Engine, root: Path, sent: list[Message], now: int) -> t
 
     worker = threading.Thread(target=work)
     for part in parts[:2]:  # warm
-        engine.take(part, now)
+        engine.ingest(part, now)
     worker.start()
     began = time.perf_counter()
     taken = engine.checkpoint(threading.Event())

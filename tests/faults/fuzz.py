@@ -94,11 +94,11 @@ def _honest(seq: int, now: int) -> Iterator[Message]:
 def _turn(site: Site, engine: Engine, messages: list[Message], now: int) -> int:
     """One turn of the service's worker; 1 if anything but a refusal came of it."""
     try:
-        engine.take(messages, now)
+        engine.ingest(messages, now)
         for _, ack in engine.flush():
             wire.decode_ack(ack)
         engine.tiles(now)
-        engine.fading(now)
+        engine.fade_alerts(now)
     except Exception:  # noqa: BLE001 whatever it is, it is a crash
         site.say(traceback.format_exc())
         return 1

@@ -63,7 +63,7 @@ def _archive(root: Path) -> tuple[list[Batch], Path]:
     batches = [batch("sim-001", seq, now, [0.8, 0.7]) for seq in range(1, SEGMENTS * BATCHES + 1)]
     with closing(Engine(ServiceConfig(), root)) as engine:
         for first in range(0, len(batches), BATCHES):
-            engine.take(_messages(batches[first : first + BATCHES]), time.time_ns())
+            engine.ingest(_messages(batches[first : first + BATCHES]), time.time_ns())
             engine.flush()
     return batches, segments.paths(root, Kind.OBSERVATION)[-1]
 
@@ -104,7 +104,7 @@ def _lost(root: Path, batches: Sequence[Batch]) -> int:
 def _after_all_is_sent_again(root: Path, batches: Sequence[Batch]) -> int:
     """Rows that are missing or doubled once a service has been sent everything again, and acknowledged it."""
     with closing(Engine(ServiceConfig(), root)) as engine:
-        engine.take(_messages(batches), time.time_ns())
+        engine.ingest(_messages(batches), time.time_ns())
         ((_, ack),) = engine.flush()
     (stream,) = wire.decode_ack(ack)[1]
     assert stream.durable == ((1, len(batches)),)

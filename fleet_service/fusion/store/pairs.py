@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from fleet_service.fusion.belief import VALUE
-from fleet_service.fusion.store.records import NONE, PAIRS, SECOND, State
+from fleet_service.fusion.store.records import NONE, PAIRS, State
 from fleet_service.fusion.store.table import AHEAD, pair_place
 from schemas.numeric import IntArray
 from schemas.runtime.jit import compiled, prefetch, refcount_free_inlined
 from schemas.runtime.records import RecordArray
+from schemas.thresholds import NS
 
 _FIBONACCI = np.uint64(0x9E3779B97F4A7C15)  # 2⁶⁴ over the golden ratio: its multiples lie far apart
 
@@ -63,7 +64,7 @@ def link_pair(entries: RecordArray, pairs: RecordArray, pair: int, entry: int) -
 def commit_pair(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
     """What an entry reported becomes what its vehicle reported before the checkpoint; later entries stand alone."""
     pair, kind = int(entries[entry].pair), int(entries[entry].kind)
-    pairs[pair].time[kind] = entries[entry].time // SECOND
+    pairs[pair].time[kind] = entries[entry].time // NS
     pairs[pair].mean[kind] = entries[entry].last_mean
     pairs[pair].spent[kind] = entries[entry].spent
     if kind == VALUE:

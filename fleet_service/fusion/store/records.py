@@ -16,11 +16,9 @@ from fleet_service.fusion.belief import PackedArray
 from schemas import mugrid
 from schemas.numeric import ByteArray, Float32Array, IntArray
 from schemas.runtime.records import RecordArray, record_type
-from schemas.thresholds import NS
 
 NONE: Final = -1  # no row
 NOBODY: Final = -1  # no vehicle
-SECOND: Final = NS
 GRIP, ICE = 0, 1  # sides: what a corroborating source reported
 SOURCES: Final = 5  # remembered per slot of each side: as many as an alert ever needs
 # What a vehicle reported last, its mean, standard deviation and votes spent, is remembered in 16 bits: parts of 1/FINE,

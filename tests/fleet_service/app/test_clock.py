@@ -72,7 +72,7 @@ def test_honest_reports_are_kept_through_jumps_and_restarts_of_the_service(tmp_p
         with closing(Engine(ServiceConfig(), tmp_path)) as engine:
             clock = system.clock(engine.seen)
             for step in range(2):
-                engine.take([message(1 + 2 * start + step, true)], clock.now(), clock.slack())
+                engine.ingest([message(1 + 2 * start + step, true)], clock.now(), clock.slack())
                 engine.flush()
                 true += SECOND
                 system.passes(SECOND, jump=jump * (start == step == 0))
@@ -83,8 +83,8 @@ def test_honest_reports_are_kept_through_jumps_and_restarts_of_the_service(tmp_p
 def test_a_vehicle_whose_clock_is_a_day_ahead_is_refused_and_does_not_make_the_others_late(tmp_path: Path) -> None:
     now = time.time_ns()
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        engine.take([message(1, now + DAY)], now)
-        engine.take([message(2, now)], now)
+        engine.ingest([message(1, now + DAY)], now)
+        engine.ingest([message(2, now)], now)
         assert (engine.counts["refused.time"], engine.counts[Kind.OBSERVATION], engine.counts["late"]) == (1, 1, 0)
         (_, ack), *_ = engine.flush()
         (stream,) = wire.decode_ack(ack)[1]

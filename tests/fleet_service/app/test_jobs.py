@@ -82,7 +82,7 @@ def test_rounds_of_no_rows_are_refused(tmp_path: Path, capsys: pytest.CaptureFix
 def test_a_compaction_that_fails_is_said_and_one_that_runs_is_stopped_with_the_service(tmp_path: Path) -> None:
     engine = Engine(ServiceConfig(), tmp_path)
     with closing(engine):
-        engine.take(
+        engine.ingest(
             [Message(Kind.OBSERVATION, key("sim-001"), wire.encode(batch("sim-001", 1, now(), [0.8])), "")], now()
         )
         engine.flush()

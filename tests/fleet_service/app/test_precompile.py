@@ -36,10 +36,10 @@ def drive(root):
         taken = {name: column[part] for name, column in columns.items()}
         batch = wire.Batch(wire.Kind.OBSERVATION, "sim-001", seq, int(home[0]), seq, 1, taken, "test")
         key, encoding = keys.observation_key(int(home[0]), "sim-001"), wire.ENCODING[batch.kind]
-        engine.take([Message(batch.kind, key, wire.encode(batch), encoding)], time.time_ns())
+        engine.ingest([Message(batch.kind, key, wire.encode(batch), encoding)], time.time_ns())
     engine.flush()
     engine.tiles(time.time_ns())
-    engine.fading(time.time_ns())
+    engine.fade_alerts(time.time_ns())
     list(engine.answer(MapQuery(), lambda tile: True, time.time_ns()))
     assert engine.fusion.size > 2100, engine.counts
     engine.close()

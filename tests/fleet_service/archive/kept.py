@@ -119,8 +119,8 @@ def make(root: Path) -> dict[str, Any]:
                 report = weather.encode(weather.Report(now_of(2), air_temperature=-3.0, precipitation=1.0))
                 region = int(grid.region_of(grid.cell_of(*PLACES[0])))
                 engine.weather.hear(Heard(keys.weather_key(region), report, wire.WEATHER_ENCODING))
-                engine.overcast(now_of(2))
-            engine.take(list(messages(turn)), now_of(turn))
+                engine.update_weather(now_of(2))
+            engine.ingest(list(messages(turn)), now_of(turn))
             if turn % 2:
                 engine.flush()
             if turn == ROUNDS // 2 - 1:

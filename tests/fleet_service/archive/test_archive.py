@@ -59,7 +59,7 @@ def test_an_acknowledgement_follows_fsync_rename_and_fsync_of_the_folder(
         order.append("rename")
         return rename(path, target)
 
-    engine.take([sent("sim-001", 1)], time.time_ns())
+    engine.ingest([sent("sim-001", 1)], time.time_ns())
     monkeypatch.setattr(os, "fsync", seen_fsync)
     monkeypatch.setattr(Path, "rename", seen_rename)
     acks = engine.flush()
@@ -70,9 +70,9 @@ def test_an_acknowledgement_follows_fsync_rename_and_fsync_of_the_folder(
 
 def test_nothing_is_acknowledged_while_the_disk_fails_and_all_of_it_afterwards(engine: Engine, tmp_path: Path) -> None:
     shutil.move(tmp_path / "inbox", tmp_path / "gone")
-    engine.take([sent("sim-001", 1)], time.time_ns())
+    engine.ingest([sent("sim-001", 1)], time.time_ns())
     assert engine.flush() == []
-    engine.take([sent("sim-001", 2), sent("sim-001", 1)], time.time_ns())
+    engine.ingest([sent("sim-001", 2), sent("sim-001", 1)], time.time_ns())
     assert engine.flush() == []
     assert engine.counts["segment_failures"] == 2
     shutil.move(tmp_path / "gone", tmp_path / "inbox")
@@ -89,7 +89,7 @@ def test_a_second_service_on_an_archive_refuses_to_start(engine: Engine, tmp_pat
 
 def test_a_damaged_segment_is_set_aside_and_the_others_are_read(engine: Engine, tmp_path: Path) -> None:
     for seq in (1, 2, 3):
-        engine.take([sent("sim-001", seq)], time.time_ns())
+        engine.ingest([sent("sim-001", seq)], time.time_ns())
         engine.flush()
     engine.close()
     damaged = segments.paths(tmp_path, Kind.OBSERVATION)[1]
@@ -97,7 +97,7 @@ def test_a_damaged_segment_is_set_aside_and_the_others_are_read(engine: Engine, 
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
         assert again.fusion.live.visits[0] == 4
         assert damaged.with_name(damaged.name + ".bad").exists()
-        again.take([sent("sim-001", seq) for seq in (1, 2, 3)], time.time_ns())
+        again.ingest([sent("sim-001", seq) for seq in (1, 2, 3)], time.time_ns())
         assert again.counts[Kind.OBSERVATION] == 2
         assert again.counts["duplicates"] == 2
 
@@ -106,7 +106,7 @@ def test_a_damaged_segment_is_set_aside_and_the_others_are_read(engine: Engine, 
 def test_a_changed_byte_is_noticed_wherever_it_is(
     engine: Engine, tmp_path: Path, caplog: pytest.LogCaptureFixture, place: float
 ) -> None:
-    engine.take([sent("sim-001", 1)], time.time_ns())
+    engine.ingest([sent("sim-001", 1)], time.time_ns())
     engine.flush()
     engine.close()
     (segment,) = segments.paths(tmp_path, Kind.OBSERVATION)
@@ -119,7 +119,7 @@ def test_a_changed_byte_is_noticed_wherever_it_is(
         assert repr(held) == repr(before) or not held
         assert again.counts["files_set_aside"] == (not held)
         assert ("is damaged and set aside" in caplog.text) == (not held)
-        again.take([sent("sim-001", 1)], time.time_ns())
+        again.ingest([sent("sim-001", 1)], time.time_ns())
         assert again.counts["duplicates"] == bool(held)
 
 
@@ -131,10 +131,10 @@ def test_names_that_could_not_be_synced_are_synced_before_anything_is_acknowledg
 
     with monkeypatch.context() as patch:
         patch.setattr(segments, "sync_directory", broken)
-        engine.take([sent("sim-001", 1)], time.time_ns())
+        engine.ingest([sent("sim-001", 1)], time.time_ns())
         assert engine.flush() == []
         assert engine.counts["segment_failures"] == 1
-    engine.take([sent("sim-001", 2)], time.time_ns())
+    engine.ingest([sent("sim-001", 2)], time.time_ns())
     assert settled(engine.flush()) == {"sim-001": [(1, 2)]}
     assert sum(table.num_rows for table in reading.read(tmp_path, Kind.OBSERVATION)) == 4
 
@@ -150,14 +150,14 @@ def test_what_a_died_service_had_half_written_is_removed(engine: Engine, tmp_pat
 def test_no_segment_name_is_used_twice(tmp_path: Path) -> None:
     for seq in range(1, 4):
         engine = Engine(ServiceConfig(), tmp_path)
-        engine.take([sent("sim-001", seq)], time.time_ns())
+        engine.ingest([sent("sim-001", seq)], time.time_ns())
         engine.flush()
         engine.close()
     assert len(segments.paths(tmp_path, Kind.OBSERVATION)) == 3
 
 
 def test_rows_read_back_are_the_rows_written(engine: Engine, tmp_path: Path) -> None:
-    engine.take([sent("sim-001", 1), sent("sim-002", 1, told=False)], time.time_ns())
+    engine.ingest([sent("sim-001", 1), sent("sim-002", 1, told=False)], time.time_ns())
     engine.flush()
     (table,) = reading.read(tmp_path, Kind.OBSERVATION)
     rows = segments.rows_of(table)
@@ -170,7 +170,7 @@ def test_rows_read_back_are_the_rows_written(engine: Engine, tmp_path: Path) -> 
 
 
 def test_other_tools_read_the_segments(engine: Engine, tmp_path: Path) -> None:
-    engine.take([sent("sim-001", 1), sent("sim-002", 1, told=False)], time.time_ns())
+    engine.ingest([sent("sim-001", 1), sent("sim-002", 1, told=False)], time.time_ns())
     engine.flush()
     pattern = str(tmp_path / "inbox" / "*.parquet")
     with duckdb.connect() as db:
@@ -209,8 +209,8 @@ def test_keys_are_for_the_service_alone_and_a_destroyed_one_forgets(tmp_path: Pa
 def test_a_late_observation_is_archived_with_its_mark_and_not_fused(engine: Engine, tmp_path: Path) -> None:
     now = time.time_ns()
     old = batch("sim-002", 1, now - 1000 * SECOND, [0.3])
-    engine.take([sent("sim-001", 1)], now)
-    engine.take([Message(Kind.OBSERVATION, key("sim-002"), wire.encode(old), "")], now)
+    engine.ingest([sent("sim-001", 1)], now)
+    engine.ingest([Message(Kind.OBSERVATION, key("sim-002"), wire.encode(old), "")], now)
     assert settled(engine.flush()) == {"sim-001": [(1, 1)], "sim-002": [(1, 1)]}
     assert engine.counts["late"] == 1
     (table,) = reading.read(tmp_path, Kind.OBSERVATION)

@@ -210,7 +210,7 @@ def test_a_service_on_a_compacted_archive_has_the_same_map_and_knows_what_it_hol
     messages = [sent(f"sim-{k % 5:03}", 1 + k // 5) for k in range(20)]
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for k in range(0, 20, 4):
-            engine.take(messages[k : k + 4], time_ns())
+            engine.ingest(messages[k : k + 4], time_ns())
             engine.flush()
             if k == 8:
                 compact(tmp_path)  # while the service runs
@@ -219,7 +219,7 @@ def test_a_service_on_a_compacted_archive_has_the_same_map_and_knows_what_it_hol
     for _ in range(2):
         with closing(Engine(ServiceConfig(), tmp_path)) as again:
             np.testing.assert_allclose(again.fusion.beliefs(np.arange(again.fusion.size), at), before, atol=1e-6)
-            again.take(messages, time_ns())
+            again.ingest(messages, time_ns())
             assert again.counts["duplicates"] == 20
             assert settled(again.flush()).keys() == {f"sim-{k:03}" for k in range(5)}
         compact(tmp_path)

@@ -72,7 +72,7 @@ def test_a_service_on_the_kept_archive_has_the_map_that_it_was_made_with(old: Pa
     with closing(Engine(ServiceConfig(), old)) as engine:
         same(map_of(engine, MADE["at"]), MADE)
         assert engine.alerts == MADE["alerts"] > 0
-        engine.take([m for turn in range(ROUNDS) for m in messages(turn)], now_of(ROUNDS))
+        engine.ingest([m for turn in range(ROUNDS) for m in messages(turn)], now_of(ROUNDS))
         assert engine.counts["duplicates"] == 8 * 2 * ROUNDS, "it knows every batch again"
     assert not list(old.rglob("*.bad"))
 
@@ -80,7 +80,7 @@ def test_a_service_on_the_kept_archive_has_the_map_that_it_was_made_with(old: Pa
 def test_what_is_kept_is_compacted_together_with_what_is_new_and_gives_the_same_map(old: Path) -> None:
     with closing(Engine(ServiceConfig(), old)) as engine:
         for turn in (ROUNDS, ROUNDS + 1):
-            engine.take(list(messages(turn)), now_of(turn))
+            engine.ingest(list(messages(turn)), now_of(turn))
             engine.flush()
     drop_checkpoints(old)
     with closing(Engine(ServiceConfig(), old)) as engine:

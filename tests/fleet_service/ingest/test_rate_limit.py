@@ -12,7 +12,7 @@ import zenoh
 from fleet_service.ingest import rate_limit
 from fleet_service.ingest.acks import Acks
 from fleet_service.ingest.dedup import SequenceTracker
-from fleet_service.ingest.rate_limit import LEAST_BYTES, Limits
+from fleet_service.ingest.rate_limit import LEAST_BYTES, RateLimiter
 from schemas import wire
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.errors import InputError
@@ -35,36 +35,36 @@ class Clock:
         return self.now
 
 
-def buckets(clock: Clock, known: set[str] | None = None) -> tuple[Limits, Counter[str]]:
+def buckets(clock: Clock, known: set[str] | None = None) -> tuple[RateLimiter, Counter[str]]:
     counts: Counter[str] = Counter()
-    return Limits(RATE, BURST, known, counts, clock), counts
+    return RateLimiter(RATE, BURST, known, counts, clock), counts
 
 
 def test_a_vehicle_may_send_a_burst_and_then_its_rate() -> None:
     clock = Clock()
     found, counts = buckets(clock)
-    assert sum(found.lets("obs/a", 5_000) for _ in range(100)) == BURST / 5_000
+    assert sum(found.allows("obs/a", 5_000) for _ in range(100)) == BURST / 5_000
     clock.now = 2.0
-    assert sum(found.lets("obs/a", 5_000) for _ in range(100)) == 2 * RATE / 5_000
+    assert sum(found.allows("obs/a", 5_000) for _ in range(100)) == 2 * RATE / 5_000
     assert counts == {"limited": 200 - 10 - 4}
 
 
 def test_small_messages_cost_what_it_takes_to_read_one() -> None:
     found, _ = buckets(Clock())
-    assert sum(found.lets("obs/a", 1) for _ in range(1000)) == BURST // LEAST_BYTES
+    assert sum(found.allows("obs/a", 1) for _ in range(1000)) == BURST // LEAST_BYTES
 
 
 def test_one_that_sends_too_much_takes_nothing_from_the_others() -> None:
     found, _ = buckets(Clock())
     for _ in range(1000):
-        found.lets("obs/1202/310/232/loud", 60_000)
-    assert found.lets("obs/1202/310/232/quiet", 300)
+        found.allows("obs/1202/310/232/loud", 60_000)
+    assert found.allows("obs/1202/310/232/quiet", 300)
 
 
 def test_who_is_not_enrolled_is_not_looked_at() -> None:
     found, counts = buckets(Clock(), {"car-1"})
-    assert found.lets("obs/1202/310/232/car-1", 300)
-    assert not any(found.lets(f"obs/1202/310/232/{name}", 300) for name in ("car-2", "**", ""))
+    assert found.allows("obs/1202/310/232/car-1", 300)
+    assert not any(found.allows(f"obs/1202/310/232/{name}", 300) for name in ("car-2", "**", ""))
     assert counts == {"refused.unknown": 3}
     assert len(found) == 1
 
@@ -73,11 +73,11 @@ def test_names_that_are_made_up_share_one_bucket_and_do_not_fill_the_memory(monk
     monkeypatch.setattr(rate_limit, "MOST_NAMES", 100)
     clock = Clock()
     found, _ = buckets(clock)
-    through = sum(found.lets(f"obs/made-up-{number}", int(BURST)) for number in range(10_000))
+    through = sum(found.allows(f"obs/made-up-{number}", int(BURST)) for number in range(10_000))
     assert through == 101
     assert len(found) == 101
     clock.now = BURST / RATE
-    assert found.lets("obs/after-a-while", 300), "buckets that are full again are forgotten"
+    assert found.allows("obs/after-a-while", 300), "buckets that are full again are forgotten"
     assert len(found) == 1
 
 

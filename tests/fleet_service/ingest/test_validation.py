@@ -17,7 +17,7 @@ from fleet_service.archive.pseudonyms import Pseudonyms
 from fleet_service.ingest.acks import Acks, ranges
 from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.inbox import Inbox, Intake, Message
-from fleet_service.ingest.rate_limit import Limits
+from fleet_service.ingest.rate_limit import RateLimiter
 from fleet_service.ingest.validation import Clock
 from schemas import grid, wire
 from schemas.wire import Kind
@@ -144,7 +144,7 @@ def test_a_batch_is_admitted_once_however_often_and_wherever_it_comes(desk: Desk
 
 def test_a_full_queue_drops_and_counts() -> None:
     counts: Counter[str] = Counter()
-    inbox = Inbox(2, counts, Limits(1e6, 1e6, None, counts))
+    inbox = Inbox(2, counts, RateLimiter(1e6, 1e6, None, counts))
     for _ in range(5):
         inbox.put(message(good()))
     assert len(inbox.drain(0.0)) == 2

@@ -76,7 +76,7 @@ def drive(engine: Engine, begin: int, seq: int) -> None:
     """Three vehicles, one visit each, at a time [ns]."""
     for k in range(3):
         sent = batch(f"sim-00{k}", seq, begin + k * SECOND, [0.8])
-        engine.take([Message(Kind.OBSERVATION, key(sent.vehicle), wire.encode(sent), "")], begin + 60 * SECOND)
+        engine.ingest([Message(Kind.OBSERVATION, key(sent.vehicle), wire.encode(sent), "")], begin + 60 * SECOND)
     engine.flush()
 
 
@@ -96,7 +96,7 @@ def test_a_restart_from_the_archive_has_the_weather_that_was_used_and_gives_the_
     told = weather.encode(Report(start + 1200 * SECOND, road_temperature=-1.0, precipitation=1.0))
     engine.weather.hear(Heard(keys.weather_key(REGION), told, wire.WEATHER_ENCODING))
     engine.weather.hear(Heard(keys.weather_key(REGION), b"garbage", ""))
-    engine.overcast(start + 1300 * SECOND)
+    engine.update_weather(start + 1300 * SECOND)
     drive(engine, start + 3000 * SECOND, 2)
     assert (engine.counts["weather"], engine.counts["refused.weather"]) == (2, 1)
     engine.close()

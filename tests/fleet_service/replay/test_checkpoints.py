@@ -75,11 +75,11 @@ def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(tmp_path: Path, r
     sent = [icy(k % 6, 1 + k // 6, 0.2 if k % 5 else 0.8) for k in range(60)]
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for k in range(0, 40, 4):
-            engine.take(sent[k : k + 4], time.time_ns())
+            engine.ingest(sent[k : k + 4], time.time_ns())
             engine.flush()
         compact(tmp_path)
         path = keep(engine, tmp_path)
-        engine.take(sent[40:], time.time_ns())
+        engine.ingest(sent[40:], time.time_ns())
         engine.flush()
         at, alerts = time.time_ns(), engine.alerts
         running = beliefs(engine, at)
@@ -89,7 +89,7 @@ def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(tmp_path: Path, r
         assert replayed == [20]
         assert again.alerts == alerts > 0
         assert again.counts["checkpoints_refused"] == 0
-        again.take(sent, time.time_ns())
+        again.ingest(sent, time.time_ns())
         assert again.counts["duplicates"] == 60
     assert path.name < f"{at:020d}"
     drop_checkpoints(tmp_path)
@@ -101,12 +101,12 @@ def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(tmp_path: Path, r
 
 def test_what_is_in_a_checkpoint_is_on_disk(tmp_path: Path) -> None:
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
-        engine.take([icy(k, 1, 0.5) for k in range(4)], time.time_ns())
+        engine.ingest([icy(k, 1, 0.5) for k in range(4)], time.time_ns())
         keep(engine, tmp_path)
-        engine.take([icy(k, 2, 0.5) for k in range(4)], time.time_ns())  # dies before its segment
+        engine.ingest([icy(k, 2, 0.5) for k in range(4)], time.time_ns())  # dies before its segment
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
         assert again.fusion.live.visits[0] == 4
-        again.take([icy(k, seq, 0.5) for k in range(4) for seq in (1, 2)], time.time_ns())
+        again.ingest([icy(k, seq, 0.5) for k in range(4) for seq in (1, 2)], time.time_ns())
         assert (again.counts["duplicates"], again.fusion.live.visits[0]) == (4, 8)
 
 
@@ -114,7 +114,7 @@ def test_what_is_in_a_checkpoint_is_on_disk(tmp_path: Path) -> None:
 def test_a_damaged_checkpoint_gives_way_to_the_one_before_and_to_the_log(tmp_path: Path, harm: str) -> None:
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         for seq in (1, 2, 3):
-            engine.take([icy(k, seq, 0.3) for k in range(4)], time.time_ns())
+            engine.ingest([icy(k, seq, 0.3) for k in range(4)], time.time_ns())
             keep(engine, tmp_path)
         at = time.time_ns()
         running = beliefs(engine, at)

@@ -37,7 +37,7 @@ def hear(engine: Engine, *names: str) -> None:
     """One visit of each."""
     now = time.time_ns()
     sent = [Message(Kind.OBSERVATION, key(n), wire.encode(batch(n, 1, now - SECOND, [0.8])), "") for n in names]
-    engine.take(sent, now)
+    engine.ingest(sent, now)
     engine.flush()
 
 
