@@ -128,11 +128,11 @@ def own_plants(barred: Sequence[Figure], values: dict[str, float]) -> str:
 
 def oracles(barred: Sequence[Figure], values: dict[str, float]) -> str:
     """The bars for which there is an oracle, the default, and the oracle."""
-    rows = [
-        [bar.name, f"{bar.bar}", f"{bar.value:.3g}", number(values, bar.name.replace("papers.", "oracle.", 1))]
-        for bar in barred
-        if bar.name.replace("papers.", "oracle.", 1) in values
-    ]
+    rows = []
+    for bar in barred:
+        name = f"oracle.{bar.name.removeprefix('papers.')}"
+        if name in values:
+            rows.append([bar.name, f"{bar.bar}", f"{bar.value:.3g}", number(values, name)])
     return grid(("figure", "bar", "default", "oracle"), rows)
 
 

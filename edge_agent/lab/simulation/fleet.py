@@ -28,7 +28,7 @@ from edge_agent.lab.simulation.plant import (
     wheel_place,
 )
 from edge_agent.lab.simulation.presets import nominal, one_of_a_fleet
-from edge_agent.lab.simulation.relief import gradient, tilt
+from edge_agent.lab.simulation.relief import gradient, lean, tilt
 from edge_agent.lab.simulation.roads import LanePoint, Network
 from edge_agent.lab.simulation.scenarios import Scenario, scenario_named
 from edge_agent.lab.simulation.sensors import (
@@ -44,6 +44,7 @@ from schemas.errors import InputError
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.jit import compiled
 
+TURN_OVER_M = 6.0  # in which a road turns over from one crossfall to another
 VEHICLE_STREAM = 0
 STOPS = 0.3  # share of the 7 s in which a driver of a rough vehicle stops: two or three times a minute
 GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0  # multiples of it, modulo 1, are spread evenly however many there are
@@ -77,7 +78,7 @@ def run(
 ) -> FloatArray:  # fmt: skip
     """Records (T, N, 32) of the next `steps` samples; the states are carried on in place.
 
-    states: vehicles (N, 12), drivers (N, 9), routes (N, 4), wheels (N, 8, 4); ground: lanes, tables
+    states: vehicles (N, 12), drivers (N, 10), routes (N, 4), wheels (N, 8, 4); ground: lanes, tables
     of friction and of relief; keys: of routes and of alerts (N,);
     timing: sample period [s] and plant steps in it; `first` is the number of the first sample.
     """
@@ -91,12 +92,10 @@ def run(
         for k in range(steps):
             t = (first + k) * period
             lane = lanes[0][lanes[1][g[Route.LANE]] + g[Route.POINT]]
-            east, north = gradient(
-                relief,
-                (x[Motion.X], x[Motion.Y]),
-                (lane[LanePoint.COS], lane[LanePoint.SIN]),
-                lane[LanePoint.CURVATURE],
-            )
+            turned = -math.expm1(-abs(x[Motion.VX]) * period / TURN_OVER_M)
+            d[Driver.LEAN] += (lean(relief, lane[LanePoint.CURVATURE]) - d[Driver.LEAN]) * turned
+            heading = (math.cos(x[Motion.YAW]), math.sin(x[Motion.YAW]))
+            east, north = gradient(relief, (x[Motion.X], x[Motion.Y]), heading, d[Driver.LEAN])
             u[Control.TILT, 0], u[Control.TILT, 1] = tilt(east, north, x[Motion.YAW])
             now = (t, period, gravity(u)[0])
             drive(x, (d, g), (lanes, friction), p, w, now, (keys[0][n], keys[1][n]))
@@ -155,6 +154,7 @@ class SimulatedFleet:
         )
         self._states = _start(self.scenario.network, self._parameters, rngs)
         self._states[1][:, Driver.STOPS] = np.where(self.rough, STOPS, 0.0)
+        self._states[1][:, Driver.LEAN] = self.scenario.relief.crossfall
         self._before = np.empty((0, vehicles, RECORD))  # what late clocks may still speak of
         self._wander = np.zeros((vehicles, 3))
         self._relief = self.scenario.relief.table

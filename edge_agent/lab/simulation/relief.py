@@ -75,12 +75,17 @@ class WaveColumn(IntEnum):
 
 
 @compiled
+def lean(table: FloatArray, curvature: float) -> float:
+    """How much a lane of that `curvature` [1/m] rises to its left [1]: crossfall, and less in a bend to the left."""
+    return float(table[0, 0] - table[0, 1] * curvature)
+
+
+@compiled
 def gradient(
-    table: FloatArray, place: tuple[float, float], lane: tuple[float, float], curvature: float
+    table: FloatArray, place: tuple[float, float], heading: tuple[float, float], left: float
 ) -> tuple[float, float]:
-    """∇h (east, north) at `place` (x, y) [m] on a lane of heading (cos, sin) and `curvature` [1/m]."""
-    left = table[0, 0] - table[0, 1] * curvature
-    east, north = -left * lane[1], left * lane[0]
+    """∇h (east, north) at `place` (x, y) [m] of a road that rises by `left` [1] to the left of `heading` (cos, sin)."""
+    east, north = -left * heading[1], left * heading[0]
     for k in range(1, table.shape[0]):
         row = table[k]
         along = place[0] * row[WaveColumn.EAST] + place[1] * row[WaveColumn.NORTH]

@@ -32,7 +32,7 @@ from edge_agent.lab.simulation.plant import (
     start_at,
     wheel_forces,
 )
-from edge_agent.lab.simulation.relief import STEEPEST, gradient, tilt
+from edge_agent.lab.simulation.relief import STEEPEST, gradient, lean, tilt
 from edge_agent.lab.simulation.roads import LanePoint
 from edge_agent.lab.simulation.scenarios import scenario_named
 from edge_agent.lab.simulation.sensors import ROUGH_FLEET, Sensors
@@ -155,7 +155,7 @@ def test_traffic_lights_stop_it_hold_it_and_let_it_go(slope: float) -> None:
 def test_every_road_is_the_gradient_of_a_height_and_public(name: str) -> None:
     for seed in range(20):
         table = ROADS[name](seed).table
-        slopes = np.array([gradient(table, (x, 0.0), (1.0, 0.0), 0.0) for x in np.linspace(0, 1000, 400)])
+        slopes = np.array([gradient(table, (x, 0.0), (1.0, 0.0), lean(table, 0.0)) for x in np.arange(0.0, 1e3, 3.0)])
         assert np.hypot(*slopes.T).max() <= STEEPEST * (1 + 1e-12)
         assert slopes.any() == (name != "level")
         east, north = slopes[7].tolist()
@@ -182,7 +182,7 @@ def test_lanes_fall_to_their_right_and_bends_to_their_inside() -> None:
     for heading in np.linspace(0, 6, 9).tolist():
         lane, falls = (float(np.cos(heading)), float(np.sin(heading))), []
         for curvature in (0.0, 0.02, -0.02):
-            east, north = gradient(table, (0.0, 0.0), lane, curvature)
+            east, north = gradient(table, (0.0, 0.0), lane, lean(table, curvature))
             falls.append(tilt(east, north, heading))
         np.testing.assert_allclose([left for _, left in falls], [0.025, 0.015, 0.035], atol=1e-12)
         np.testing.assert_allclose([ahead for ahead, _ in falls], 0.0, atol=1e-12)
@@ -197,7 +197,7 @@ def test_the_town_on_hills_reaches_eight_per_cent_and_is_gentle_where_it_is_icy(
             table,
             (row[LanePoint.X], row[LanePoint.Y]),
             (row[LanePoint.COS], row[LanePoint.SIN]),
-            row[LanePoint.CURVATURE],
+            lean(table, row[LanePoint.CURVATURE]),
         )
         along.append(east * row[LanePoint.COS] + north * row[LanePoint.SIN])
     steep = np.abs(along)
@@ -295,6 +295,15 @@ def test_a_rough_fleet_on_hills_is_the_same_whatever_its_blocks_and_its_number()
     pieces = [parts.step(n)[1] for n in (1, 7, 92, 300, 200)]
     np.testing.assert_array_equal(np.concatenate(pieces), signals)
     np.testing.assert_array_equal(one.step(600)[1][:, 0], signals[:, 0])
+
+
+def test_the_road_under_a_car_is_smooth() -> None:
+    fleet = SimulatedFleet("hills", 6, 5, 100.0, rough=0.5)
+    fleet.step(3000)
+    slope, speed = fleet.truth.slope, np.abs(fleet.truth.vx)
+    driven = np.maximum(speed[1:], 1.0) / 100.0
+    assert np.ptp(slope) > 0.06
+    assert (np.abs(np.diff(slope, axis=0)) / driven).max() < 0.03  # per metre; at 10 m/s, 3 m/s^2 in a second
 
 
 def test_torque_is_missing_in_about_half_of_a_rough_fleet() -> None:
