@@ -140,7 +140,6 @@ def _is_overload(node: ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) ->
     return any(ast.unparse(decorator).endswith("overload") for decorator in node.decorator_list)
 
 
-@pytest.mark.xfail(reason="on its way", strict=False)
 @pytest.mark.parametrize("package", ROOMS)
 def test_rooms_import_along_the_way_of_the_data(package: str) -> None:
     found = house.arrows(ROOT, package)
@@ -171,13 +170,11 @@ def test_the_contract_is_imported_without_compiler_session_or_science_library() 
     assert not heavy
 
 
-@pytest.mark.xfail(reason="on its way", strict=False)
 def test_no_function_takes_more_than_a_reader_holds_in_mind() -> None:
     found = house.too_wide(ROOT)
     assert not found, f"more than {MOST_PARAMETERS} positional parameters:\n" + "\n".join(found)
 
 
-@pytest.mark.xfail(reason="on its way", strict=False)
 def test_a_name_of_a_class_stands_for_one_thing() -> None:
     found = house.ambiguous_classes(ROOT)
     assert not found, "\n".join(f"{name}: {', '.join(places)}" for name, places in found.items())

@@ -66,7 +66,7 @@ def tyre_forces(
         force_x[wheel], force_y[wheel] = force
 
 
-class Motion(NamedTuple):
+class PlanarMotion(NamedTuple):
     """How the body moves."""
 
     vx: float
@@ -87,7 +87,7 @@ class WheelInputs(NamedTuple):
 
 
 @inlined
-def response(body: Body, motion: Motion, wheels: WheelInputs) -> tuple[float, float, float]:
+def response(body: Body, motion: PlanarMotion, wheels: WheelInputs) -> tuple[float, float, float]:
     """(a_x, a_y [m/s^2], yaw acceleration [rad/s^2]) of four Dugoff tyres' forces.
 
     Written out per wheel, with numbers and no arrays between: this is where the papers' filters spend their time.

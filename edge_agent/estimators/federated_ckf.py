@@ -22,7 +22,7 @@ from typing import Annotated
 
 import numpy as np
 
-from edge_agent.dynamics.chassis import Motion, WheelInputs, response
+from edge_agent.dynamics.chassis import PlanarMotion, WheelInputs, response
 from edge_agent.dynamics.parameters import body, four
 from edge_agent.estimators.bank import EstimatorBank
 from edge_agent.estimators.common.inputs import wheel_force
@@ -135,7 +135,7 @@ def _measure(
         force_x[wheel] = wheel_force(row, track, wheel, dt)
     axis_points(mean, root, XI, points)
     cos, sin, omega = four(track.steering[0]), four(track.steering[1]), four(use[S.OMEGA : S.TORQUE])
-    motion = Motion(
+    motion = PlanarMotion(
         x[PlanarState.VX], x[PlanarState.VY], x[PlanarState.YAW_RATE], x[PlanarState.AX], x[PlanarState.AY]
     )  # fmt: skip
     for p in range(points.shape[0]):

@@ -26,7 +26,7 @@ from typing import Annotated
 import numpy as np
 
 from edge_agent.dynamics.body import advance_velocity
-from edge_agent.dynamics.chassis import DUGOFF, Motion, WheelInputs, response, tyre_forces, wheel_inputs
+from edge_agent.dynamics.chassis import DUGOFF, PlanarMotion, WheelInputs, response, tyre_forces, wheel_inputs
 from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import P, body, four
 from edge_agent.estimators.bank import EstimatorBank
@@ -123,7 +123,7 @@ def _friction(x: FloatArray, mean: FloatArray, share: float, mu: FloatArray) -> 
 def _felt(row: FloatArray, x: FloatArray, track: InputTrack, mu: FloatArray) -> tuple[float, float]:
     """(a_y, yaw acceleration) of the tyres at x (7,)."""
     use, unknown = track.inputs, (math.nan, math.nan, math.nan, math.nan)
-    motion = Motion(x[0], x[1], x[WheelFrictionState.YAW_RATE], use[S.AX], use[S.AY])
+    motion = PlanarMotion(x[0], x[1], x[WheelFrictionState.YAW_RATE], use[S.AX], use[S.AY])
     cos, sin, omega = four(track.steering[0]), four(track.steering[1]), four(use[S.OMEGA : S.TORQUE])
     _, ay, turn = response(body(row), motion, WheelInputs(cos, sin, omega, unknown, four(mu)))
     return ay, turn

@@ -6,9 +6,9 @@ A batch is due when it is full, when its oldest record has waited long enough, o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from edge_agent.observe.observation_builder import RecordBlock
 from edge_agent.publish.outbox import Draft
 from schemas import grid
 from schemas.wire import Batch, Columns, Kind, encode
+
+UNNUMBERED: Final = 0  # the outbox numbers a batch when it takes it in
 
 
 class _Place(NamedTuple):
@@ -82,15 +84,14 @@ class Batcher:
 
     def _draft(self, place: _Place, columns: Columns) -> Draft:
         name = self._names[place.vehicle]
-        fixed = partial(_encoded, place.kind, name, self._boot, place.region, columns, self._estimator)
-        return Draft(name, place.kind, place.region, len(columns["latitude"]), fixed)
+        batch = Batch(place.kind, name, self._boot, place.region, UNNUMBERED, UNNUMBERED, columns, self._estimator)
+        return Draft(name, place.kind, place.region, batch.rows, partial(_encoded, batch))
 
 
 def _slice(columns: Columns, first: int, last: int) -> Columns:
     return {name: column[first:last] for name, column in columns.items()}
 
 
-def _encoded(
-    kind: Kind, vehicle: str, boot: int, region: int, columns: Columns, estimator: str, seq: int, first_held: int
-) -> bytes:
-    return encode(Batch(kind, vehicle, boot, region, seq, first_held, columns, estimator))
+def _encoded(batch: Batch, seq: int, first_held: int) -> bytes:
+    """The bytes of a batch that the outbox has given its number."""
+    return encode(replace(batch, seq=seq, first_held=first_held))

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edge_agent.dynamics.body import advance_velocity
-from edge_agent.dynamics.chassis import Motion, WheelInputs, response
+from edge_agent.dynamics.chassis import PlanarMotion, WheelInputs, response
 from edge_agent.dynamics.parameters import Body, Four, body, four
 from edge_agent.estimators.common.inputs import InputTrack, wheel_force
 from schemas.mugrid import LOWER, UPPER
@@ -98,17 +98,17 @@ def _heun(vehicle: Body, columns: FloatArray, first: int, last: int, drive: Heun
         v, u, ax, ay, r, z = column_v[p], column_u[p], column_x[p], column_y[p], column_r[p], column_z[p]
         one = min(max(z, LOWER), UPPER)
         mu = begin.mu if by_torque else (one, one, one, one)
-        _, _, turn = response(vehicle, Motion(v, u, r, ax, ay), _with(begin, mu))
+        _, _, turn = response(vehicle, PlanarMotion(v, u, r, ax, ay), _with(begin, mu))
         turn = z if by_torque else turn
         slope_x, slope_y = ax + r * u, ay - r * v
         ahead, aside, rate = v + step * slope_x, u + step * slope_y, r + step * turn
         vx, vy = advance_velocity(v, u, ax, ay, r, step) if by_torque else (ahead, aside)
-        felt_x, felt_y, again = response(vehicle, Motion(vx, vy, rate, ax, ay), _with(end, mu))
+        felt_x, felt_y, again = response(vehicle, PlanarMotion(vx, vy, rate, ax, ay), _with(end, mu))
         if not by_torque:
             vx = v + 0.5 * step * (slope_x + felt_x + rate * aside)
             vy = u + 0.5 * step * (slope_y + felt_y - rate * ahead)
         rate = r + 0.5 * step * (turn + again)
-        felt_x, felt_y, again = response(vehicle, Motion(vx, vy, rate, ax, ay), _with(end, mu))
+        felt_x, felt_y, again = response(vehicle, PlanarMotion(vx, vy, rate, ax, ay), _with(end, mu))
         column_v[p], column_u[p], column_x[p], column_y[p], column_r[p] = vx, vy, felt_x, felt_y, rate
         column_z[p] = again if by_torque else z
 

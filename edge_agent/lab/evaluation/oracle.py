@@ -47,7 +47,7 @@ THETA: Final = np.linspace(0.0, 4.0, 2001)
 LEAST: Final = 1e-3  # normalised slip below which a wheel rolls freely
 
 
-class Heard(NamedTuple):
+class OracleSignals(NamedTuple):
     """A drive of 002.sine: what the oracle knows, and what rolls and pitches in the accelerometers, (T,) each."""
 
     batch: DriveSet
@@ -62,12 +62,12 @@ def speed(seeds: Sequence[int]) -> FloatArray:
     car, batch = scenario.vehicle, realistic(scenario, seeds)
     felt = realistic(scenario, seeds[:1], Sensors(leak=True)).signals[:, 0, S.AX : S.AY + 1]
     leaked = felt - np.stack([batch.truth["true_ax"][:, 0], batch.truth["true_ay"][:, 0]], axis=-1)
-    heard = Heard(batch, leaked[:, 1] / car.roll_leak, leaked[:, 0] / car.pitch_leak, felt)
+    heard = OracleSignals(batch, leaked[:, 1] / car.roll_leak, leaked[:, 0] / car.pitch_leak, felt)
     known = [vehicle.wheel_radius / car.vehicle.wheel_radius - 1.0 for vehicle in batch.vehicles]
     return np.array([_speed(heard, n, rho) for n, rho in enumerate(known)])
 
 
-def _speed(heard: Heard, n: int, rho: float) -> float:
+def _speed(heard: OracleSignals, n: int, rho: float) -> float:
     """Each second he estimates ρ anew from all that came before, and corrects the wheels by it."""
     batch, car = heard.batch, PAPERS["002.sine"].vehicle
     v, vy, r = (batch.truth[f"true_{name}"][:, n] for name in ("vx", "vy", "yaw_rate"))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edge_agent.dynamics.body import accelerations
-from edge_agent.dynamics.chassis import DUGOFF, Motion, WheelInputs, response, tyre_forces, wheel_inputs
+from edge_agent.dynamics.chassis import DUGOFF, PlanarMotion, WheelInputs, response, tyre_forces, wheel_inputs
 from edge_agent.dynamics.drive_wheel import ELECTRIC_S, WheelState, blended, drive_wheel, slip_share
 from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import P, body, four, parameter_row
@@ -51,7 +51,7 @@ def test_the_response_is_that_of_the_tyres_unless_a_force_is_known() -> None:
 
     def felt(known: FloatArray) -> tuple[float, float, float]:
         cos, sin, mu = four(inputs[:, 0]), four(inputs[:, 1]), (0.8, 0.8, 0.8, 0.8)
-        return response(body(ROW), Motion(*MOTION), WheelInputs(cos, sin, four(omega), four(known), mu))
+        return response(body(ROW), PlanarMotion(*MOTION), WheelInputs(cos, sin, four(omega), four(known), mu))
 
     tyre_x, tyre_y = forces(DUGOFF, 0.8, omega)
     assert felt(UNKNOWN) == pytest.approx(accelerations(ROW, tyre_x, tyre_y, DELTA), rel=1e-12, abs=1e-12)
