@@ -159,6 +159,7 @@ def test_run_drives_a_log_in_real_time_and_publishes_it(
     assert main(["run", *source, "--estimator", "ckf", "--duration", "1", *config(tmp_path, router)]) == 0
     told = counts(capsys)
     assert told["acknowledged"] == told["published"] == sum(b.rows for b in service.batches) >= 3
+    assert {b.estimator for b in service.batches} == {"ckf"}
     assert told["unsettled"] == 0
 
 
@@ -170,6 +171,7 @@ def test_fleet_gives_each_vehicle_its_name_and_writes_what_is_true(
     assert main(["fleet", *options, "--estimator", "ckf", "--duration", "2", *config(tmp_path, router)]) == 0
     names = {f"sim-{n:03}" for n in range(1, 5)}
     assert {b.vehicle for b in service.batches} == names == set(pq.read_table(truth)["vehicle"].to_pylist())
+    assert {b.estimator for b in service.batches} == {"ckf"}
     told = counts(capsys)
     assert told["unsettled"] == told["observations_unsettled"] == 0
     assert told["observations_published"] >= 4

@@ -6,8 +6,11 @@ One table per place where options are declared; a test says when an option is in
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import json
+import shutil
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -16,7 +19,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from edge_agent.app.estimator_factory import bank_of
-from edge_agent.cli import COMMANDS, main
+from edge_agent.cli import COMMANDS, live, main
 from edge_agent.inputs.block import Block
 from edge_agent.lab.simulation import SimulatedFleet
 from edge_agent.lab.simulation.blocks import blocks
@@ -38,31 +41,44 @@ SIMULATE = {
     )},
     "--no-torque": [*SIMULATED, "--no-torque"],
 }  # fmt: skip
-LIVE, REPLAYED = "test_seed_rate_and_scenario_of_a_live_drive", "test_log_vehicle_estimator_and_configuration"
-# what the other options of the commands do is told by the tests named here
-REAL = "test_the_real_minute_becomes_a_log"
+# run, fleet, tune: option -> the words that are added to those of USUAL; `{0}` and `{1}` are two drives
+USUAL = {
+    "run": ["run"], "fleet": ["fleet", "--vehicles", "3"], "tune": ["tune", "--quick"],
+}  # fmt: skip
+LOGGED = ["--source", "{0}.parquet", "--vehicle", "{0}.json"]
+CHANGED: dict[tuple[str, str], list[str]] = {
+    ("run", "--source"): LOGGED, ("run", "--vehicle"): [*LOGGED[:2], "--vehicle", "{1}.json"],
+    **{(command, option): [option, value] for command in ("run", "fleet") for option, value in (
+        ("--estimator", "ckf"), ("--config", "{0}.agent"), ("--scenario", "hills"), ("--rate", "50"), ("--seed", "1"),
+        ("--duration", "7"),
+    )},
+    ("run", "--name"): ["--name", "car-one"], ("fleet", "--vehicles"): ["--vehicles", "4"],
+    ("fleet", "--rough"): ["--rough", "0.5"], ("fleet", "--truth"): ["--truth", "{0}.truth"],
+    **{("tune", option): [option, value] for option, value in (
+        ("--seed", "1"), ("--ants", "4"), ("--iterations", "3"), ("--objective", "innovation"), ("--out", "{0}.tuned"),
+    )},
+}  # fmt: skip
+REPLAYED = "test_log_vehicle_estimator_and_configuration_of_a_replay_change_what_it_says"
+SENT_BY_REPLAY = "test_replay_publishes_observations_and_states_at_the_time_of_the_drive_and_waits"
+# what the other options of the commands do is told by the tests named here, in whose modules they are given
+REAL = "test_the_real_minute_becomes_a_log_in_si_with_its_provenance"
+CAMPAIGN = "test_the_quick_campaign_writes_figures_report_and_plots"
+SEEDS = "test_more_seeds_are_driven_and_no_plots_drawn_where_so_asked"
 ELSEWHERE = {
-    "simulate": {"--list": "test_simulate_lists_the_manoeuvres", "--out": "test_simulate_writes",
-                 "--vehicle-out": "test_simulate_writes"},
+    "simulate": {"--list": "test_simulate_lists_the_manoeuvres",
+                 "--out": "test_simulate_writes_a_log_with_truth_and_the_vehicle_file",
+                 "--vehicle-out": "test_simulate_writes_a_log_with_truth_and_the_vehicle_file"},
     "import": {"source": REAL, "--profile": REAL, "--vehicle": REAL, "--out": REAL,
                "--list": "test_the_shipped_profiles",
                "--dbc": "test_another_database", "--draft": "test_another_database",
                "--clock": "test_clocks_that_do_not_meet"},
     "replay": {"log": REPLAYED, "--vehicle": REPLAYED, "--estimator": REPLAYED, "--out": REPLAYED, "--config": REPLAYED,
-               "--publish": "test_replay_publishes", "--name": "test_replay_publishes",
-               "--start": "test_replay_publishes", "--jobs": "test_two_jobs_write"},
-    "run": {"--source": "test_run_drives_a_log", "--vehicle": "test_run_drives_a_log",
-            "--name": "test_run_drives_a_log", "--config": "test_run_drives_a_log", "--estimator": REPLAYED,
-            "--scenario": LIVE, "--rate": LIVE, "--seed": LIVE, "--duration": "test_fleet_gives"},
-    "fleet": {"--vehicles": "test_fleet_gives", "--config": "test_fleet_gives", "--truth": "test_fleet_gives",
-              "--duration": "test_fleet_gives", "--estimator": REPLAYED, "--scenario": LIVE, "--rate": LIVE,
-              "--seed": LIVE, "--rough": "test_half_a_fleet_is_rough"},
-    "tune": {"--seed": "test_options_out_of_range", "--ants": "test_options_out_of_range",
-             "--iterations": "test_options_out_of_range", "--objective": "test_quick_tuning_writes",
-             "--out": "test_quick_tuning_writes", "--quick": "test_quick_tuning_writes",
-             "--study": "test_the_quick_study_writes"},
-    "evaluate": {"--out": "test_the_quick_campaign", "--quick": "test_the_quick_campaign",
-                 "--seeds": "test_more_seeds", "--no-plots": "test_more_seeds"},
+               "--publish": SENT_BY_REPLAY, "--name": SENT_BY_REPLAY, "--start": SENT_BY_REPLAY,
+               "--jobs": "test_two_jobs_write_what_one_writes_and_what_a_single_replay_writes"},
+    "run": {}, "fleet": {},
+    "tune": {"--quick": "test_quick_tuning_writes_a_valid_file_and_says_what_it_does",
+             "--study": "test_the_quick_study_writes_figures_table_plot_and_a_tuned_file"},
+    "evaluate": {"--out": CAMPAIGN, "--quick": CAMPAIGN, "--seeds": SEEDS, "--no-plots": SEEDS},
 }  # fmt: skip
 # agent configuration: setting -> another value; those of sending are shown where things are sent
 OBSERVED = {
@@ -87,14 +103,81 @@ def options(command: str) -> set[str]:
 
 def test_every_option_of_every_command_is_in_a_table() -> None:
     for command in COMMANDS:
-        shown = set(ELSEWHERE[command.name]) | (set(SIMULATE) if command.name == "simulate" else set())
-        assert options(command.name) == shown, command.name
+        shown = set(ELSEWHERE[command.name]) | {option for name, option in CHANGED if name == command.name}
+        assert options(command.name) == shown | (set(SIMULATE) if command.name == "simulate" else set()), command.name
 
 
-def test_the_tests_that_show_an_option_exist() -> None:
-    text = "".join(path.read_text() for path in sorted(Path(__file__).parent.rglob("test_*.py")))
-    for shown in ELSEWHERE.values():
-        assert all(f"def {test}" in text for test in shown.values())
+def test_the_tests_that_show_an_option_give_it_to_the_command() -> None:
+    """In their module, with another value or with none elsewhere; that is read, not run."""
+    texts = [path.read_text() for path in sorted(Path(__file__).parent.rglob("test_*.py")) if path != Path(__file__)]
+    texts.append(Path(__file__).read_text().partition("def options(")[2])  # behind the tables
+    for command, shown in ELSEWHERE.items():
+        for option, test in shown.items():
+            text = "".join(text for text in texts if f"def {test}" in text)
+            assert f'"{option}"' in text or (text and not option.startswith("-")), (command, option)
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two drives with their vehicles, and a configuration."""
+    folder = tmp_path_factory.mktemp("given")
+    for k in (0, 1):
+        files = ["--out", str(folder / f"{k}.parquet"), "--vehicle-out", str(folder / f"{k}.json")]
+        assert main(["simulate", "slalom", "--duration", "2", "--seed", str(k), *files]) == 0
+    (folder / "0.agent").write_text(json.dumps({"estimator": "sr-ukf", "batch_rows": 7}))
+    return folder
+
+
+def driven(words: list[str], monkeypatch: pytest.MonkeyPatch, folder: Path) -> object:
+    """What a live command hands to the loop: vehicles, names, signals, settings, estimator, duration; and its files."""
+    seen: list[object] = []
+
+    def note(
+        vehicles: Sequence[Vehicle], names: Sequence[str], source: Iterator[Block], config: AgentConfig,
+        estimator: str | None, duration_s: float, at_end: Callable[[], None] = lambda: None,
+    ) -> int:  # fmt: skip
+        first = [next(source) for _ in range(3)]
+        at_end()
+        signals = [(block.t.tolist(), np.nan_to_num(block.signals).tolist()) for block in first]
+        seen.append([list(vehicles), list(names), signals, config, estimator, duration_s])
+        return 0
+
+    monkeypatch.setattr(live, "drive_live", note)
+    assert main(words) == 0
+    return seen, sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.parametrize(("command", "option"), [pair for pair in CHANGED if pair[0] != "tune"])
+def test_every_option_of_a_live_command_changes_what_is_driven(
+    command: str, option: str, given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "given"
+    shutil.copytree(given, folder)
+    changed = [word.format(folder / "0", folder / "1") for word in CHANGED[command, option]]
+    usual = USUAL[command]
+    if option == "--vehicle":
+        usual = [*usual, *(word.format(folder / "0", folder / "1") for word in LOGGED)]
+    first, again, other = (driven(words, monkeypatch, folder) for words in (usual, usual, [*usual, *changed]))
+    assert first == again
+    assert other != first
+
+
+@cache
+def tuned(folder: Path, *words: str) -> tuple[object, list[str]]:
+    """The memberships, scores and budget of a quick search, and the files that it wrote."""
+    folder.mkdir(parents=True)
+    with contextlib.chdir(folder):
+        assert main([*USUAL["tune"], *words]) == 0
+    (path,) = folder.iterdir()
+    document = json.loads(path.read_text())
+    return {name: part for name, part in document.items() if name != "provenance"}, [path.name]
+
+
+@pytest.mark.parametrize("option", [option for command, option in CHANGED if command == "tune"])
+def test_every_option_of_tune_changes_what_is_found(option: str, tmp_path_factory: pytest.TempPathFactory) -> None:
+    base = tmp_path_factory.getbasetemp() / "tuned"
+    words = [word.format("0") for word in CHANGED["tune", option]]
+    assert tuned(base / "usual") != tuned(base / option, *words)
 
 
 @pytest.mark.parametrize("option", SIMULATE)
@@ -176,15 +259,6 @@ def test_waiting_time_and_rows_of_a_batch_change_the_batches(flush_s: float, row
         return len(batcher.due(0.5))
 
     assert batches(flush_s, rows) != batches(1.0, 50)
-
-
-@pytest.mark.parametrize("change", [{"seed": 5}, {"rate": 100.0}, {"scenario": "demo"}], ids=lambda c: next(iter(c)))
-def test_seed_rate_and_scenario_of_a_live_drive_change_it(change: dict[str, object]) -> None:
-    usual = recorded(seconds=1.0)[0]
-    other = recorded(seconds=1.0, **change)[0]
-    assert usual.signals.shape != other.signals.shape or not np.array_equal(
-        usual.signals, other.signals, equal_nan=True
-    )
 
 
 @pytest.mark.parametrize(("estimator", "name"), NUMBERS)

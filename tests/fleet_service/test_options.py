@@ -1,0 +1,278 @@
+"""Every option of the commands is seen to matter: it is changed, the command runs, and what it does is
+another thing than before.
+
+A command runs on copies of the archive that is kept; what it prints, its exit code and every file below its folder is
+what it does. It does the same twice, so that a difference is the option's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import importlib.util
+import json
+import shutil
+import signal
+import sys
+import time
+from hashlib import blake2b
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import zenoh
+from cryptography import x509
+
+from fleet_service.cli import COMMANDS, ServiceCommand, main
+from schemas import grid, wire
+from schemas.config import ZenohSettings
+from tests.faults.processes import Part
+from tests.fleet_service.app.test_service import Fleet
+from tests.fleet_service.archive.kept import DATA, PLACES
+from tests.fleet_service.conftest import Running
+from tests.fleet_service.examples import CELL, LATITUDE, LONGITUDE, REGION, SECOND, batch
+from tests.secured import enrolment
+
+Capture = pytest.CaptureFixture[str]
+ARCHIVE: Final = ["--archive", "{a}"]
+ANALYZE: Final = ["analyze", "worst", *ARCHIVE, "--out", "{out}/a.csv"]
+REPLAY: Final = [
+    "analyze",
+    "replay",
+    *ARCHIVE,
+    "--out",
+    "{out}/a.csv",
+    "--from",
+    "2024-10-04T23:56",
+    "--to",
+    "2024-10-05",
+]
+WEATHER: Final = ["analyze", "weather", *ARCHIVE, "--out", "{out}/a.csv"]
+CERTS: Final = ["certs", "--fleet", "{fleet}", "--out", "{out}/certs"]
+USUAL: Final = {
+    "compact": ["compact", *ARCHIVE],
+    "retention": ["retention", *ARCHIVE, "--raw-days", "31"],
+    "forget": ["forget", *ARCHIVE, "--period", "2024-10"],
+    "export": ["export", "observations", *ARCHIVE, "--out", "{out}/a.csv"],
+    "analyze": ANALYZE,
+    "certs": CERTS,
+}
+BOX: Final = "11,57,13,59"  # around one of two towns
+# command -> option -> another value; or the words with which, and those without which, it is to be seen
+CHANGES: Final[dict[str, dict[str, str | tuple[list[str], list[str]]]]] = {
+    "compact": {"--archive": "{b}", "--to": "file://{out}/there", "--round-rows": "10"},
+    "retention": {"--archive": "{b}", "--raw-days": "100000"},
+    "forget": {"--archive": "{b}", "--period": "2024-09", "--vehicle": "sim-003"},
+    "export": {
+        "what": (["export", "rollup", *USUAL["export"][2:]], USUAL["export"]), "--archive": "{b}",
+        "--out": "{out}/a.geojson", "--from": "2024-10-05", "--to": "2024-10-05", "--bbox": BOX,
+    },
+    "analyze": {
+        "question": (["analyze", "grip", *ANALYZE[2:]], ANALYZE), "--archive": "{b}", "--out": "{out}/a.html",
+        "--from": "2024-10-04T23:58", "--to": "2024-10-04T23:57", "--bbox": BOX, "--min-vehicles": "5",
+        "--engine": "spark", "--at": ([*REPLAY, "--at", "2024-10-04T23:57"], REPLAY),
+        "--step": ([*REPLAY, "--step", "60"], REPLAY),
+        "--stations": ([*WEATHER, "--stations", "{warm}"], [*WEATHER, "--stations", "{cold}"]),
+    },
+    "certs": {
+        "--fleet": "{fleet2}", "--out": "{out}/others", "--days": "100", "--ca-days": "1000",
+        "--ca": ([*CERTS, "--ca", "next"], CERTS),
+    },
+}  # fmt: skip
+SHOWN_BELOW: Final = {
+    "certs": {"--renew-days"},
+    "run": {"--config", "--archive", "--weather"},
+    "query": {"--bbox", "--route", "--min-vehicles", "--at", "--basis", "--format", "--out", "--connect", "--config"},
+    "watch": {"--bbox", "--connect", "--config"},
+}
+# A campaign takes minutes: tests/fleet_service/lab/test_evaluate.py runs it small.
+CAMPAIGN: Final = {"--out", "--quick", "--skip-whole-way", "--whole-way"}
+
+
+class Done(NamedTuple):
+    """What a command did: exit code, what it printed, and the files below its folder."""
+
+    code: int
+    said: str
+    files: dict[str, str]
+
+
+def place(folder: Path) -> dict[str, str]:
+    """Two archives that are not the same, and files that are given to commands."""
+    names = {name: folder / name for name in ("a", "b", "out", "fleet", "fleet2", "warm", "cold")}
+    for name in ("a", "b"):
+        shutil.copytree(DATA / "v1.0" / "archive", names[name])
+    shutil.rmtree(names["b"] / "inbox")
+    shutil.rmtree(next((names["b"] / "observations").glob("*/zone=*")))
+    shutil.rmtree(next((names["b"] / "rollup/cell_hour").glob("*/zone=*")))
+    names["out"].mkdir()
+    names["fleet"].write_text(enrolment().model_dump_json())
+    names["fleet2"].write_text(enrolment(vehicles=["car-1"]).model_dump_json())
+    for name, degrees in (("warm", 20), ("cold", -5)):
+        rows = [f"{k},2024-10-04T23:00:00,{lat},{lon},{degrees}\n" for k, (lat, lon) in enumerate(PLACES)]
+        names[name].write_text("station,time,latitude,longitude,temperature\n" + "".join(rows))
+    return {name: str(path) for name, path in names.items()}
+
+
+def content(path: Path, folder: Path) -> str:
+    """What a file holds, as far as it is the same each time."""
+    if path.suffix == ".key" or path.name.startswith("README"):
+        return ""
+    if path.suffix == ".pem":
+        found = x509.load_pem_x509_certificates(path.read_bytes())
+        return str([(one.not_valid_after_utc - one.not_valid_before_utc).days for one in found])
+    return blake2b(path.read_bytes().replace(str(folder).encode(), b""), digest_size=8).hexdigest()
+
+
+def done(words: list[str], folder: Path, capsys: Capture) -> Done:
+    """Run a command in a new folder."""
+    names = place(folder)
+    code = main([word.format(**names) for word in words])
+    said = capsys.readouterr()
+    text = (said.out + (said.err if code else "")).replace(str(folder), "")
+    files = {str(p.relative_to(folder)): content(p, folder) for p in sorted(folder.rglob("*")) if p.is_file()}
+    return Done(code, text, files)
+
+
+def options(command: ServiceCommand) -> set[str]:
+    """What a command takes."""
+    parser = argparse.ArgumentParser(add_help=False)
+    importlib.import_module(command.module).add_arguments(parser)
+    return {action.option_strings[0] if action.option_strings else action.dest for action in parser._actions}
+
+
+def test_every_option_of_every_command_is_in_a_table() -> None:
+    for command in COMMANDS:
+        shown = set(CHANGES.get(command.name, {})) | SHOWN_BELOW.get(command.name, set())
+        assert options(command) == (CAMPAIGN if command.name == "evaluate" else shown), command
+
+
+@pytest.mark.parametrize(("command", "option"), [(c, o) for c, changes in CHANGES.items() for o in changes])
+def test_every_option_of_a_command_changes_what_it_does(
+    command: str, option: str, tmp_path: Path, capsys: Capture
+) -> None:
+    change, usual = CHANGES[command][option], USUAL[command]
+    if isinstance(change, tuple):
+        other, usual = change
+    elif option in usual:
+        at = usual.index(option) + 1
+        other = [*usual[:at], change, *usual[at + 1 :]]
+    else:
+        other = [*usual, option, change]
+    first, again = (done(usual, tmp_path / name, capsys) for name in ("first", "again"))
+    assert first == again
+    assert first.code == 0, first.said
+    seen = done(other, tmp_path / "other", capsys)
+    if option == "--engine" and importlib.util.find_spec("pyspark"):  # the answer is the same: test_spark
+        assert seen == first
+        return
+    assert seen != first
+    wrong = {"--period": "has no key of 2024-09", "--engine": "Spark is not installed"}
+    assert wrong.get(option, "") in seen.said
+    assert (seen.code == 0) == (option not in wrong), seen.said
+
+
+@pytest.mark.parametrize(("days", "renewed"), [("5", False), ("20", True)])
+def test_certificates_that_end_within_so_many_days_are_renewed(
+    days: str, renewed: bool, tmp_path: Path, capsys: Capture
+) -> None:
+    names = place(tmp_path)
+    words = [word.format(**names) for word in CERTS]
+    assert main([*words, "--days", "10", "--renew-days", "1"]) == 0
+    capsys.readouterr()
+    assert main([*words, "--days", "100", "--renew-days", days]) == 0
+    assert capsys.readouterr().out.startswith("issued 7: ") == renewed
+
+
+def test_weather_archive_and_configuration_of_a_service_are_those_that_run_is_given(
+    tmp_path: Path, router: ZenohSettings
+) -> None:
+    rain = pa.table({"region": [REGION], "time": [time.time_ns()], "precipitation": [2.0]})
+    pq.write_table(rain, tmp_path / "rain.parquet")
+    for name, more in (("shard-1", []), ("shard-2", ["--weather", str(tmp_path / "rain.parquet")])):
+        config, archive = tmp_path / f"{name}.json", tmp_path / name
+        config.write_text(json.dumps({"name": name, "zenoh": router.model_dump()}))
+        words = ["run", "--config", str(config), "--archive", str(archive), *more]
+        part = Part(name, [sys.executable, "-m", "fleet_service.cli", *words], tmp_path)
+        part.start()
+        try:
+            part.line_with(f"ready: {name}, ")
+        finally:
+            part.stop()
+        assert (archive / "inbox").is_dir()
+        assert len(list((archive / "weather").glob(f"{name}-*.parquet"))) == bool(more)
+
+
+FAR: Final = (LATITUDE, LONGITUDE + 0.05)
+
+
+def there(name: str, mu: float) -> wire.Batch:
+    """A batch of another tile in the same region."""
+    cell = int(grid.cell_of(*FAR))
+    return batch(name, 2, time.time_ns() - SECOND, [mu], latitude=[FAR[0]], longitude=[FAR[1]], cell=[cell])
+
+
+@pytest.fixture
+def fed(service: Running, session: zenoh.Session) -> Fleet:
+    """A service with three cars on ice, one of which is on a dry road elsewhere later."""
+    fleet = Fleet(session).meet()
+    fleet.settle(*(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(3)))
+    fleet.settle(there("sim-000", 0.8))
+    return fleet
+
+
+@pytest.mark.usefixtures("fed")
+def test_every_option_of_a_query_changes_the_answer(router: ZenohSettings, tmp_path: Path, capsys: Capture) -> None:
+    out, config = tmp_path / "a", tmp_path / "config.json"
+    config.write_text(json.dumps({"zenoh": router.model_dump()}))
+    usual = {"--connect": router.connect[0], "--format": "json", "--out": str(out)}
+    here, far = CELL, int(grid.cell_of(*FAR))
+
+    def cells(**changed: str | None) -> set[int]:
+        given = usual | {f"--{name.replace('_', '-')}": value for name, value in changed.items()}
+        words = [word for name, value in given.items() if value is not None for word in (name, value)]
+        assert main(["query", *words]) == 0
+        return {row["cell"] for tile in json.loads(out.read_text())["tiles"] for row in tile["cells"]}
+
+    assert cells() == {here, far}
+    assert cells(bbox="11.96,57.69,11.98,57.71") == {here}
+    assert cells(route=f"{FAR[1] - 1e-4},{FAR[0]}|{FAR[1] + 1e-4},{FAR[0]}") == {far}
+    assert cells(min_vehicles="2") == {here}
+    assert cells(at="2024-10-05") == set()
+    assert cells(basis="borrowed") > {here, far}
+    assert cells(connect=None, config=str(config)) == {here, far}
+    assert main(["query", "--connect", "tcp/127.0.0.1:1", "--format", "json"]) == 2
+    capsys.readouterr()
+    assert main(["query", "--connect", router.connect[0], "--format", "geojson"]) == 0
+    assert json.loads(capsys.readouterr().out)["type"] == "FeatureCollection"
+    assert main(["query", "--connect", router.connect[0]]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "2 cells"
+
+
+def test_a_box_chooses_the_tiles_that_are_watched_and_either_way_names_the_router(
+    service: Running, session: zenoh.Session, router: ZenohSettings, tmp_path: Path
+) -> None:
+    (tmp_path / "config.json").write_text(json.dumps({"zenoh": router.model_dump()}))
+    boxes = {"here": "11.96,57.69,11.98,57.71", "far": "12.01,57.69,12.03,57.71"}
+    ways = {"here": ["--connect", router.connect[0]], "far": ["--config", str(tmp_path / "config.json")]}
+    watching = {}
+    for name, box in boxes.items():
+        words = [sys.executable, "-m", "fleet_service.cli", "watch", "--bbox", box, *ways[name]]
+        watching[name] = Part(name, words, tmp_path)
+        watching[name].start()
+    try:
+        for part in watching.values():
+            part.line_with("watching")
+        fleet = Fleet(session).meet()
+        fleet.settle(batch("sim-001", 1, time.time_ns() - SECOND, [0.8]), there("sim-001", 0.8))
+        tiles = {name: part.line_with("tile ").split()[1] for name, part in watching.items()}
+        assert tiles["here"] != tiles["far"]
+        for name, part in watching.items():
+            part.send(signal.SIGTERM)
+            part.wait(30.0)
+            assert {line.split()[1] for line in part.lines() if line.startswith("tile ")} == {tiles[name]}
+    finally:
+        for part in watching.values():
+            part.kill()

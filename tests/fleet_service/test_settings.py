@@ -1,0 +1,151 @@
+"""Every setting of the service is seen to matter: it is changed, and what the service does is another thing."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Final
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from fleet_service.app import jobs, service
+from fleet_service.app.engine import Engine
+from fleet_service.app.service import Service
+from fleet_service.ingest.inbox import Message
+from schemas import wire
+from schemas.config import ServiceConfig
+from schemas.wire import Kind
+from tests.fleet_service.archive.kept import DATA
+from tests.fleet_service.examples import REGION, SECOND, batch, key
+from tests.secured import enrolment
+
+# Settings of the configuration: another value, and what shows it.
+Show = Callable[[ServiceConfig, Path], object]
+
+
+def taken(config: ServiceConfig, root: Path) -> Iterator[Engine]:
+    """An engine that has taken two cars' reports: one now, one of ten minutes ago, and one of a minute ahead."""
+    with closing(Engine(config, root)) as engine:
+        now = time.time_ns()
+        for name, age in (("sim-001", 1), ("sim-002", 600), ("sim-003", -60), ("sim-001", 300)):
+            sent = batch(name, 1 + (age == 300), now - age * SECOND, [0.5])
+            engine.ingest([Message(sent.kind, key(name), wire.encode(sent), wire.ENCODING[sent.kind])], now)
+        engine.flush()
+        yield engine
+
+
+def of_engine(look: Callable[[Engine], object]) -> Show:
+    return lambda config, root: next(look(engine) for engine in taken(config, root))
+
+
+def of_jobs(config: ServiceConfig, root: Path) -> object:
+    with closing(Engine(config, root)) as engine:
+        return {job.name: job.every_s for job in jobs.archive_jobs(engine, config, root)}
+
+
+def of_compaction(config: ServiceConfig, root: Path) -> object:
+    shutil.copytree(DATA / "v1.0" / "archive", root)
+    with closing(Engine(config, root)) as engine:
+        (compaction,) = (job for job in jobs.archive_jobs(engine, config, root) if job.name == "compaction")
+        assert compaction.work(threading.Event())
+    return sorted(path.name for path in root.parent.joinpath("there").rglob("*.parquet"))
+
+
+def of_service(look: Callable[[Service], object]) -> Show:
+    def show(config: ServiceConfig, root: Path) -> object:
+        made = Service(config, root, lambda _: None)
+        with closing(made.engine):
+            return look(made)
+
+    return show
+
+
+def let_in(made: Service) -> list[bool]:
+    """Which of thirty messages of 40 kB of two vehicles are looked at."""
+    return [made.inbox._limits.allows(key(name), 40_000) for name in ("car-1", "car-2") for _ in range(30)]
+
+
+def queued(made: Service) -> int:
+    for _ in range(5):
+        made.inbox.put(Message(Kind.STATE, "", b"", ""))
+    return len(made.inbox)
+
+
+def turns(made: Service) -> tuple[int, int]:
+    """How often segments are written and tiles put in ten turns of .3 s each."""
+    clock, calls = [time.monotonic()], {"begin_flush": 0, "tiles": 0}
+
+    def counted(name: str) -> Callable[..., list[Any]]:
+        def call(*_: object) -> list[Any]:
+            calls[name] += 1
+            return []
+
+        return call
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(service, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+        patch.setattr(service, "IDLE_S", 0.0)
+        for name in calls:
+            patch.setattr(made.engine, name, counted(name))
+        for _ in range(10):
+            clock[0] += 0.3
+            made._turn(None, threading.Event())  # type: ignore[arg-type]
+    return calls["begin_flush"], calls["tiles"]
+
+
+def refused(engine: Engine) -> object:
+    return engine.counts["refused.time"], engine.counts["late"]
+
+
+SETTINGS: Final[dict[str, tuple[object, Show]]] = {
+    "name": ("shard-9", lambda c, r: (of_engine(refused)(c, r), [p.name[:7] for p in (r / "inbox").glob("*.parquet")])),
+    "lateness_s": (1000.0, of_engine(refused)),
+    "clock_ahead_s": (120.0, of_engine(refused)),
+    "oldest_s": (400.0, of_engine(refused)),
+    "public_vehicles": (2, of_engine(lambda engine: len(engine.tiles(time.time_ns())))),
+    "weather": ("{rain}", of_engine(lambda engine: engine.counts["weather"])),
+    "compact_s": (10.0, of_jobs),
+    "checkpoint_s": (10.0, of_jobs),
+    "snapshot_s": (10.0, of_jobs),
+    "raw_days": (50, of_jobs),
+    "put_to": ("file://{there}", of_compaction),
+    "queue_batches": (3, of_service(queued)),
+    "vehicle_kb_s": (1e9, of_service(let_in)),
+    "vehicle_burst_kb": (100.0, of_service(let_in)),
+    "fleet": ("{fleet}", of_service(let_in)),
+    "segment_s": (1.0, of_service(turns)),
+    "put_s": (0.1, of_service(turns)),
+}
+# Where the network or the operator sees them: zenoh and regions where two services share the world, in
+# app/test_service.py, the others in tests/schemas/runtime and app/test_metrics.py.
+SEEN_OUTSIDE: Final = {"zenoh", "regions", "metrics_port", "metrics_host", "log"}
+
+
+def test_every_setting_of_the_service_is_in_a_table() -> None:
+    assert set(ServiceConfig.model_fields) == set(SETTINGS) | SEEN_OUTSIDE
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_every_setting_of_the_service_changes_what_it_does(name: str, tmp_path: Path) -> None:
+    value, show = SETTINGS[name]
+    if isinstance(value, str):
+        (tmp_path / "fleet").write_text(enrolment(vehicles=["car-1"]).model_dump_json())
+        pq.write_table(
+            pa.table({"region": [REGION], "time": [time.time_ns()], "precipitation": [2.0]}), tmp_path / "rain"
+        )
+        value = value.format(**{file: tmp_path / "2" / file if file == "there" else tmp_path / file
+                                for file in ("fleet", "rain", "there")})  # fmt: skip
+    assert getattr(ServiceConfig(), name) != value
+    usual, again, other = (
+        show(ServiceConfig.model_validate(given), tmp_path / str(k) / "archive")
+        for k, given in enumerate(({}, {}, {name: value}))
+    )
+    assert usual == again
+    assert other != usual
