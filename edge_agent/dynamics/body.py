@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 
-from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.parameters import Parameter
 from edge_agent.dynamics.slip import wheel_position
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
@@ -30,7 +30,7 @@ def accelerations(
         total_x += ahead
         total_y += left
         moment += x * left - y * ahead
-    return total_x / row[P.MASS], total_y / row[P.MASS], moment / row[P.YAW_INERTIA]
+    return total_x / row[Parameter.MASS], total_y / row[Parameter.MASS], moment / row[Parameter.YAW_INERTIA]
 
 
 @compiled
@@ -39,10 +39,10 @@ def axle_lateral_forces(row: FloatArray, ay: float, yaw_acceleration: float, mom
 
     moment_x [N m] is the yaw moment of the forces along the body, sum of -y*F_ahead.
     """
-    base = row[P.TO_FRONT] + row[P.TO_REAR]
-    total = row[P.MASS] * ay
-    moment = row[P.YAW_INERTIA] * yaw_acceleration - moment_x
-    front = (row[P.TO_REAR] * total + moment) / base
+    base = row[Parameter.TO_FRONT] + row[Parameter.TO_REAR]
+    total = row[Parameter.MASS] * ay
+    moment = row[Parameter.YAW_INERTIA] * yaw_acceleration - moment_x
+    front = (row[Parameter.TO_REAR] * total + moment) / base
     return front, total - front
 
 

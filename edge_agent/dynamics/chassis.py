@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import Body, Four, P, body
+from edge_agent.dynamics.parameters import Body, Four, Parameter, body
 from edge_agent.dynamics.slip import slips, wheel_position
 from edge_agent.dynamics.tyres import combined_dugoff, combined_magic
 from schemas.numeric import FloatArray
@@ -57,8 +57,8 @@ def tyre_forces(
     for wheel in range(4):
         x, y = wheel_position(row, wheel)
         ahead, aside = motion[0] - y * motion[2], motion[1] + x * motion[2]
-        slip = _slips(row[P.RADIUS], ahead, aside, wheels[wheel, 0], wheels[wheel, 1], wheels[wheel, 2])
-        stiffness = row[P.SLOPE_X] * loads[wheel], row[P.SLOPE_Y] * loads[wheel]
+        slip = _slips(row[Parameter.RADIUS], ahead, aside, wheels[wheel, 0], wheels[wheel, 1], wheels[wheel, 2])
+        stiffness = row[Parameter.SLOPE_X] * loads[wheel], row[Parameter.SLOPE_Y] * loads[wheel]
         if shape == DUGOFF:
             force = combined_dugoff(slip, stiffness, mu[wheel], loads[wheel])
         else:

@@ -1,6 +1,6 @@
 """A vehicle as one row of numbers for the compiled kernels.
 
-Legend of the row (index, meaning, unit): see `P`. All values are nominal.
+Legend of the row (index, meaning, unit): see `Parameter`. All values are nominal.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from schemas.thresholds import GRAVITY
 from schemas.vehicle import Vehicle
 
 
-class P(IntEnum):
+class Parameter(IntEnum):
     """Index of a vehicle parameter in its row."""
 
     MASS = 0  # [kg]
@@ -35,7 +35,7 @@ class P(IntEnum):
 
 
 def parameter_row(vehicle: Vehicle) -> FloatArray:
-    """The parameters of `vehicle`, shape (12,), indexed by `P`.
+    """The parameters of `vehicle`, shape (12,), indexed by `Parameter`.
 
     Stiffnesses of the vehicle file are means over the four wheels at static load; a slope per newton of load makes
     them valid for the lightly and the heavily loaded wheel alike.
@@ -86,9 +86,10 @@ class Body(NamedTuple):
 @inlined
 def body(row: FloatArray) -> Body:
     """The body of a row (12,)."""
+    p = Parameter
     return Body(
-        row[P.MASS], row[P.YAW_INERTIA], row[P.TO_FRONT], row[P.TO_REAR], row[P.TRACK_FRONT], row[P.TRACK_REAR],
-        row[P.CG_HEIGHT], row[P.RADIUS], row[P.SLOPE_X], row[P.SLOPE_Y],
+        row[p.MASS], row[p.YAW_INERTIA], row[p.TO_FRONT], row[p.TO_REAR], row[p.TRACK_FRONT], row[p.TRACK_REAR],
+        row[p.CG_HEIGHT], row[p.RADIUS], row[p.SLOPE_X], row[p.SLOPE_Y],
     )  # fmt: skip
 
 

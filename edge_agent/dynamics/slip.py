@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.parameters import Parameter
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled, inlined
 
@@ -19,8 +19,8 @@ SLOWEST_M_S = 0.5  # slip's denominator is kept above it: near standstill slip h
 def wheel_position(row: FloatArray, wheel: int) -> tuple[float, float]:
     """(x, y) [m] of wheel 0..3 (fl, fr, rl, rr) from the centre of gravity; y is positive to the left."""
     front = wheel < 2
-    x = row[P.TO_FRONT] if front else -row[P.TO_REAR]
-    half = 0.5 * (row[P.TRACK_FRONT] if front else row[P.TRACK_REAR])
+    x = row[Parameter.TO_FRONT] if front else -row[Parameter.TO_REAR]
+    half = 0.5 * (row[Parameter.TRACK_FRONT] if front else row[Parameter.TRACK_REAR])
     return x, (half if wheel % 2 == 0 else -half)
 
 

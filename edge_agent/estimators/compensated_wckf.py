@@ -29,7 +29,7 @@ from edge_agent.adaptation.windows import push, weighted_noise
 from edge_agent.dynamics.body import accelerations
 from edge_agent.dynamics.chassis import tyre_forces, wheel_inputs
 from edge_agent.dynamics.drive_wheel import WheelState, blended, drive_wheel, slip_share
-from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.parameters import Parameter
 from edge_agent.dynamics.slip import wheel_velocity
 from edge_agent.estimators.adaptive_federated_ckf import DRY
 from edge_agent.estimators.bank import EstimatorBank
@@ -111,8 +111,8 @@ def _begin(memory: CompensatedMemory, context: FrictionSet) -> None:  # noqa: AR
     for wheel in range(4):
         omega = use[S.OMEGA + wheel]
         mean[X.TORQUE + wheel] = use[S.TORQUE + wheel]
-        mean[X.OMEGA + wheel] = mean[X.VX] / row[P.RADIUS] if math.isnan(omega) else omega
-        mean[X.FORCE + wheel] = use[S.TORQUE + wheel] / row[P.RADIUS]
+        mean[X.OMEGA + wheel] = mean[X.VX] / row[Parameter.RADIUS] if math.isnan(omega) else omega
+        mean[X.FORCE + wheel] = use[S.TORQUE + wheel] / row[Parameter.RADIUS]
         root[X.TORQUE + wheel, X.TORQUE + wheel], root[X.OMEGA + wheel, X.OMEGA + wheel] = 20.0, 0.3
         root[X.FORCE + wheel, X.FORCE + wheel], root[X.SLOPE + wheel, X.SLOPE + wheel] = 200.0, 1000.0
     root[X.VX, X.VX], root[X.VY, X.VY] = FIRST_V_STD if known else UNKNOWN_V_STD, FIRST_V_STD
@@ -142,7 +142,7 @@ def _forces(
     for wheel in range(4):
         along, _ = wheel_velocity(row, wheel, x[X.VX], x[X.VY], x[X.YAW_RATE], delta[wheel])
         # a wheel whose speed is missing has no slip to judge by: its force is the observed one
-        share[wheel] = 0.0 if math.isnan(omega[wheel]) else slip_share(row[P.RADIUS], omega[wheel], along)
+        share[wheel] = 0.0 if math.isnan(omega[wheel]) else slip_share(row[Parameter.RADIUS], omega[wheel], along)
     blended(share, force_x, observed, force_x)
 
 
@@ -163,7 +163,7 @@ def _preliminary(memory: CompensatedMemory, context: FrictionSet, dt: float) -> 
         x[X.YAW_RATE] = rate + dt * turn
         for w in range(4):
             state = WheelState(x[X.TORQUE + w], x[X.OMEGA + w], x[X.FORCE + w], x[X.SLOPE + w])
-            state = drive_wheel(state, use[S.TORQUE + w], row[P.WHEEL_INERTIA], row[P.RADIUS], dt)
+            state = drive_wheel(state, use[S.TORQUE + w], row[Parameter.WHEEL_INERTIA], row[Parameter.RADIUS], dt)
             x[X.TORQUE + w], x[X.OMEGA + w], x[X.FORCE + w], x[X.SLOPE + w] = state
     for i in range(A_STATES):
         noise[i, i] = A_PROCESS[i] * math.sqrt(dt)

@@ -55,7 +55,7 @@ from schemas.vehicle import Vehicle
 WHEELS, ROWS = 4, 3
 RULE = cubature(WHEELS)
 XI, WEIGHT = RULE.xi, RULE.w_cov
-NOISE_STD = np.array([0.15, 0.15, 0.004])  # of a_x, a_y, r against the tyre model, for one independent look
+NOISE_STD = np.array([0.15, 0.15, 0.004])  # of a_x, a_y, r against the tyre model, for one independent measurement
 AY_SHARE = 0.05  # of a_y that the tyre model may miss
 
 

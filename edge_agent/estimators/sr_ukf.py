@@ -28,7 +28,7 @@ import numpy as np
 from edge_agent.dynamics.body import advance_velocity
 from edge_agent.dynamics.chassis import DUGOFF, PlanarMotion, WheelInputs, response, tyre_forces, wheel_inputs
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import P, body, four
+from edge_agent.dynamics.parameters import Parameter, body, four
 from edge_agent.estimators.bank import EstimatorBank
 from edge_agent.estimators.common.inputs import InputTrack, wheel_force
 from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD, diverged
@@ -187,9 +187,9 @@ def _measure(memory: UnscentedMemory, dt: float, share: float, points: FloatArra
     loads = wheel_loads(body(row), use[S.AX], use[S.AY])
     for wheel in range(4):
         force = wheel_force(row, track, wheel, dt)
-        slip_std = SLIP_STD + OMEGA_STD * row[P.RADIUS] / max(abs(mean[0]), SLOWEST_SLIP_M_S)
+        slip_std = SLIP_STD + OMEGA_STD * row[Parameter.RADIUS] / max(abs(mean[0]), SLOWEST_SLIP_M_S)
         quiet = math.hypot(FORCE_STD * loads[wheel], FORCE_SHARE * force)
-        std[3 + wheel] = inflation * math.hypot(quiet, row[P.SLOPE_X] * loads[wheel] * slip_std)
+        std[3 + wheel] = inflation * math.hypot(quiet, row[Parameter.SLOPE_X] * loads[wheel] * slip_std)
         missing = math.isnan(now[S.OMEGA + wheel]) or math.isnan(now[S.TORQUE + wheel])
         innovation[3 + wheel] = math.nan if missing else force
     for r in range(ROWS):

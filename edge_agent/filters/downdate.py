@@ -98,6 +98,8 @@ def update_by_downdate(
         mean += gain[a] * whitened[a]
         if not downdate(sqrt_cov, gain[a], white):
             sqrt_cov[:, :], mean[:] = kept, start
-            told = update(mean, sqrt_cov, state_deviations, measured_deviations, innovation, noise_std, work)
-            return told[0], told[1], told[2], True
+            used, log_likelihood, square = update(
+                mean, sqrt_cov, state_deviations, measured_deviations, innovation, noise_std, work
+            )
+            return used, log_likelihood, square, True
     return used, log_likelihood - 0.5 * square, square, False

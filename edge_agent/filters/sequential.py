@@ -60,9 +60,9 @@ def carlson(
         per = 1.0 / math.sqrt(before * after)
         keep, lose = before * per, part * per
         for k in range(j, n):
-            held = sqrt_cov[k, j]
-            sqrt_cov[k, j] = keep * held - lose * gain[k]
-            gain[k] += part * held
+            old = sqrt_cov[k, j]
+            sqrt_cov[k, j] = keep * old - lose * gain[k]
+            gain[k] += part * old
     innovation = reading - mean[i]
     share = innovation / after
     for k in range(n):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.parameters import Parameter
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import FloatArray
 from schemas.thresholds import GRAVITY
@@ -33,25 +33,31 @@ def respond(
     """(a_x, a_y, yaw acceleration), each (P,), of four Dugoff tyres."""
     front = np.array([True, True, False, False])
     left = np.array([1.0, -1.0, 1.0, -1.0])
-    base, weight = row[P.TO_FRONT] + row[P.TO_REAR], row[P.MASS] * GRAVITY
-    pitch = (row[P.MASS] * ax * row[P.CG_HEIGHT] / base)[:, None]
-    axle = np.where(front, weight * row[P.TO_REAR] / base - pitch, weight * row[P.TO_FRONT] / base + pitch)
-    track = np.where(front, row[P.TRACK_FRONT], row[P.TRACK_REAR])
-    roll = (ay * row[P.CG_HEIGHT] / GRAVITY)[:, None]
+    base, weight = row[Parameter.TO_FRONT] + row[Parameter.TO_REAR], row[Parameter.MASS] * GRAVITY
+    pitch = (row[Parameter.MASS] * ax * row[Parameter.CG_HEIGHT] / base)[:, None]
+    axle = np.where(
+        front, weight * row[Parameter.TO_REAR] / base - pitch, weight * row[Parameter.TO_FRONT] / base + pitch
+    )
+    track = np.where(front, row[Parameter.TRACK_FRONT], row[Parameter.TRACK_REAR])
+    roll = (ay * row[Parameter.CG_HEIGHT] / GRAVITY)[:, None]
     load = np.maximum(0.5 * axle - left * axle * roll / track, 0.02 * weight / 4.0)
-    x, y = np.where(front, row[P.TO_FRONT], -row[P.TO_REAR]), left * 0.5 * track
+    x, y = np.where(front, row[Parameter.TO_FRONT], -row[Parameter.TO_REAR]), left * 0.5 * track
     cos, sin = np.cos(readings[DELTA:OMEGA]), np.sin(readings[DELTA:OMEGA])
     ahead, aside = vx[:, None] - y * rate[:, None], vy[:, None] + x * rate[:, None]
     along, across = cos * ahead + sin * aside, cos * aside - sin * ahead
     speed, grip = np.maximum(np.abs(along), 0.5), mu[:, None] * load
-    theta_x = row[P.SLOPE_X] * load * (row[P.RADIUS] * readings[OMEGA:] - along) / speed / grip
-    theta_y = row[P.SLOPE_Y] * load * -across / speed / grip
+    theta_x = row[Parameter.SLOPE_X] * load * (row[Parameter.RADIUS] * readings[OMEGA:] - along) / speed / grip
+    theta_y = row[Parameter.SLOPE_Y] * load * -across / speed / grip
     theta = np.maximum(np.hypot(theta_x, theta_y), 1e-12)
     gain = grip * np.where(theta <= 0.5, theta, 1.0 - 0.25 / theta) / theta
     force_x, force_y = gain * theta_x, gain * theta_y
     f_ahead, f_left = cos * force_x - sin * force_y, sin * force_x + cos * force_y
     moment = x * f_left - y * f_ahead
-    return f_ahead.sum(1) / row[P.MASS], f_left.sum(1) / row[P.MASS], moment.sum(1) / row[P.YAW_INERTIA]
+    return (
+        f_ahead.sum(1) / row[Parameter.MASS],
+        f_left.sum(1) / row[Parameter.MASS],
+        moment.sum(1) / row[Parameter.YAW_INERTIA],
+    )
 
 
 def measured(points: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ import math
 from typing import Annotated
 
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import P, body
+from edge_agent.dynamics.parameters import Parameter, body
 from edge_agent.estimators import flags
 from edge_agent.estimators.common.excitation import Excitation, begin_excitation, note_excitation
 from edge_agent.estimators.common.readings import (
@@ -100,7 +100,7 @@ def _renew(track: InputTrack, row: FloatArray, anew: bool) -> None:
     use[S.AX] = 0.0 if math.isnan(now[S.AX]) else now[S.AX]
     turning = 0.0 if math.isnan(speed) else use[S.YAW_RATE] * speed
     use[S.AY] = turning if math.isnan(now[S.AY]) else now[S.AY]
-    share = 0.25 * row[P.MASS] * use[S.AX] * row[P.RADIUS]
+    share = 0.25 * row[Parameter.MASS] * use[S.AX] * row[Parameter.RADIUS]
     for wheel in range(4):
         torque = now[S.TORQUE + wheel]
         use[S.OMEGA + wheel] = now[S.OMEGA + wheel]
@@ -114,7 +114,7 @@ def _grip_used(track: InputTrack, row: FloatArray) -> float:
     loads, most = wheel_loads(body(row), use[S.AX], use[S.AY]), 0.0
     for wheel in range(4):
         most = max(most, abs(use[S.TORQUE + wheel]) / loads[wheel])
-    return math.sqrt((most / row[P.RADIUS]) ** 2 + (use[S.AY] / GRAVITY) ** 2)
+    return math.sqrt((most / row[Parameter.RADIUS]) ** 2 + (use[S.AY] / GRAVITY) ** 2)
 
 
 @compiled
@@ -122,4 +122,4 @@ def wheel_force(row: FloatArray, track: InputTrack, wheel: int, step: float) -> 
     """F_x = (T - J*omega')/R [N] of a wheel from inputs `step` [s] apart (paper 000, equation 10)."""
     gain = track.inputs[S.OMEGA + wheel] - track.inputs_before[S.OMEGA + wheel]
     turning = 0.0 if math.isnan(gain) or step <= 0.0 else gain / step
-    return float((track.inputs[S.TORQUE + wheel] - row[P.WHEEL_INERTIA] * turning) / row[P.RADIUS])
+    return float((track.inputs[S.TORQUE + wheel] - row[Parameter.WHEEL_INERTIA] * turning) / row[Parameter.RADIUS])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.parameters import Parameter
 from edge_agent.dynamics.slip import SLOWEST_M_S, along_wheel
 from edge_agent.estimators import flags
 from edge_agent.estimators.common.inputs import InputTrack
@@ -35,6 +35,6 @@ def sliding(row: FloatArray, track: InputTrack, vx: float, vy: float, mu: float)
     health, yaw_rate = 0, track.inputs[S.YAW_RATE]
     for wheel in range(4):
         along = along_wheel(row, wheel, vx, vy, yaw_rate, track.steering[0, wheel], track.steering[1, wheel])
-        gliding = abs(row[P.RADIUS] * track.inputs[S.OMEGA + wheel] - along) * row[P.SLOPE_X]
+        gliding = abs(row[Parameter.RADIUS] * track.inputs[S.OMEGA + wheel] - along) * row[Parameter.SLOPE_X]
         health |= flags.SLIDING if gliding > SLIDING_THETA * mu * max(abs(along), SLOWEST_M_S) else 0
     return health

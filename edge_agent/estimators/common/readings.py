@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators import flags
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
@@ -61,7 +61,7 @@ def rolling_speed(row: FloatArray, now: FloatArray) -> float:
     """Second largest rolling speed [m/s] (two wheels may be locked, one may spin); NaN without any wheel."""
     first = second = math.nan
     for wheel in range(4):
-        speed = row[P.RADIUS] * now[S.OMEGA + wheel]
+        speed = row[Parameter.RADIUS] * now[S.OMEGA + wheel]
         if math.isnan(speed):
             continue
         if math.isnan(first) or speed > first:

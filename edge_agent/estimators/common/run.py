@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Annotated, TypeVar
 
-from edge_agent.dynamics.parameters import P, parameter_table
+from edge_agent.dynamics.parameters import Parameter, parameter_table
 from edge_agent.estimators import flags
 from edge_agent.estimators.bank import Kernel, Part
 from edge_agent.estimators.common.inputs import BEGUN, STEPPED, InputTrack, take
@@ -25,7 +25,7 @@ from schemas.vehicle import Vehicle
 class PaperMemory:
     """What every paper's filter carries of one vehicle."""
 
-    row: Annotated[FloatArray, len(P)]  # parameters of the vehicle
+    row: Annotated[FloatArray, len(Parameter)]  # parameters of the vehicle
     track: InputTrack
     nis: float  # per row
     log_likelihood: float  # of what was measured at the sample [nat]

@@ -11,7 +11,7 @@ import math
 
 from edge_agent.dynamics.body import axle_lateral_forces
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import P, body
+from edge_agent.dynamics.parameters import Parameter, body
 from edge_agent.dynamics.slip import SLOWEST_M_S, wheel_position
 from edge_agent.dynamics.wheel import force_from_torque
 from edge_agent.estimators import flags
@@ -39,7 +39,7 @@ def block_features(memory: MixtureMemory, design: MixtureDesign, features: Block
     for wheel in range(4):
         features.steer_cos[wheel] = math.cos(last.delta[wheel])
         features.steer_sin[wheel] = math.sin(last.delta[wheel])
-        features.rolling[wheel] = row[P.RADIUS] * mean_or(block, S.OMEGA + wheel, math.nan)
+        features.rolling[wheel] = row[Parameter.RADIUS] * mean_or(block, S.OMEGA + wheel, math.nan)
         change = (last.omega[wheel] - block.start_omega[wheel]) / features.duration
         features.spin[wheel] = 0.0 if math.isnan(change) else change
     health = _forces(row, constants, block, features)
@@ -78,12 +78,12 @@ def _forces(row: FloatArray, constants: Constants, block: BlockSums, features: B
     for wheel in range(4):
         torque = mean_or(block, S.TORQUE + wheel, math.nan)
         if not (math.isnan(torque) or math.isnan(features.rolling[wheel])):
-            force = force_from_torque(torque, features.spin[wheel], row[P.WHEEL_INERTIA], row[P.RADIUS])
+            force = force_from_torque(torque, features.spin[wheel], row[Parameter.WHEEL_INERTIA], row[Parameter.RADIUS])
             spread = constants.force_share * abs(force)
         else:
             if math.isnan(torque):
                 health |= flags.NO_TORQUE
-            known = 0.0 if math.isnan(ax) else row[P.MASS] * ax
+            known = 0.0 if math.isnan(ax) else row[Parameter.MASS] * ax
             force = _wheel_share(row, constants, wheel, known) * known
             spread = constants.no_torque_share * abs(known)
             if math.isnan(ax):
@@ -96,7 +96,7 @@ def _forces(row: FloatArray, constants: Constants, block: BlockSums, features: B
 @compiled
 def _wheel_share(row: FloatArray, constants: Constants, wheel: int, force: float) -> float:
     """Guess of a wheel's share of the total longitudinal force where torque is missing."""
-    split = row[P.DRIVE_FRONT]
+    split = row[Parameter.DRIVE_FRONT]
     front = constants.brake_front if force < 0.0 or math.isnan(split) else split
     return 0.5 * front if wheel < 2 else 0.5 * (1.0 - front)
 
@@ -149,8 +149,8 @@ def _noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures
     scale = design.scales[0] * memory.factor[0]
     for wheel in range(4):
         samples = max(memory.block.counts[S.OMEGA + wheel], 1)
-        slip = constants.omega_noise / math.sqrt(samples) * row[P.RADIUS] / speed
-        white = row[P.SLOPE_X] * slip
+        slip = constants.omega_noise / math.sqrt(samples) * row[Parameter.RADIUS] / speed
+        white = row[Parameter.SLOPE_X] * slip
         shape = constants.shape_share * features.force[wheel] ** 2
         variance = 0.5 * white**2 + constants.floor_x**2 + features.noise_std[wheel] ** 2 + shape**2
         features.noise_std[wheel] = math.sqrt(variance * scale)
@@ -158,9 +158,9 @@ def _noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures
     scale = design.scales[1] * memory.factor[1]
     for axle in range(2):
         side = features.side[axle]
-        turning = constants.gyro_std * (row[P.TO_FRONT] if axle == 0 else row[P.TO_REAR]) / speed
+        turning = constants.gyro_std * (row[Parameter.TO_FRONT] if axle == 0 else row[Parameter.TO_REAR]) / speed
         pointing = constants.angle_share * features.steer_sin[2 * axle]
-        angle = row[P.SLOPE_Y] * math.sqrt(constants.angle_std**2 + turning**2 + pointing**2)
+        angle = row[Parameter.SLOPE_Y] * math.sqrt(constants.angle_std**2 + turning**2 + pointing**2)
         share = constants.axle_share * side
         shape = constants.shape_share * side * side
         change = side - before[axle]
@@ -187,14 +187,14 @@ def asymmetry(row: FloatArray, constants: Constants, block: BlockSums, features:
     most, speed = 0.0, max(features.speed, SLOWEST_COMPARED_M_S)
     for axle in range(2):
         left, right = 2 * axle, 2 * axle + 1
-        track = row[P.TRACK_FRONT] if axle == 0 else row[P.TRACK_REAR]
+        track = row[Parameter.TRACK_FRONT] if axle == 0 else row[Parameter.TRACK_REAR]
         turning = track * features.yaw_rate * features.steer_cos[left]
         slip = (features.rolling[right] - features.rolling[left] - turning) / speed
         samples = max(min(block.counts[S.OMEGA + left], block.counts[S.OMEGA + right]), 1)
-        noise = constants.omega_noise * row[P.RADIUS] / speed * math.sqrt(2.0 / samples)
-        apart = abs(row[P.SLOPE_X] * slip - features.force[right] + features.force[left])
+        noise = constants.omega_noise * row[Parameter.RADIUS] / speed * math.sqrt(2.0 / samples)
+        apart = abs(row[Parameter.SLOPE_X] * slip - features.force[right] + features.force[left])
         if not math.isnan(apart):
-            most = max(most, apart - CERTAIN * row[P.SLOPE_X] * noise)
+            most = max(most, apart - CERTAIN * row[Parameter.SLOPE_X] * noise)
     return most
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from edge_agent.dynamics.body import advance_velocity
-from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators import flags
 from edge_agent.estimators.common.readings import GAP_S, INPUTS, believe, position_health, position_time
 from edge_agent.estimators.friction_mixture.constants import NodeState
@@ -87,7 +87,7 @@ def _filter_yaw_rate(memory: MixtureMemory, dt: float) -> None:
     value, noise = now[S.YAW_RATE], YAW_STD
     if math.isnan(value):
         left, right = now[S.OMEGA + 2], now[S.OMEGA + 3]
-        value, noise = row[P.RADIUS] * (right - left) / row[P.TRACK_REAR], REAR_STD
+        value, noise = row[Parameter.RADIUS] * (right - left) / row[Parameter.TRACK_REAR], REAR_STD
     if math.isnan(value):
         last.yaw_rate_var = min(variance, UNKNOWN_YAW_VAR)
         return

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import numpy as np
 
-from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators.common.excitation import Excitation
 from edge_agent.estimators.common.readings import INPUTS
 from edge_agent.estimators.friction_mixture.constants import ALL_NODES, STATES
@@ -77,7 +77,7 @@ class Quantiles:
 class MixtureMemory:
     """One filter."""
 
-    row: Annotated[FloatArray, len(P)]  # parameters of the vehicle
+    row: Annotated[FloatArray, len(Parameter)]  # parameters of the vehicle
     started: bool
     split: bool  # whether the split nodes take part
     last: LastInputs

@@ -36,7 +36,7 @@ from schemas.runtime.jit import compiled
 
 
 class NodeUpdate(NamedTuple):
-    """What one node's update says of it."""
+    """What one node's update found."""
 
     log_likelihood: float  # with the inflated R and the price of sliding [nat]
     moved: float  # change of `belief_cost` [nat]
@@ -156,7 +156,7 @@ def spread(
     features: BlockFeatures,
     node: NodeWorkspace,
 ) -> None:
-    """Fill node.deviation (A), node.residual with the predicted rows and node.nonlinearity with their bend."""
+    """Fill node.deviation (A), node.residual with the predicted rows and node.nonlinearity with its variance."""
     scale = math.sqrt(CURVED)
     for r in range(ROWS):
         node.residual[r] = node.nonlinearity[r] = 0.0

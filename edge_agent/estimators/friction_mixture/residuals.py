@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 
-from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.parameters import Parameter
 from edge_agent.dynamics.slip import SLOWEST_M_S, wheel_position
 from edge_agent.dynamics.tyres import TINY
 from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
@@ -83,7 +83,7 @@ def find_slips(
         blind = math.isnan(features.side[axle])  # slip across is then guesswork, and must not bend the force along
         ln_kx = mean_kx + features.informs_x[axle] * (x[NodeState.LN_KX] - mean_kx)
         ln_ky = mean_ky + features.informs_y[axle] * (x[NodeState.LN_KY] - mean_ky)
-        slope_x, slope_y = row[P.SLOPE_X] * math.exp(ln_kx), row[P.SLOPE_Y] * math.exp(ln_ky)
+        slope_x, slope_y = row[Parameter.SLOPE_X] * math.exp(ln_kx), row[Parameter.SLOPE_Y] * math.exp(ln_ky)
         slip.scale_x[axle] = math.exp(-constants.stiffness_power_x * ln_kx)
         slip.scale_y[axle] = math.exp(-constants.stiffness_power_y * ln_ky)
         for wheel in range(2 * axle, 2 * axle + 2):

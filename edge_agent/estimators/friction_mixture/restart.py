@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators import flags
 from edge_agent.estimators.common.arrays import clear, put, put_square
 from edge_agent.estimators.common.excitation import begin_excitation
@@ -146,7 +146,7 @@ def recover(memory: MixtureMemory, design: MixtureDesign, features: BlockFeature
             return 0
         if not math.isnan(features.rolling[wheel]):
             least, most = min(least, features.rolling[wheel]), max(most, features.rolling[wheel])
-    turning = abs(features.yaw_rate) * memory.row[P.TRACK_REAR]
+    turning = abs(features.yaw_rate) * memory.row[Parameter.TRACK_REAR]
     if most - least > ALIKE * max(most, SLOWEST_M_S) + turning:
         return 0
     forget_vehicle(memory, design.nominal)  # what was learned while lost is as wrong as the motion was

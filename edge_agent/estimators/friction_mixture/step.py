@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators import flags
 from edge_agent.estimators.common.excitation import note_excitation
 from edge_agent.estimators.common.motion import SLIDING_THETA
@@ -87,7 +87,7 @@ def conclude(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> 
     speed = max(abs(vx), SLOWEST_SLIDING_M_S)
     for wheel in range(4):
         along = scratch.features.rolling[wheel] - vx
-        if memory.row[P.SLOPE_X] * abs(along) / speed > SLIDING_THETA * memory.friction.median:
+        if memory.row[Parameter.SLOPE_X] * abs(along) / speed > SLIDING_THETA * memory.friction.median:
             memory.health |= flags.SLIDING
 
 

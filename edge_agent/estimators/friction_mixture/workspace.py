@@ -36,7 +36,7 @@ class BlockFeatures:
     side_leak: Annotated[FloatArray, 2]  # its derivative by the leak [1]
     noise_std: Annotated[FloatArray, ROWS]  # nominal, of a residual where the curve rises [1]
     slip_noise: Annotated[FloatArray, ROWS]  # variance of slip, as linear force over load; half of it is in noise_std
-    informs_x: Annotated[FloatArray, 2]  # what the force of an axle's wheels says of stiffness, from 0 to 1
+    informs_x: Annotated[FloatArray, 2]  # how much the force of an axle's wheels informs of stiffness, 0 to 1
     informs_y: Annotated[FloatArray, 2]
 
 
@@ -61,7 +61,7 @@ class NodeWorkspace:
     residual: Annotated[FloatArray, ROWS]  # at the mean, then mean of the cubature points, then what is left of it
     ahead: Annotated[FloatArray, ROWS]
     behind: Annotated[FloatArray, ROWS]
-    nonlinearity: Annotated[FloatArray, ROWS]  # variance of the rows' bend
+    nonlinearity: Annotated[FloatArray, ROWS]  # variance that the rows' curvature adds
     middle: Annotated[FloatArray, CURVED, ROWS]
     derivative: Annotated[FloatArray, ACTIVE, ROWS]
     deviation: Annotated[FloatArray, ROWS, ACTIVE]

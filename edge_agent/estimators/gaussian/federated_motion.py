@@ -17,7 +17,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import P, body
+from edge_agent.dynamics.parameters import Parameter, body
 from edge_agent.dynamics.slip import wheel_velocity
 from edge_agent.estimators.common.inputs import InputTrack, wheel_force
 from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD
@@ -186,9 +186,9 @@ def slip_free_speed(row: FloatArray, track: InputTrack, dt: float) -> tuple[floa
         omega = use[S.OMEGA + wheel]
         if math.isnan(omega):
             continue
-        slip = wheel_force(row, track, wheel, dt) / (row[P.SLOPE_X] * loads[wheel])
+        slip = wheel_force(row, track, wheel, dt) / (row[Parameter.SLOPE_X] * loads[wheel])
         slip = min(max(slip, -0.5), 0.5)
-        total += row[P.RADIUS] * omega / (1.0 + slip)
+        total += row[Parameter.RADIUS] * omega / (1.0 + slip)
         most = max(most, abs(slip))
         count += 1
     if count == 0:

@@ -15,7 +15,7 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.parameters import Parameter
 from edge_agent.lab.simulation.chance import uniform
 from edge_agent.lab.simulation.friction import PatchColumn, look_up
 from edge_agent.lab.simulation.plant import Motion, Wheel, strongest_pull
@@ -190,8 +190,12 @@ def wished_acceleration(
     wish = (max(aim, SLOWEST**2) - vx * vx) / (2.0 * reach)
     across = min(abs(vx * x[Motion.YAW_RATE]) / q, 1.0)
     room = math.sqrt(1.0 - across * across)  # what cornering leaves of the budget
-    driven = max(p[P.DRIVE_FRONT], 1.0 - p[P.DRIVE_FRONT])  # share of the pull on an axle that carries half the vehicle
-    gas = min(PULL * d[Driver.BELIEF] * GRAVITY * min(1.0, 0.5 / driven), 0.8 * q, strongest_pull(p, vx) / p[P.MASS])
+    driven = max(
+        p[Parameter.DRIVE_FRONT], 1.0 - p[Parameter.DRIVE_FRONT]
+    )  # share of the pull on an axle that carries half the vehicle
+    gas = min(
+        PULL * d[Driver.BELIEF] * GRAVITY * min(1.0, 0.5 / driven), 0.8 * q, strongest_pull(p, vx) / p[Parameter.MASS]
+    )
     alarm = alerted(t, key)
     if alarm > 0.0 and vx > SLOWEST + 1.0:
         wish = min(wish, -alarm * q)
@@ -204,26 +208,26 @@ def wished_acceleration(
 @compiled
 def wished_force(p: FloatArray, d: FloatArray, vx: float, acceleration: float, along: float) -> float:
     """Force [N] that he gives for an acceleration while gravity pulls with `along` [m/s^2]: as tyres and engine can."""
-    driven = max(p[P.DRIVE_FRONT], 1.0 - p[P.DRIVE_FRONT])
-    most = min(PULL * d[Driver.BELIEF] * GRAVITY * min(1.0, 0.5 / driven), strongest_pull(p, vx) / p[P.MASS])
-    return float(p[P.MASS] * min(acceleration - along, max(most, acceleration)))
+    driven = max(p[Parameter.DRIVE_FRONT], 1.0 - p[Parameter.DRIVE_FRONT])
+    most = min(PULL * d[Driver.BELIEF] * GRAVITY * min(1.0, 0.5 / driven), strongest_pull(p, vx) / p[Parameter.MASS])
+    return float(p[Parameter.MASS] * min(acceleration - along, max(most, acceleration)))
 
 
 @compiled
 def wished_steer(x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float) -> float:
     """Mean road-wheel angle [rad] of the circle through a point ahead, as far as the front tyres follow."""
-    vx, base = max(x[Motion.VX], SLOWEST), p[P.TO_FRONT] + p[P.TO_REAR]
+    vx, base = max(x[Motion.VX], SLOWEST), p[Parameter.TO_FRONT] + p[Parameter.TO_REAR]
     number, beyond = ahead(d, g, lanes, 2.5 + 0.45 * vx)
     row = lanes[0][number]
     offset = d[Driver.WOBBLE] * math.sin(2.0 * math.pi * WOBBLE_HZ * t + 1e3 * d[Driver.WOBBLE])
     dx = row[LanePoint.X] + row[LanePoint.COS] * beyond - row[LanePoint.SIN] * offset - x[Motion.X]
     dy = row[LanePoint.Y] + row[LanePoint.SIN] * beyond + row[LanePoint.COS] * offset - x[Motion.Y]
     c, s = math.cos(x[Motion.YAW]), math.sin(x[Motion.YAW])
-    forward, left = c * dx + s * dy + p[P.TO_REAR], c * dy - s * dx
+    forward, left = c * dx + s * dy + p[Parameter.TO_REAR], c * dy - s * dx
     if forward < 0.0:  # spun round: turn about, or the point stays straight behind for ever
         return math.copysign(LARGEST_STEER, left)
     steer = math.atan(2.0 * base * left / max(forward * forward + left * left, 1.0))
-    drift = math.atan2(x[Motion.VY] + p[P.TO_FRONT] * x[Motion.YAW_RATE], vx)
+    drift = math.atan2(x[Motion.VY] + p[Parameter.TO_FRONT] * x[Motion.YAW_RATE], vx)
     steer = min(max(steer, drift - LARGEST_SLIP_ANGLE), drift + LARGEST_SLIP_ANGLE)
     return min(max(steer, -LARGEST_STEER), LARGEST_STEER)
 
@@ -248,6 +252,6 @@ def drive(
     acceleration = wished_acceleration(x, d, g, lanes, p, t, keys[1])
     force = wished_force(p, d, x[Motion.VX], acceleration, along)
     if x[Motion.VX] < RESTING and stops(t, d[Driver.STOPS], keys[1]):
-        force = -p[P.MASS] * (STOPPING * budget(d) + abs(along))
+        force = -p[Parameter.MASS] * (STOPPING * budget(d) + abs(along))
     d[Driver.FORCE] += (force - d[Driver.FORCE]) * -math.expm1(-dt / FOOT_S)
     d[Driver.STEER] += (wished_steer(x, d, g, lanes, p, t) - d[Driver.STEER]) * -math.expm1(-dt / ARMS_S)

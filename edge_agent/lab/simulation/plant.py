@@ -33,7 +33,7 @@ from typing import Final
 
 from edge_agent.dynamics.body import accelerations
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import P, body
+from edge_agent.dynamics.parameters import Parameter, body
 from edge_agent.dynamics.slip import SLOWEST_M_S, slips, wheel_position, wheel_velocity
 from edge_agent.dynamics.tyres import TINY, brush, magic_formula
 from schemas.numeric import FloatArray
@@ -69,23 +69,27 @@ STATES: Final = 12
 class TrueParameter(IntEnum):
     """What only the true vehicle has; these continue the row of `edge_agent.dynamics.parameters.P`."""
 
-    SHAPE = len(P)  # c and e of the tyre curve
-    CURVATURE = len(P) + 1
-    DEGRESSION = len(P) + 2  # ε
-    LAG = len(P) + 3  # [s] of the sprung body behind the accelerations
-    ROLL_LEAK = len(P) + 4  # gravity that an accelerometer feels in the rolled and pitched body, per a_y and per a_x
-    PITCH_LEAK = len(P) + 5
-    DRAG = len(P) + 6  # D [N per (m/s)^2]
-    ROLLING = len(P) + 7  # k_r
-    SLIP_LIMIT = len(P) + 8  # slip at which anti-lock and traction control begin to let go; inf: none
-    BRAKE_FRONT = len(P) + 9  # share of the braking torque at the front axle
-    POWER = len(P) + 10  # [W]
-    BRUSH = len(P) + 11  # 1: the tyre's curve is that of the brush model, not the Magic Formula
-    SOFTENING = len(P) + 12  # stiffness falls with friction, as (mu/FIRM)^softening; 0: it does not know friction
-    REAR_STEER = len(P) + 13  # angle of the rear wheels over that of the front wheels; 0: they do not steer
+    SHAPE = len(Parameter)  # c and e of the tyre curve
+    CURVATURE = len(Parameter) + 1
+    DEGRESSION = len(Parameter) + 2  # ε
+    LAG = len(Parameter) + 3  # [s] of the sprung body behind the accelerations
+    ROLL_LEAK = (
+        len(Parameter) + 4
+    )  # gravity that an accelerometer feels in the rolled and pitched body, per a_y and per a_x
+    PITCH_LEAK = len(Parameter) + 5
+    DRAG = len(Parameter) + 6  # D [N per (m/s)^2]
+    ROLLING = len(Parameter) + 7  # k_r
+    SLIP_LIMIT = len(Parameter) + 8  # slip at which anti-lock and traction control begin to let go; inf: none
+    BRAKE_FRONT = len(Parameter) + 9  # share of the braking torque at the front axle
+    POWER = len(Parameter) + 10  # [W]
+    BRUSH = len(Parameter) + 11  # 1: the tyre's curve is that of the brush model, not the Magic Formula
+    SOFTENING = (
+        len(Parameter) + 12
+    )  # stiffness falls with friction, as (mu/FIRM)^softening; 0: it does not know friction
+    REAR_STEER = len(Parameter) + 13  # angle of the rear wheels over that of the front wheels; 0: they do not steer
 
 
-PARAMETERS: Final = len(P) + len(TrueParameter)
+PARAMETERS: Final = len(Parameter) + len(TrueParameter)
 
 
 class Control(IntEnum):
@@ -149,9 +153,9 @@ def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> 
     for i in range(4):
         load, omega = share * loads[i], x[Motion.OMEGA + i]
         along, across = wheel_velocity(p, i, x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE], u[Control.STEER, i])
-        slip_x, slip_y = slips(p[P.RADIUS], omega, along, across)
-        slope_x = stiffness_per_load(p[P.SLOPE_X], p[TrueParameter.DEGRESSION], load, at_rest[i])
-        slope_y = stiffness_per_load(p[P.SLOPE_Y], p[TrueParameter.DEGRESSION], load, at_rest[i])
+        slip_x, slip_y = slips(p[Parameter.RADIUS], omega, along, across)
+        slope_x = stiffness_per_load(p[Parameter.SLOPE_X], p[TrueParameter.DEGRESSION], load, at_rest[i])
+        slope_y = stiffness_per_load(p[Parameter.SLOPE_Y], p[TrueParameter.DEGRESSION], load, at_rest[i])
         if p[TrueParameter.SOFTENING] > 0.0:
             soft = (u[Control.MU, i] / FIRM) ** p[TrueParameter.SOFTENING]
             slope_x, slope_y = soft * slope_x, soft * slope_y
@@ -171,7 +175,7 @@ def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> 
             brake *= allowed(slip_x, slip_limit(p, i))
         w[Wheel.FX, i], w[Wheel.FY, i], w[Wheel.FZ, i] = pull * theta_x, pull * theta_y, load
         w[Wheel.SPEED, i], w[Wheel.SLIP, i], w[Wheel.THETA, i] = along, slip_x, theta
-        w[Wheel.SLOPE, i] = secant * slope_x * load * p[P.RADIUS] / max(abs(along), SLOWEST_M_S)
+        w[Wheel.SLOPE, i] = secant * slope_x * load * p[Parameter.RADIUS] / max(abs(along), SLOWEST_M_S)
         w[Wheel.TORQUE, i] = drive - brake * omega / max(abs(omega), BRAKED)
 
 
@@ -182,7 +186,7 @@ def body_accelerations(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArra
     `w` is filled.
     """
     ax, ay, yaw_acceleration = accelerations(p, w[Wheel.FX], w[Wheel.FY], u[Control.STEER])
-    return ax - p[TrueParameter.DRAG] * x[Motion.VX] * abs(x[Motion.VX]) / p[P.MASS], ay, yaw_acceleration
+    return ax - p[TrueParameter.DRAG] * x[Motion.VX] * abs(x[Motion.VX]) / p[Parameter.MASS], ay, yaw_acceleration
 
 
 @compiled
@@ -193,7 +197,7 @@ def turn_wheels(
 
     gain is dv_x/dt [m/s^2], yaw_acceleration in rad/s^2: how the ground's speed changes under the wheels.
     """
-    radius = p[P.RADIUS]
+    radius = p[Parameter.RADIUS]
     for i in range(4):
         ground = gain - wheel_position(p, i)[1] * yaw_acceleration
         omega, slip = x[Motion.OMEGA + i], abs(w[Wheel.SLIP, i])
@@ -206,7 +210,7 @@ def turn_wheels(
             damping += asked * radius / (max(abs(w[Wheel.SPEED, i]), SLOWEST_M_S) * slip_limit(p, i))
         if abs(omega) < BRAKED:
             damping += u[Control.BRAKE, i] / BRAKED
-        x[Motion.OMEGA + i] = omega + dt * excess / (p[P.WHEEL_INERTIA] + dt * damping)
+        x[Motion.OMEGA + i] = omega + dt * excess / (p[Parameter.WHEEL_INERTIA] + dt * damping)
 
 
 @compiled
@@ -217,11 +221,11 @@ def held(x: FloatArray, p: FloatArray, u: FloatArray) -> bool:
     along, across, share = gravity(u)
     brake = pull = grip = 0.0
     for i in range(4):
-        brake += u[Control.BRAKE, i] / p[P.RADIUS]
-        pull += u[Control.DRIVE, i] / p[P.RADIUS]
-        grip += 0.25 * u[Control.MU, i] * p[P.MASS] * GRAVITY * share
-    pull += p[P.MASS] * along
-    return bool(brake > 0.0 and abs(pull) <= brake and math.hypot(pull, p[P.MASS] * across) <= grip)
+        brake += u[Control.BRAKE, i] / p[Parameter.RADIUS]
+        pull += u[Control.DRIVE, i] / p[Parameter.RADIUS]
+        grip += 0.25 * u[Control.MU, i] * p[Parameter.MASS] * GRAVITY * share
+    pull += p[Parameter.MASS] * along
+    return bool(brake > 0.0 and abs(pull) <= brake and math.hypot(pull, p[Parameter.MASS] * across) <= grip)
 
 
 @compiled
@@ -266,19 +270,19 @@ def command(p: FloatArray, u: FloatArray, steer: float, force: float) -> None:
     The steered wheels follow Ackermann: they point at one centre on the line of the rear axle. Where the rear wheels
     steer too, `steer` is the angle of a car without that on the same circle: the front wheels turn more, or less.
     """
-    base = p[P.TO_FRONT] + p[P.TO_REAR]
+    base = p[Parameter.TO_FRONT] + p[Parameter.TO_REAR]
     curvature = math.tan(steer) / base
     front = base * curvature / (1.0 - p[TrueParameter.REAR_STEER])
     for i in range(4):
         side = 1.0 if i % 2 == 0 else -1.0
-        inner = 1.0 - side * 0.5 * p[P.TRACK_FRONT] * curvature
+        inner = 1.0 - side * 0.5 * p[Parameter.TRACK_FRONT] * curvature
         u[Control.STEER, i] = (
             math.atan(front / inner) if i < 2 else p[TrueParameter.REAR_STEER] * math.atan(front / inner)
         )
-        drive_share = p[P.DRIVE_FRONT] if i < 2 else 1.0 - p[P.DRIVE_FRONT]
+        drive_share = p[Parameter.DRIVE_FRONT] if i < 2 else 1.0 - p[Parameter.DRIVE_FRONT]
         brake_share = p[TrueParameter.BRAKE_FRONT] if i < 2 else 1.0 - p[TrueParameter.BRAKE_FRONT]
-        u[Control.DRIVE, i] = 0.5 * drive_share * max(force, 0.0) * p[P.RADIUS]
-        u[Control.BRAKE, i] = 0.5 * brake_share * max(-force, 0.0) * p[P.RADIUS]
+        u[Control.DRIVE, i] = 0.5 * drive_share * max(force, 0.0) * p[Parameter.RADIUS]
+        u[Control.BRAKE, i] = 0.5 * brake_share * max(-force, 0.0) * p[Parameter.RADIUS]
 
 
 class RecordColumn(IntEnum):
@@ -346,7 +350,7 @@ def _observe_held(x: FloatArray, p: FloatArray, u: FloatArray, record: FloatArra
     for i in range(4):
         brake_share = p[TrueParameter.BRAKE_FRONT] if i < 2 else 1.0 - p[TrueParameter.BRAKE_FRONT]
         record[RecordColumn.OMEGA + i] = 0.0
-        record[RecordColumn.TORQUE + i] = -0.5 * brake_share * p[P.MASS] * along * p[P.RADIUS]
+        record[RecordColumn.TORQUE + i] = -0.5 * brake_share * p[Parameter.MASS] * along * p[Parameter.RADIUS]
         record[RecordColumn.UTILISATION + i] = math.hypot(along, across) / (u[Control.MU, i] * GRAVITY * share)
 
 
@@ -356,7 +360,7 @@ def start_at(x: FloatArray, p: FloatArray, place: tuple[float, float, float], sp
     x[:] = 0.0
     x[Motion.VX] = speed
     x[Motion.X], x[Motion.Y], x[Motion.YAW] = place
-    x[Motion.OMEGA : Motion.OMEGA + 4] = speed / p[P.RADIUS]
+    x[Motion.OMEGA : Motion.OMEGA + 4] = speed / p[Parameter.RADIUS]
 
 
 def substeps_of(rate_hz: float) -> int:

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.parameters import Parameter
 from edge_agent.lab.simulation.chance import checked_seed
 from edge_agent.lab.simulation.faults import Fault, apply_faults
 from edge_agent.lab.simulation.manoeuvres import MANOEUVRES, Friction, Manoeuvre, Moment
@@ -132,9 +132,9 @@ def _drive(
         wish, acceleration = manoeuvre.control(_moment(k * dt, x, speed))
         acceleration -= gravity(u)[0]
         if k == 0 and speed == 0.0:
-            force = float(p[P.MASS]) * acceleration  # who stands has had his foot down before
+            force = float(p[Parameter.MASS]) * acceleration  # who stands has had his foot down before
         steer += (wish - steer) * -math.expm1(-dt / STEERING_LAG_S)
-        force += (float(p[P.MASS]) * acceleration - force) * -math.expm1(-dt / PEDAL_LAG_S)
+        force += (float(p[Parameter.MASS]) * acceleration - force) * -math.expm1(-dt / PEDAL_LAG_S)
         force = min(force, strongest_pull(p, float(x[Motion.VX])))
         command(p, u, steer, force)
         for i in range(4):

@@ -11,7 +11,7 @@ from edge_agent.dynamics.body import accelerations
 from edge_agent.dynamics.chassis import DUGOFF, PlanarMotion, WheelInputs, response, tyre_forces, wheel_inputs
 from edge_agent.dynamics.drive_wheel import ELECTRIC_S, WheelState, blended, drive_wheel, slip_share
 from edge_agent.dynamics.loads import wheel_loads
-from edge_agent.dynamics.parameters import P, body, four, parameter_row
+from edge_agent.dynamics.parameters import Parameter, body, four, parameter_row
 from edge_agent.dynamics.tyres import brush
 from edge_agent.lab.simulation.presets import PRESETS
 from schemas.numeric import FloatArray
@@ -68,7 +68,7 @@ def test_the_brush_curve_starts_with_slope_one_and_stays_at_one_from_three_on() 
 
 
 def test_in_balance_the_drive_wheel_rests() -> None:
-    radius = float(ROW[P.RADIUS])
+    radius = float(ROW[Parameter.RADIUS])
     rest = WheelState(300.0, 50.0, 300.0 / radius, 0.0)
     assert drive_wheel(rest, 300.0, 1.2, radius, 0.01) == pytest.approx(rest)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edge_agent.dynamics import body, loads, parameters, slip, tyres, wheel
-from edge_agent.dynamics.parameters import P, parameter_row
+from edge_agent.dynamics.parameters import Parameter, parameter_row
 from schemas.thresholds import GRAVITY
 from schemas.vehicle import Vehicle
 
@@ -106,7 +106,7 @@ def test_wheel_torque_balance_closes() -> None:
 
 
 def test_every_parameter_of_the_row_has_its_place() -> None:
-    assert ROW.shape == (len(P),)
-    assert ROW[P.SLOPE_X] == pytest.approx(6e4 / (1200.0 * GRAVITY / 4))
-    assert math.isnan(ROW[P.DRIVE_FRONT])
-    assert parameter_row(CAR.model_copy(update={"drive_split_front": 0.4}))[P.DRIVE_FRONT] == 0.4
+    assert ROW.shape == (len(Parameter),)
+    assert ROW[Parameter.SLOPE_X] == pytest.approx(6e4 / (1200.0 * GRAVITY / 4))
+    assert math.isnan(ROW[Parameter.DRIVE_FRONT])
+    assert parameter_row(CAR.model_copy(update={"drive_split_front": 0.4}))[Parameter.DRIVE_FRONT] == 0.4

@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.parameters import Parameter
 from edge_agent.lab.simulation import PRESETS, simulate_manoeuvre
 from edge_agent.lab.simulation.plant import (
     STATES,
@@ -34,7 +34,7 @@ def some_instant(rng: np.random.Generator, mu: float = 0.6) -> tuple[FloatArray,
     p = PRESETS["sedan"].row()
     x, u, w = np.zeros(STATES), np.zeros((len(Control), 4)), np.zeros((len(Wheel), 4))
     x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE] = rng.uniform(3, 30), rng.normal(0, 1), rng.normal(0, 0.4)
-    x[Motion.OMEGA : Motion.OMEGA + 4] = x[Motion.VX] / p[P.RADIUS] * rng.uniform(0.8, 1.2, 4)
+    x[Motion.OMEGA : Motion.OMEGA + 4] = x[Motion.VX] / p[Parameter.RADIUS] * rng.uniform(0.8, 1.2, 4)
     x[Motion.AX_LAGGED], x[Motion.AY_LAGGED] = rng.uniform(-4, 4, 2)
     u[Control.STEER], u[Control.MU] = rng.normal(0, 0.1, 4), mu
     wheel_forces(x, p, u, w)
@@ -57,8 +57,10 @@ def run(x: FloatArray, p: FloatArray, u: FloatArray, seconds: float, dt: float =
 
 
 def kinetic_energy(x: FloatArray, p: FloatArray) -> float:
-    wheels = p[P.WHEEL_INERTIA] * (x[Motion.OMEGA : Motion.OMEGA + 4] ** 2).sum()
-    body = p[P.MASS] * (x[Motion.VX] ** 2 + x[Motion.VY] ** 2) + p[P.YAW_INERTIA] * x[Motion.YAW_RATE] ** 2
+    wheels = p[Parameter.WHEEL_INERTIA] * (x[Motion.OMEGA : Motion.OMEGA + 4] ** 2).sum()
+    body = (
+        p[Parameter.MASS] * (x[Motion.VX] ** 2 + x[Motion.VY] ** 2) + p[Parameter.YAW_INERTIA] * x[Motion.YAW_RATE] ** 2
+    )
     return float(0.5 * (body + wheels))
 
 
@@ -66,12 +68,12 @@ def kinetic_energy(x: FloatArray, p: FloatArray) -> float:
 def test_accelerations_are_the_wheel_forces_over_mass_and_inertia(seed: int) -> None:
     x, p, u, w = some_instant(np.random.default_rng(seed))
     force = (w[Wheel.FX] + 1j * w[Wheel.FY]) * np.exp(1j * u[Control.STEER])  # the body's axes as the complex plane
-    half = 0.5 * np.repeat([p[P.TRACK_FRONT], p[P.TRACK_REAR]], 2) * [1, -1, 1, -1]
-    place = np.repeat([p[P.TO_FRONT], -p[P.TO_REAR]], 2) + 1j * half
+    half = 0.5 * np.repeat([p[Parameter.TRACK_FRONT], p[Parameter.TRACK_REAR]], 2) * [1, -1, 1, -1]
+    place = np.repeat([p[Parameter.TO_FRONT], -p[Parameter.TO_REAR]], 2) + 1j * half
     ax, ay, yaw_acceleration = body_accelerations(x, p, u, w)
     total = force.sum() - p[TrueParameter.DRAG] * x[Motion.VX] ** 2
-    assert complex(ax, ay) == pytest.approx(total / p[P.MASS], rel=ROUNDING)
-    assert yaw_acceleration == pytest.approx((place.conj() * force).imag.sum() / p[P.YAW_INERTIA], rel=ROUNDING)
+    assert complex(ax, ay) == pytest.approx(total / p[Parameter.MASS], rel=ROUNDING)
+    assert yaw_acceleration == pytest.approx((place.conj() * force).imag.sum() / p[Parameter.YAW_INERTIA], rel=ROUNDING)
 
 
 @pytest.mark.parametrize("mu", [0.05, 0.2, 0.6, 1.2])
@@ -84,7 +86,7 @@ def test_no_wheel_pulls_more_than_its_grip(mu: float) -> None:
 def test_loads_add_up_to_the_weight_whatever_the_accelerations() -> None:
     for seed in range(20):
         _, p, _, w = some_instant(np.random.default_rng(seed))
-        assert w[Wheel.FZ].sum() == pytest.approx(p[P.MASS] * GRAVITY, rel=ROUNDING)
+        assert w[Wheel.FZ].sum() == pytest.approx(p[Parameter.MASS] * GRAVITY, rel=ROUNDING)
 
 
 def test_small_slip_does_not_know_the_friction() -> None:
@@ -144,27 +146,27 @@ def test_driving_goes_forward_and_loads_the_rear() -> None:
     command(p, u, 0.0, 4000.0)
     w = run(x, p, u, 1.0)
     assert x[Motion.VX] > 11.0
-    assert w[Wheel.FZ, 2:].sum() > w[Wheel.FZ, :2].sum() * p[P.TO_FRONT] / p[P.TO_REAR]
+    assert w[Wheel.FZ, 2:].sum() > w[Wheel.FZ, :2].sum() * p[Parameter.TO_FRONT] / p[Parameter.TO_REAR]
     assert (w[Wheel.TORQUE] > 0).all()
 
 
 @pytest.mark.parametrize("mu", [0.15, 0.5, 0.9])
 def test_an_anti_lock_stop_uses_most_of_the_grip_and_never_more(mu: float) -> None:
     x, p, u = rolling(20.0, mu)
-    command(p, u, 0.0, -1.2 * p[P.MASS] * GRAVITY)
+    command(p, u, 0.0, -1.2 * p[Parameter.MASS] * GRAVITY)
     run(x, p, u, 0.3)
     fast = x[Motion.VX]
     run(x, p, u, 0.5)
     deceleration = (fast - x[Motion.VX]) / 0.5
-    assert 0.7 * mu * GRAVITY < deceleration < mu * GRAVITY + p[TrueParameter.DRAG] * fast**2 / p[P.MASS]
-    assert (x[Motion.OMEGA : Motion.OMEGA + 4] > 0.5 * x[Motion.VX] / p[P.RADIUS]).all()
+    assert 0.7 * mu * GRAVITY < deceleration < mu * GRAVITY + p[TrueParameter.DRAG] * fast**2 / p[Parameter.MASS]
+    assert (x[Motion.OMEGA : Motion.OMEGA + 4] > 0.5 * x[Motion.VX] / p[Parameter.RADIUS]).all()
 
 
 def test_without_slip_control_the_wheels_lock_and_brake_less() -> None:
     stops = {}
     for limit in (0.08, np.inf):
         x, p, u = rolling(20.0, 0.4, replace(PRESETS["sedan"], slip_limit=limit))
-        command(p, u, 0.0, -1.0 * p[P.MASS] * GRAVITY)
+        command(p, u, 0.0, -1.0 * p[Parameter.MASS] * GRAVITY)
         run(x, p, u, 1.5)
         stops[limit] = x[Motion.VX], x[Motion.OMEGA]
     assert abs(stops[np.inf][1]) < 0.5
@@ -198,7 +200,7 @@ def test_a_wheel_has_the_inertia_that_it_has() -> None:
         run(x, p, u, 0.3)
         before = x.copy()
         run(x, p, u, 0.1)
-        heavy = p[P.MASS] + 4 * p[P.WHEEL_INERTIA] / p[P.RADIUS] ** 2
+        heavy = p[Parameter.MASS] + 4 * p[Parameter.WHEEL_INERTIA] / p[Parameter.RADIUS] ** 2
         assert (x[Motion.VX] - before[Motion.VX]) / 0.1 == pytest.approx(3000.0 / heavy, rel=2e-3)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from edge_agent.dynamics.parameters import P
+from edge_agent.dynamics.parameters import Parameter
 from edge_agent.lab.simulation import (
     PRESETS,
     ROADS,
@@ -103,8 +103,12 @@ def test_a_coasting_vehicle_gains_what_it_falls_and_no_more(slope: float) -> Non
     command(p, u, 0.0, 0.0)
 
     def energy() -> float:
-        turning = 0.5 * p[P.WHEEL_INERTIA] * (x[Motion.OMEGA : Motion.OMEGA + 4] ** 2).sum()
-        return float(0.5 * p[P.MASS] * x[Motion.VX] ** 2 + turning + p[P.MASS] * GRAVITY * sine(slope) * x[Motion.X])
+        turning = 0.5 * p[Parameter.WHEEL_INERTIA] * (x[Motion.OMEGA : Motion.OMEGA + 4] ** 2).sum()
+        return float(
+            0.5 * p[Parameter.MASS] * x[Motion.VX] ** 2
+            + turning
+            + p[Parameter.MASS] * GRAVITY * sine(slope) * x[Motion.X]
+        )
 
     before = energy()
     for _ in range(50):
@@ -118,7 +122,7 @@ def test_loads_add_up_to_the_weight_that_is_normal_to_the_road_and_move_downhill
     command(p, u, 0.0, -8000.0)
     advance(x, p, u, w, 1e-3, 1000)
     wheel_forces(x, p, u, w)
-    assert w[Wheel.FZ].sum() == pytest.approx(p[P.MASS] * GRAVITY / np.sqrt(1 + 0.08**2 + 0.05**2), rel=1e-9)
+    assert w[Wheel.FZ].sum() == pytest.approx(p[Parameter.MASS] * GRAVITY / np.sqrt(1 + 0.08**2 + 0.05**2), rel=1e-9)
     level, *_ = still(0.0)
     flat = np.zeros((len(Wheel), 4))
     wheel_forces(level, p, np.zeros((INPUTS, 4)) + 0.85 * (np.arange(INPUTS) == Control.MU)[:, None], flat)
