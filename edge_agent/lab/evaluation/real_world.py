@@ -26,6 +26,7 @@ from edge_agent.lab.evaluation.measures import covered, errors
 from edge_agent.lab.simulation import PRESETS, SimulatedFleet
 from edge_agent.lab.simulation.scenarios import drawn
 from schemas.errors import InputError
+from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import BoolArray, FloatArray
 from schemas.signals import S, per_wheel
 from schemas.thresholds import EXCITED_SHARE, GRAVITY, SLIPPERY_MU, UTILISED_WINDOW_S, Z_95
@@ -33,7 +34,7 @@ from schemas.thresholds import EXCITED_SHARE, GRAVITY, SLIPPERY_MU, UTILISED_WIN
 SURFACES: Final = {"ice": (0.0, 0.2), "snow": (0.2, 0.45), "wet": (0.45, 0.75), "dry": (0.75, 2.0)}
 LOST_M_S: Final = 1.0
 MISS: Final = 20.0  # of the interval score of Gneiting and Raftery (2007) at 90 %
-PRIOR: Final = (0.1075, 1.1425)  # 90 % of the prior
+PRIOR: Final = (LOWER + 0.05 * (UPPER - LOWER), UPPER - 0.05 * (UPPER - LOWER))  # 90 % of it
 NOISE: Final = 0.03  # of the grip in use, which is smoothed over SMOOTH_S
 SMOOTH_S: Final = 0.2
 RATE_HZ: Final = 100.0
