@@ -67,6 +67,7 @@ PURE = (
 )
 # Beside it, what turns one thing in memory into another: tables and messages too, but no input or output either.
 SANS_IO = (
+    "edge_agent/publish/batching.py",
     *(f"fleet_service/ingest/{name}.py" for name in ("acks", "validation")),
     *(
         f"fleet_service/serve/{name}.py"

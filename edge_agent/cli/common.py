@@ -36,19 +36,19 @@ def checked_name(name: str) -> str:
 
 
 def publisher_of(names: Sequence[str], config: AgentConfig, estimator: str) -> Publisher:
-    """A started publisher on the configured spool.
+    """A started publisher on the configured outbox.
 
     Raises:
-        InputError: Zenoh refuses its settings, or the spool is in use or unusable.
+        InputError: Zenoh refuses its settings, or the outbox is in use or unusable.
     """
-    from edge_agent.publish.outbox import Spool
+    from edge_agent.publish.outbox import Outbox
     from edge_agent.publish.publisher import Publisher
     from schemas.runtime.zenoh_session import configuration
 
     for name in names:  # a bad setting, or a missing certificate, is to be an error here, not in a thread
         configuration(config.zenoh, name)
-    spool = Spool(config.spool, capacity_bytes=round(config.spool_mb * 1e6), first_resend_s=config.resend_s)
-    publisher = Publisher(names, spool, config, estimator)
+    outbox = Outbox(config.spool, capacity_bytes=round(config.spool_mb * 1e6), first_resend_s=config.resend_s)
+    publisher = Publisher(names, outbox, config, estimator)
     publisher.start()
     return publisher
 
@@ -80,7 +80,7 @@ left_behind = threading.Event()
 def leave(publisher: Publisher, progress: Progress, drain_s: float) -> None:
     """Wait for acknowledgements, close, print the counts as one line of JSON on stdout.
 
-    What is unsettled stays in the spool for the next start.
+    What is unsettled stays in the outbox for the next start.
     """
     from edge_agent.app.live_loop import summary
 
@@ -91,7 +91,7 @@ def leave(publisher: Publisher, progress: Progress, drain_s: float) -> None:
     print(json.dumps(summary(progress, publisher)), flush=True)
 
 
-def status(progress: Progress, publisher: Publisher, say: Callable[[str], None]) -> None:
+def status(progress: Progress, publisher: Publisher, log_line: Callable[[str], None]) -> None:
     """One line on how it goes."""
     from edge_agent.app.live_loop import summary
 
@@ -101,4 +101,4 @@ def status(progress: Progress, publisher: Publisher, say: Callable[[str], None])
         f"{progress.signals_s:7.1f} s  {publisher.links} sessions, {sum(counts.published.values())} records published, "
         f"{sum(counts.acknowledged.values())} acknowledged, {publisher.unsettled()} unsettled{late}"
     )
-    say(Line(text, event="status", **summary(progress, publisher)))
+    log_line(Line(text, event="status", **summary(progress, publisher)))

@@ -33,5 +33,5 @@ def run(args: argparse.Namespace) -> int:
     fleet = SimulatedFleet(args.scenario, args.vehicles, args.seed, args.rate, rough=args.rough)
     recorder = TruthRecorder(tuple(fleet.names)) if args.truth and writable("truth", args.truth) else None
     source = blocks(fleet, args.rate, recorder)
-    told = partial(recorder.write, args.truth) if recorder is not None else lambda: None
-    return drive_live(fleet.vehicles, fleet.names, source, config, args.estimator, args.duration, told)
+    at_end = partial(recorder.write, args.truth) if recorder is not None else lambda: None
+    return drive_live(fleet.vehicles, fleet.names, source, config, args.estimator, args.duration, at_end)

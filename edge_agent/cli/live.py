@@ -57,7 +57,7 @@ def drive_live(
         pipeline = Pipeline(bank_of(chosen, vehicles), len(vehicles), config)
         publisher = publisher_of(names, config, chosen)
         running.append(publisher)
-        report = partial(status, publisher=publisher, say=line_logger(config.log, sys.stderr))
+        report = partial(status, publisher=publisher, log_line=line_logger(config.log, sys.stderr))
         drive(blocks, pipeline, publisher, stop, report, duration_s=duration_s, progress=progress)
         at_end()
         leave(publisher, progress, STOPPED_DRAIN_S if stop.is_set() else ENDED_DRAIN_S)

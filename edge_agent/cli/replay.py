@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from edge_agent.inputs.signal_log import SignalLog
     from schemas.config import AgentConfig
 
-DRAIN_S = 30.0  # for a busy service; what is not settled by then stays in the spool
+DRAIN_S = 30.0  # for a busy service; what is not settled by then stays in the outbox
 PROGRESS_S = 1.0
 
 

@@ -5,7 +5,7 @@ A batch is due when it is full, when its oldest record has waited long enough, o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Final, NamedTuple
@@ -13,11 +13,21 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from edge_agent.observe.observation_builder import RecordBlock
-from edge_agent.publish.outbox import Draft
 from schemas import grid
 from schemas.wire import Batch, Columns, Kind, encode
 
 UNNUMBERED: Final = 0  # the outbox numbers a batch when it takes it in
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A batch that has no name yet; `encode(seq, first_held)` gives its payload."""
+
+    vehicle: str
+    kind: Kind
+    region: int
+    records: int
+    encode: Callable[[int, int], bytes]
 
 
 class _Place(NamedTuple):

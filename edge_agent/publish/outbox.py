@@ -7,7 +7,7 @@ Batches that an earlier start left behind are resent under their old name.
 
 Bounded: when the payloads exceed the capacity the oldest states go first, then the oldest observations,
 and both are counted. SQLite in WAL mode with a sync per commit; the exclusive lock of the database file is
-held as long as the spool is open, so that one file never serves two agents.
+held as long as the outbox is open, so that one file never serves two agents.
 Time is monotonic seconds and comes in as an argument.
 """
 
@@ -17,11 +17,12 @@ import heapq
 import random
 import secrets
 import sqlite3
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
+from edge_agent.publish.batching import Draft
 from schemas.errors import InputError
 from schemas.runtime.durable import make_folder
 from schemas.wire import Kind
@@ -29,7 +30,7 @@ from schemas.wire import Kind
 BOOT_LIMIT = 2**63  # boot fits a signed 64-bit column
 FIRST_RESEND_S = 2.0  # a service writes a segment each second: an answer younger than this is on its way
 LONGEST_RESEND_S = 6.0  # after an outage everything is offered again within this time
-HURRY_S = 1.0  # in which an agent that was cut off offers all that it holds
+REOFFER_S = 1.0  # in which an agent that was cut off offers all that it holds
 JITTER = 0.25  # share of the delay, either way: agents that lost one router do not return in step
 DEFAULT_CAPACITY_BYTES = 256 * 2**20  # some days of one vehicle at a batch per second and kind
 EVICTION_ORDER = (Kind.STATE, Kind.OBSERVATION)  # an old state is worth least, an observation most
@@ -55,18 +56,7 @@ class Stream(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Draft:
-    """A batch that has no name yet; `encode(seq, first_held)` gives its payload."""
-
-    vehicle: str
-    kind: Kind
-    region: int
-    records: int
-    encode: Callable[[int, int], bytes]
-
-
-@dataclass(frozen=True)
-class Held:
+class StoredBatch:
     """A batch that is on disk and not settled."""
 
     key: int
@@ -77,7 +67,7 @@ class Held:
 
 
 @dataclass
-class SpoolCounts:
+class OutboxCounts:
     """Records that went through, by what became of them."""
 
     stored: int = 0
@@ -110,8 +100,8 @@ class _Sequence:
         return self.first
 
 
-class Spool:
-    """One agent process' unsettled batches. Raises InputError when the file is another agent's or no spool."""
+class Outbox:
+    """One agent process' unsettled batches. Raises InputError when the file is another agent's or no outbox."""
 
     def __init__(
         self,
@@ -124,7 +114,7 @@ class Spool:
         self.boot = boot if boot is not None else secrets.randbelow(BOOT_LIMIT - 1) + 1
         self.capacity_bytes = capacity_bytes
         self.first_resend_s = first_resend_s
-        self.counts = SpoolCounts()
+        self.counts = OutboxCounts()
         self._random = random.Random(self.boot)
         self._entries: dict[int, _Entry] = {}
         self._oldest: dict[Kind, dict[int, None]] = {kind: {} for kind in Kind}  # keys in their order
@@ -132,11 +122,11 @@ class Spool:
         self._later: list[tuple[float, int]] = []
         self._ready: list[int] = []
         self._bytes = 0
-        self._leaving: list[int] = []
+        self._deletable: list[int] = []
         self._database = _open(path)
-        self._recall()
+        self._restore()
 
-    def _recall(self) -> None:
+    def _restore(self) -> None:
         """Take up what an earlier start left; all of it is due at once."""
         rows = self._database.execute(
             "SELECT id, vehicle, boot, kind, region, seq, records, LENGTH(payload) FROM batch ORDER BY id"
@@ -162,7 +152,7 @@ class Spool:
         if not sequence.held and entry.stream.boot != self.boot:
             del self._streams[entry.stream]
         self._bytes -= entry.size
-        self._leaving.append(key)
+        self._deletable.append(key)
         return entry
 
     @property
@@ -180,16 +170,16 @@ class Spool:
         """Payload bytes held."""
         return self._bytes
 
-    def store(self, drafts: Sequence[Draft], now: float) -> list[Held]:
+    def store(self, drafts: Sequence[Draft], now: float) -> list[StoredBatch]:
         """Name the drafts and commit them in one transaction; nothing changes when the commit fails.
 
         Raises sqlite3.Error when the disk refuses.
         """
         ahead: dict[Stream, int] = {}
         with self._database:
-            self._delete_leaving()
+            self._delete()
             held = [self._insert(draft, ahead) for draft in drafts]
-        self._leaving.clear()
+        self._deletable.clear()
         for batch in held:
             self._hold(batch.key, _Entry(batch.stream, batch.seq, batch.records, len(batch.payload)))
             self._postpone(batch.key, now)
@@ -197,7 +187,7 @@ class Spool:
         self._evict()
         return [batch for batch in held if batch.key in self._entries]
 
-    def _insert(self, draft: Draft, ahead: dict[Stream, int]) -> Held:
+    def _insert(self, draft: Draft, ahead: dict[Stream, int]) -> StoredBatch:
         stream = Stream(draft.vehicle, self.boot, draft.kind, draft.region)
         known = self._streams.get(stream, _Sequence())
         seq = ahead.get(stream, known.next)
@@ -210,7 +200,7 @@ class Spool:
         key = cursor.lastrowid
         if key is None:
             raise sqlite3.DatabaseError("an insert gave no row id")
-        return Held(key, stream, seq, draft.records, payload)
+        return StoredBatch(key, stream, seq, draft.records, payload)
 
     def _postpone(self, key: int, now: float) -> None:
         entry = self._entries[key]
@@ -223,12 +213,12 @@ class Spool:
         self._entries[key].due = at
         heapq.heappush(self._later, (at, key))
 
-    def hurry(self, vehicle: str, now: float) -> None:
-        """Offer everything of a vehicle anew within HURRY_S, oldest first: it has just found a router again."""
+    def reoffer(self, vehicle: str, now: float) -> None:
+        """Offer everything of a vehicle anew within REOFFER_S, oldest first: it has just found a router again."""
         keys = [key for key, entry in self._entries.items() if entry.stream.vehicle == vehicle]
         for place, key in enumerate(keys):
             self._entries[key].attempts = 0
-            self._schedule(key, now + HURRY_S * (place + self._random.random()) / len(keys))
+            self._schedule(key, now + REOFFER_S * (place + self._random.random()) / len(keys))
 
     def _evict(self) -> None:
         """Keep within the capacity: oldest state first, then oldest observation."""
@@ -237,21 +227,21 @@ class Spool:
                 entry = self._forget(next(iter(self._oldest[kind])))
                 self.counts.evicted[kind] += entry.records
 
-    def _delete_leaving(self) -> None:
-        self._database.executemany("DELETE FROM batch WHERE id = ?", [(key,) for key in self._leaving])
+    def _delete(self) -> None:
+        self._database.executemany("DELETE FROM batch WHERE id = ?", [(key,) for key in self._deletable])
 
-    def tidy(self) -> None:
+    def delete_settled(self) -> None:
         """Take what has left off the disk too, without waiting for the next `store`. Raises sqlite3.Error."""
-        if self._leaving:
+        if self._deletable:
             with self._database:
-                self._delete_leaving()
-            self._leaving.clear()
+                self._delete()
+            self._deletable.clear()
 
     def settle(self, stream: Stream, ranges: Iterable[tuple[int, int]]) -> int:
         """Drop the batches of inclusive seq ranges; returns the records settled. Unknown seqs are ignored.
 
-        The rows go with the next `store` or `tidy`, so that an acknowledgement costs no sync of its own; a batch that
-        a crash brings back is sent again, and the service knows it.
+        The rows go with the next `store` or `delete_settled`, so that an acknowledgement costs no sync of its own; a
+        batch that a crash brings back is sent again, and the service knows it.
         """
         sequence = self._streams.get(stream)
         if sequence is None:
@@ -261,7 +251,7 @@ class Spool:
         self.counts.settled += records
         return records
 
-    def due(self, now: float, limit: int) -> list[Held]:
+    def due(self, now: float, limit: int) -> list[StoredBatch]:
         """At most `limit` batches whose time to be offered again has come, oldest first; each is postponed."""
         while self._later and self._later[0][0] <= now:
             at, key = heapq.heappop(self._later)
@@ -276,15 +266,15 @@ class Spool:
             self._postpone(key, now)
         return [self._read(key) for key in keys]
 
-    def _read(self, key: int) -> Held:
+    def _read(self, key: int) -> StoredBatch:
         entry = self._entries[key]
         (payload,) = self._database.execute("SELECT payload FROM batch WHERE id = ?", (key,)).fetchone()
-        return Held(key, entry.stream, entry.seq, entry.records, payload)
+        return StoredBatch(key, entry.stream, entry.seq, entry.records, payload)
 
     def close(self) -> None:
         """Release the file. Raises sqlite3.Error when the disk refuses the last deletions."""
         try:
-            self.tidy()
+            self.delete_settled()
         finally:
             self._database.close()
 

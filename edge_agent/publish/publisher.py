@@ -1,4 +1,4 @@
-"""The thread between the estimation loop and the network: batch, spool, put, settle, resend.
+"""The thread between the estimation loop and the network: batch, outbox, put, settle, resend.
 
 The loop only ever does `offer`, which cannot block: disk and network are touched by the sender thread alone.
 Every batch is on disk before it is put, and stays there until the service has settled it.
@@ -17,8 +17,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from edge_agent.observe.observation_builder import RecordBlock
-from edge_agent.publish.batching import Batcher
-from edge_agent.publish.outbox import Draft, Spool, Stream
+from edge_agent.publish.batching import Batcher, Draft
+from edge_agent.publish.outbox import Outbox, Stream
 from edge_agent.publish.zenoh_link import Link
 from schemas.config import AgentConfig
 from schemas.errors import WireError
@@ -28,7 +28,7 @@ TICK_S: Final = 0.05  # how often the sender looks for due batches when nothing 
 QUEUE_LIMIT: Final = 20_000  # blocks of records; many minutes of a disk that does not answer
 WAITING_LIMIT: Final = 10_000  # batches kept in memory while the disk refuses
 RESEND_LIMIT: Final = 64  # batches offered again per round, so that fresh ones are not held up
-LOOK_S: Final = 0.5  # between two looks whether a lost router is back
+CHECK_S: Final = 0.5  # between two looks whether a lost router is back
 CLOSE_GRACE_S: Final = 0.5  # beyond the deadline, for a put or a close that hangs on a frozen router
 
 log = logging.getLogger(__name__)
@@ -53,21 +53,21 @@ class Publisher:
     def __init__(
         self,
         names: Sequence[str],
-        spool: Spool,
+        outbox: Outbox,
         config: AgentConfig,
         estimator: str,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._names = dict.fromkeys(names)
-        self._spool, self._config, self._clock = spool, config, clock
-        self._batcher = Batcher(names, spool.boot, estimator, flush_s=config.flush_s, rows=config.batch_rows)
+        self._outbox, self._config, self._clock = outbox, config, clock
+        self._batcher = Batcher(names, outbox.boot, estimator, flush_s=config.flush_s, rows=config.batch_rows)
         self._offered: queue.Queue[RecordBlock] = queue.Queue(QUEUE_LIMIT)
         self._acks: queue.SimpleQueue[tuple[str, bytes]] = queue.SimpleQueue()
         self._links: dict[str, Link] = {}
         self._connected: dict[str, bool] = {}
-        self._looked = -float("inf")
+        self._checked_at = -float("inf")
         self._waiting: list[Draft] = []
-        self._closing, self._gone = threading.Event(), threading.Event()
+        self._closing, self._stopped = threading.Event(), threading.Event()
         self._deadline = float("inf")
         self._sender = threading.Thread(target=self._send, name="sender", daemon=True)
         self._connector = threading.Thread(target=self._connect, name="connector", daemon=True)
@@ -89,15 +89,15 @@ class Publisher:
         return self._sender.ident is not None and not self._sender.is_alive() and not self._closing.is_set()
 
     def unsettled(self, kind: Kind | None = None) -> int:
-        """Records that are not settled yet: in the spool, those of an earlier start included, or on their way to it."""
+        """Records that are not settled yet: in the outbox, also of an earlier start, or on their way to it."""
         counts, kinds = self.counts, Kind if kind is None else (kind,)
         coming = sum(counts.offered[k] - counts.dropped[k] - counts.published[k] for k in kinds)
-        return coming + self._spool.records(self._names, kind)
+        return coming + self._outbox.records(self._names, kind)
 
     @property
     def dropped(self) -> int:
-        """Records given up for want of room, in the queue or in the spool."""
-        return sum(self.counts.dropped.values()) + sum(self._spool.counts.evicted.values())
+        """Records given up for want of room, in the queue or in the outbox."""
+        return sum(self.counts.dropped.values()) + sum(self._outbox.counts.evicted.values())
 
     def offer(self, *blocks: RecordBlock) -> None:
         """Hand records over; never blocks. What does not fit is dropped and counted."""
@@ -115,21 +115,21 @@ class Publisher:
         self._deadline = self._clock() + within_s
         self._closing.set()
         self._sender.join(within_s + CLOSE_GRACE_S)
-        self._gone.set()
+        self._stopped.set()
         closer = threading.Thread(target=self._disconnect, name="closer", daemon=True)
         closer.start()
         closer.join(CLOSE_GRACE_S)
         if self._sender.is_alive() or closer.is_alive():
             return False
         try:
-            self._spool.close()
+            self._outbox.close()
         except sqlite3.Error as error:
-            log.warning("the spool cannot be tidied (%s); settled batches will be sent again", error)
+            log.warning("the outbox cannot be tidied (%s); settled batches will be sent again", error)
         return True
 
     def _connect(self) -> None:
         for name in self._names:
-            link = Link.open(self._config.zenoh, name, self._hear, self._gone)
+            link = Link.open(self._config.zenoh, name, self._receive_ack, self._stopped)
             if link is None:
                 return
             self._links[name] = link
@@ -139,7 +139,7 @@ class Publisher:
         for link in self._links.values():
             link.close()
 
-    def _hear(self, vehicle: str, payload: bytes) -> None:
+    def _receive_ack(self, vehicle: str, payload: bytes) -> None:
         self._acks.put((vehicle, payload))
 
     def _send(self) -> None:
@@ -149,10 +149,10 @@ class Publisher:
             self._waiting += self._batcher.due(self._clock(), everything=self._closing.is_set())
             self._store()
             try:
-                self._spool.tidy()
+                self._outbox.delete_settled()
                 self._resend()
             except sqlite3.Error as error:
-                log.warning("the spool cannot be read or tidied (%s); trying again", error)
+                log.warning("the outbox cannot be read or tidied (%s); trying again", error)
 
     def _finished(self) -> bool:
         if not self._closing.is_set():
@@ -172,9 +172,9 @@ class Publisher:
         if not self._waiting:
             return
         try:
-            batches = self._spool.store(self._waiting, self._clock())
+            batches = self._outbox.store(self._waiting, self._clock())
         except sqlite3.Error as error:
-            log.warning("the spool refuses %d batches (%s); trying again", len(self._waiting), error)
+            log.warning("the outbox refuses %d batches (%s); trying again", len(self._waiting), error)
             for draft in self._waiting[:-WAITING_LIMIT]:
                 self.counts.dropped[draft.kind] += draft.records
             self._waiting = self._waiting[-WAITING_LIMIT:]
@@ -189,19 +189,19 @@ class Publisher:
     def _resend(self) -> None:
         if not self._links:
             return
-        if self._clock() - self._looked >= LOOK_S:
-            self._looked = self._clock()
-            self._hurry()
-        for batch in self._spool.due(self._clock(), RESEND_LIMIT):
+        if self._clock() - self._checked_at >= CHECK_S:
+            self._checked_at = self._clock()
+            self._reoffer()
+        for batch in self._outbox.due(self._clock(), RESEND_LIMIT):
             link = self._links.get(batch.stream.vehicle)
             self.counts.resent_batches += link is not None and link.put(batch)
 
-    def _hurry(self) -> None:
+    def _reoffer(self) -> None:
         """What was put while there was no router is lost: offer it anew as soon as there is one."""
         for name, link in list(self._links.items()):
             connected = link.connected
             if connected and not self._connected.get(name, True):
-                self._spool.hurry(name, self._clock())
+                self._outbox.reoffer(name, self._clock())
             self._connected[name] = connected
 
     def _settle(self) -> None:
@@ -216,13 +216,11 @@ class Publisher:
             if named != vehicle:
                 self.counts.bad_acks += 1
                 continue
-            for told in streams:
-                stream = Stream(vehicle, told.boot, told.kind, told.region)
-                self.counts.acknowledged[told.kind] += self._spool.settle(stream, told.durable)
-                for seq, row, reason in told.rejected:
-                    records = self._spool.settle(stream, [(seq, seq)])
-                    self.counts.rejected[told.kind] += records
+            for ack in streams:
+                stream = Stream(vehicle, ack.boot, ack.kind, ack.region)
+                self.counts.acknowledged[ack.kind] += self._outbox.settle(stream, ack.durable)
+                for seq, row, reason in ack.rejected:
+                    records = self._outbox.settle(stream, [(seq, seq)])
+                    self.counts.rejected[ack.kind] += records
                     if records:
-                        log.warning(
-                            "%s batch %d of %s was rejected at row %d: %s", told.kind, seq, vehicle, row, reason
-                        )
+                        log.warning("%s batch %d of %s was rejected at row %d: %s", ack.kind, seq, vehicle, row, reason)

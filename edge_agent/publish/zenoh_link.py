@@ -9,7 +9,7 @@ from typing import Final
 
 import zenoh
 
-from edge_agent.publish.outbox import Held
+from edge_agent.publish.outbox import StoredBatch
 from schemas import keys
 from schemas.config import ZenohSettings
 from schemas.runtime.zenoh_session import open_session
@@ -53,7 +53,7 @@ class Link:
         """Whether a router is there now."""
         return bool(self._session.info.routers_zid())
 
-    def put(self, batch: Held) -> bool:
+    def put(self, batch: StoredBatch) -> bool:
         """Put a batch; False when the session refuses. Nothing tells whether it arrives but the acknowledgement."""
         stream = batch.stream
         encoding, priority, congestion = _QUALITY[stream.kind]

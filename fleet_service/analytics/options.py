@@ -17,7 +17,7 @@ class Options:
         least_vehicles: distinct vehicles behind a slippery stretch or spell.
         step_s: time between the frames of an animated replay; 0 for one map.
         lateness_s: of the service whose map is replayed.
-        say: takes lines of progress.
+        report: takes lines of progress.
     """
 
     at: int | None = None
@@ -25,4 +25,4 @@ class Options:
     least_vehicles: int = 2
     step_s: float = 0.0
     lateness_s: float = 120.0
-    say: Callable[[str], None] = print
+    report: Callable[[str], None] = print

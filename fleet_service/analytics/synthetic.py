@@ -78,8 +78,8 @@ def _chunk(
     truth = truth_of(world, road[trip], along, seconds)
     excited = rng.random(rows) < _EXCITED
     used = np.clip(truth * np.where(excited, rng.uniform(0.62, 1.0, rows), rng.uniform(0.05, 0.5, rows)), 0.02, 1.2)
-    told = truth * (1.0 + bias[who[trip]]) + _STD * rng.normal(size=rows)
-    mu = np.clip(np.where(excited, told, np.maximum(0.62, used + 0.2) + 0.03 * rng.normal(size=rows)), 0.06, 1.19)
+    reported = truth * (1.0 + bias[who[trip]]) + _STD * rng.normal(size=rows)
+    mu = np.clip(np.where(excited, reported, np.maximum(0.62, used + 0.2) + 0.03 * rng.normal(size=rows)), 0.06, 1.19)
     half = np.where(excited, Z_95 * _STD, 0.35)
     cell = grid.cell_of(latitude, longitude)
     zeros = np.zeros(rows, np.int64)
@@ -92,7 +92,7 @@ def _chunk(
         "yaw_std": np.full(rows, 0.02, np.float32), "speed": (15 + rng.normal(0, 2, rows)).astype(np.float32),
         "mu": mu.astype(np.float32), "mu_lower": np.maximum(mu - half, 0.05).astype(np.float32),
         "mu_upper": np.minimum(mu + half, 1.2).astype(np.float32), "mu_utilised": used.astype(np.float32),
-        "log_likelihood": _likelihoods(rng, mu, used, excited), "told": np.ones(rows, bool),
+        "log_likelihood": _likelihoods(rng, mu, used, excited), "with_likelihood": np.ones(rows, bool),
         "health": np.where(rng.random(rows) < 0.01, 16, 0).astype(np.int32), "tyre_season": zeros.astype(np.int8),
         "air_temperature": (5.0 - 8.0 * night(seconds) + rng.normal(0, 1, rows)).astype(np.float32),
         "abs_active": np.full(rows, -1, np.int8), "vehicle": names[who[trip]], "boot": (who[trip] + 1) * 7919 + since_s,

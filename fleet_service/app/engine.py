@@ -30,7 +30,7 @@ from fleet_service.ingest.acks import Acks
 from fleet_service.ingest.dedup import BatchId, SequenceTrackers
 from fleet_service.ingest.inbox import Admitted, Intake, Message
 from fleet_service.ingest.validation import Clock
-from fleet_service.ingest.weather import WeatherDesk, archived
+from fleet_service.ingest.weather import WeatherInbox, archived
 from fleet_service.replay import checkpoints
 from fleet_service.replay.checkpoint_tables import fusion_from, tables_of
 from fleet_service.replay.rebuild import Since, replay, restore_streams
@@ -91,8 +91,8 @@ class Engine:
         streams = SequenceTrackers()
         self._intake = Intake(streams, Pseudonyms(root / "keys"), self.counts, self._acks)
         self._log: SegmentLog[BatchId] = SegmentLog(root, config.name)
-        self.weather = WeatherDesk(root, config.name, self.fusion, self.counts)
-        self._heard = since or 0  # when the last report of any kind came [ns]
+        self.weather = WeatherInbox(root, config.name, self.fusion, self.counts)
+        self._last_received = since or 0  # when the last report of any kind came [ns]
         self._checkpoint_wanted = threading.Event()
         self._checkpoints: queue.SimpleQueue[tuple[dict[str, pa.Table], int]] = queue.SimpleQueue()
         used = archived(root, damaged=set_aside)  # before the observations, which it acts on
@@ -168,7 +168,7 @@ class Engine:
         """Admit and fuse; returns the alerts that this raises or clears. `slack`: the true time may be so far ahead."""
         clock = Clock(now, int(self._config.clock_ahead_s * NS) + slack, int(self._config.oldest_s * NS))
         out: list[Alert] = []
-        self._heard = max(self._heard, now)
+        self._last_received = max(self._last_received, now)
         for kind, admitted in self._intake.admit(messages, clock).items():
             if kind is Kind.OBSERVATION:
                 out += self._fuse(admitted)
@@ -191,7 +191,7 @@ class Engine:
 
     def update_weather(self, now: int) -> None:
         """Let the weather act that came since the last call."""
-        self._heard = max(self._heard, now)
+        self._last_received = max(self._last_received, now)
         self._use(self.weather.take(now))
 
     def _use(self, reports: Reports | None) -> None:
@@ -210,7 +210,7 @@ class Engine:
             self._checkpoint_wanted.clear()
             with self._guard:
                 alerts = pa.Table.from_pylist([asdict(alert) for alert in self._alerts.standing])
-                self._checkpoints.put((tables_of(self.fusion) | {ALERTS: alerts}, self._heard))
+                self._checkpoints.put((tables_of(self.fusion) | {ALERTS: alerts}, self._last_received))
         return acks
 
     def begin_flush(self) -> list[tuple[str, bytes]]:

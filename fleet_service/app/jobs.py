@@ -47,8 +47,8 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path) -> list[Job]
         if not config.put_to and not any(segments.paths(root, kind) for kind in Kind):
             return None
         words = ["compact", "--archive", str(root), "--round-rows", str(ROUND_ROWS)]
-        said = _beside([*words, *(["--to", config.put_to] if config.put_to else [])], stop)
-        return said and f"compacted: {said}"
+        output = _beside([*words, *(["--to", config.put_to] if config.put_to else [])], stop)
+        return output and f"compacted: {output}"
 
     def snapshot(_: threading.Event) -> str | None:
         now = time.time_ns()
@@ -95,17 +95,17 @@ def _beside(words: Sequence[str], stop: threading.Event) -> str | None:
         if child.poll() is None:
             child.terminate()
             return None
-        said, complaint = child.communicate()
+        output, errors = child.communicate()
     if child.returncode:
-        raise InputError(words[0], complaint.strip() or f"ended with {child.returncode}", "it is tried again")
-    return said.strip()
+        raise InputError(words[0], errors.strip() or f"ended with {child.returncode}", "it is tried again")
+    return output.strip()
 
 
 @contextmanager
-def upkeep(jobs: Sequence[Job], counts: Counter[str], say: Callable[[str], None]) -> Iterator[None]:
+def upkeep(jobs: Sequence[Job], counts: Counter[str], log_line: Callable[[str], None]) -> Iterator[None]:
     """Do the jobs in turn while the block runs; what fails is counted as `NAME_failures` and tried again next time."""
     stop = threading.Event()
-    thread = threading.Thread(target=_keep, args=([job for job in jobs if job.every_s], counts, say, stop))
+    thread = threading.Thread(target=_keep, args=([job for job in jobs if job.every_s], counts, log_line, stop))
     thread.start()
     try:
         yield
@@ -114,7 +114,7 @@ def upkeep(jobs: Sequence[Job], counts: Counter[str], say: Callable[[str], None]
         thread.join()
 
 
-def _keep(jobs: Sequence[Job], counts: Counter[str], say: Callable[[str], None], stop: threading.Event) -> None:
+def _keep(jobs: Sequence[Job], counts: Counter[str], log_line: Callable[[str], None], stop: threading.Event) -> None:
     os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)  # of this thread alone, on Linux
     began = time.monotonic()
     due = {job: began + min(job.every_s, SOON_S) for job in jobs}
@@ -129,4 +129,4 @@ def _keep(jobs: Sequence[Job], counts: Counter[str], say: Callable[[str], None],
             line = f"{job.name} failed: {error}"
         trim_memory()
         if line:
-            say(line)
+            log_line(line)

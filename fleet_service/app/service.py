@@ -24,7 +24,7 @@ from fleet_service.app.metrics import Pulse, metrics, troubles
 from fleet_service.enrolment.fleet import Enrolment
 from fleet_service.ingest.inbox import Inbox, Message
 from fleet_service.ingest.rate_limit import RateLimiter
-from fleet_service.ingest.weather import Heard
+from fleet_service.ingest.weather import WeatherMessage
 from fleet_service.serve.queryable import MapQueryable
 from schemas import grid, keys, wire
 from schemas.config import ServiceConfig, load
@@ -46,14 +46,14 @@ class Service:
     Args:
         config: settings.
         root: of the archive.
-        say: takes the lines for the operator.
+        log_line: takes the lines for the operator.
 
     Raises:
         InputError: the archive belongs to another service.
     """
 
-    def __init__(self, config: ServiceConfig, root: Path, say: Callable[[str], None]) -> None:
-        self._config, self._root, self._say = config, root, say
+    def __init__(self, config: ServiceConfig, root: Path, log_line: Callable[[str], None]) -> None:
+        self._config, self._root, self._log_line = config, root, log_line
         known = None if config.fleet is None else set(load(config.fleet, Enrolment).vehicles)
         self.engine = Engine(config, root)
         self._clock = SteadyClock(self.engine.seen)
@@ -62,13 +62,13 @@ class Service:
         self.inbox = Inbox(config.queue_batches, self.engine.counts, limits)
         self.failure: BaseException | None = None  # of the worker; leaving the session after it may hang
         self._session: zenoh.Session | None = None
-        self._turned_at = self._put_at = self._flushed_at = self._said_at = time.monotonic()
-        self._said = 0
+        self._stepped_at = self._put_at = self._flushed_at = self._reported_at = time.monotonic()
+        self._reported = 0
 
     def run(self, stop: threading.Event) -> None:
         """Serve until `stop` is set; then flush, acknowledge and leave."""
         try:
-            with self._seen() as address:
+            with self._monitored() as address:
                 session = zenoh_session.open_session(self._config.zenoh, stop, self._config.name)
                 if session is not None:
                     self._serve(session, stop, f", {address}" if address else "")
@@ -83,27 +83,27 @@ class Service:
     def _serve(self, session: zenoh.Session, stop: threading.Event, address: str) -> None:
         with (
             session,
-            upkeep(archive_jobs(self.engine, self._config, self._root), self.engine.counts, self._say),
+            upkeep(archive_jobs(self.engine, self._config, self._root), self.engine.counts, self._log_line),
             self._declared(session),
         ):
             self._session = session
-            self._say(f"ready: {self._config.name}, {self.engine.fusion.size} cells from the archive{address}")
+            self._log_line(f"ready: {self._config.name}, {self.engine.fusion.size} cells from the archive{address}")
             try:
                 while not stop.is_set():
-                    self._turn(session, stop)
-                self._leave(session)
+                    self._step(session, stop)
+                self._shut_down(session)
             except BaseException as error:
                 self.failure = error
                 stop.set()
                 raise
 
-    def _seen(self) -> AbstractContextManager[str | None]:
+    def _monitored(self) -> AbstractContextManager[str | None]:
         """Metrics and health, where the settings want them."""
         config, engine, root = self._config, self.engine, self._root
 
         def pulse() -> Pulse:
             routers = len(list(self._session.info.routers_zid())) if self._session else 0
-            return Pulse(time.monotonic() - self._turned_at, len(self.inbox), routers, self._clock.lag() * 1e-9)
+            return Pulse(time.monotonic() - self._stepped_at, len(self.inbox), routers, self._clock.lag() * 1e-9)
 
         return serving(
             config.metrics_host, config.metrics_port,
@@ -147,15 +147,15 @@ class Service:
 
     def _weather(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
-            heard = Heard(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding))
-            self.engine.weather.hear(heard)
+            message = WeatherMessage(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding))
+            self.engine.weather.enqueue(message)
 
-    def _turn(self, session: zenoh.Session, stop: threading.Event) -> None:
+    def _step(self, session: zenoh.Session, stop: threading.Event) -> None:
         if self.engine.full:
             stop.wait(IDLE_S)
         else:
             self._take(session, self.inbox.drain(IDLE_S))
-        now = self._turned_at = time.monotonic()
+        now = self._stepped_at = time.monotonic()
         self._acknowledge(session, self.engine.written())
         if now - self._flushed_at >= self._config.segment_s:
             self._flushed_at = now
@@ -165,10 +165,10 @@ class Service:
             self._put_at = now
             self._put_alerts(session, self.engine.fade_alerts(self._clock.now()))
             self._put_tiles(session)
-        if now - self._said_at >= STATUS_S:
+        if now - self._reported_at >= STATUS_S:
             self._status(now)
 
-    def _leave(self, session: zenoh.Session) -> None:
+    def _shut_down(self, session: zenoh.Session) -> None:
         """Take what is waiting, as far as LEAVE_S allows, and settle it; the rest its senders keep."""
         deadline = time.monotonic() + LEAVE_S
         while not self.engine.full and time.monotonic() < deadline:
@@ -198,8 +198,8 @@ class Service:
 
     def _status(self, now: float) -> None:
         counts = self.engine.counts
-        rate = (counts[Kind.OBSERVATION] - self._said) / max(now - self._said_at, 1e-9)
-        self._said_at, self._said = now, counts[Kind.OBSERVATION]
+        rate = (counts[Kind.OBSERVATION] - self._reported) / max(now - self._reported_at, 1e-9)
+        self._reported_at, self._reported = now, counts[Kind.OBSERVATION]
         behind = self._clock.lag() * 1e-9
         rest = ", ".join(f"{name} {n}" for name, n in sorted(counts.items()) if n and name not in set(Kind))
         text = (
@@ -208,7 +208,7 @@ class Service:
             + (f"; {rest}" if rest else "")
             + (f"; the system's clock is {behind:.0f} s behind" if behind >= LAG_S else "")
         )
-        self._say(Line(text, cells=self.engine.fusion.size, queue=len(self.inbox), counts=dict(counts)))
+        self._log_line(Line(text, cells=self.engine.fusion.size, queue=len(self.inbox), counts=dict(counts)))
 
     def _answer(self, wanted: MapQuery, near: Callable[[int], bool], only: int | None) -> Iterator[tuple[int, bytes]]:
         return self.engine.answer(wanted, near, self._clock.now(), only)

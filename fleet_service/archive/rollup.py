@@ -88,11 +88,11 @@ def rolled_up(table: pa.Table) -> pa.Table:
 def _statistics(rows: segments.Rows, starts: IntArray) -> dict[str, Any]:
     n = len(rows["cell"])
     group = np.repeat(np.arange(len(starts)), np.diff(starts, append=n))
-    said = ~np.isnan(rows["mu"])
-    mu = np.where(said, rows["mu"], 0.0).astype(np.float64)
+    with_mu = ~np.isnan(rows["mu"])
+    mu = np.where(with_mu, rows["mu"], 0.0).astype(np.float64)
     bin_ = np.clip(np.searchsorted(mugrid.EDGES, mu, side="right") - 1, 0, mugrid.BINS - 1)
     histogram = np.zeros((len(starts), mugrid.BINS), np.int32)
-    np.add.at(histogram, (group[said], bin_[said]), 1)
+    np.add.at(histogram, (group[with_mu], bin_[with_mu]), 1)
     _, who = np.unique(rows["vehicle"].astype(str), return_inverse=True)
     names = np.array([int(name[:2], 16) % _BITS for name in np.unique(rows["vehicle"].astype(str))], np.uint64)
     pairs = np.unique(group * (int(who.max()) + 1) + who)
@@ -101,10 +101,10 @@ def _statistics(rows: segments.Rows, starts: IntArray) -> dict[str, Any]:
         "late": np.add.reduceat(rows["late"].astype(np.int64), starts),
         "vehicles": np.bincount(pairs // (int(who.max()) + 1), minlength=len(starts)),
         "vehicle_bits": np.bitwise_or.reduceat(np.uint64(1) << names[who], starts).view(np.int64),
-        "mu_count": np.add.reduceat(said.astype(np.int64), starts),
+        "mu_count": np.add.reduceat(with_mu.astype(np.int64), starts),
         "mu_sum": np.add.reduceat(mu, starts), "mu_sum_squares": np.add.reduceat(mu * mu, starts),
-        "mu_min": np.minimum.reduceat(np.where(said, rows["mu"], np.inf), starts),
-        "mu_max": np.maximum.reduceat(np.where(said, rows["mu"], -np.inf), starts),
+        "mu_min": np.minimum.reduceat(np.where(with_mu, rows["mu"], np.inf), starts),
+        "mu_max": np.maximum.reduceat(np.where(with_mu, rows["mu"], -np.inf), starts),
         "utilised_max": np.fmax.reduceat(rows["mu_utilised"], starts),
         "mu_histogram": histogram,
         "log_likelihood_sum": np.add.reduceat(rows["log_likelihood"].astype(np.int32), starts, axis=0),

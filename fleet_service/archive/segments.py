@@ -67,7 +67,9 @@ class Writer:
         self._epoch = max([int(time.time()), *(epoch + 1 for epoch in used)])
 
     def write(self, kind: Kind, rows: Rows) -> Path:
-        """Write one segment from columns (n,); `log_likelihood` is (n, 32) with the mask `told`. Durable after `sync`.
+        """Write one segment from columns (n,), durable after `sync`.
+
+        `log_likelihood` is (n, 32); `with_likelihood` (n,) is true for the rows that have one.
 
         Raises:
             OSError: it could not be written; nothing is kept of it.
@@ -108,7 +110,7 @@ def table_of(kind: Kind, rows: Rows) -> pa.Table:
 def _column(f: pa.Field[Any], rows: Rows) -> pa.Array[Any]:
     values = rows[f.name]
     if f.type == tables.LIKELIHOOD:
-        valid = np.packbits(rows["told"], bitorder="little").tobytes()
+        valid = np.packbits(rows["with_likelihood"], bitorder="little").tobytes()
         return pa.Array.from_buffers(f.type, len(values), [pa.py_buffer(valid), pa.py_buffer(values.tobytes())])
     if f.type == tables.US:
         values = values // tables.US_STEP
@@ -122,16 +124,16 @@ def rows_of(table: pa.Table) -> Rows:
     for f in table.schema:
         column = table.column(f.name).combine_chunks()
         if f.type == tables.LIKELIHOOD:
-            rows["told"] = np.asarray(column.is_valid())
+            rows["with_likelihood"] = np.asarray(column.is_valid())
             rows[f.name] = _likelihoods(column)
         elif f.type == tables.US:
             rows[f.name] = nanoseconds(column)
         else:
-            rows[f.name] = _said(f, column).to_numpy(zero_copy_only=False)
+            rows[f.name] = _without_null(f, column).to_numpy(zero_copy_only=False)
     return rows
 
 
-def _said(f: pa.Field[Any], column: pa.Array[Any]) -> pa.Array[Any]:
+def _without_null(f: pa.Field[Any], column: pa.Array[Any]) -> pa.Array[Any]:
     """A column without null: what an older version did not write reads as what no sender sent; NaN in floats."""
     if not column.null_count or pa.types.is_floating(f.type):
         return column

@@ -82,8 +82,8 @@ def judge(path: Path, schema: pa.Schema, entries: Mapping[str, str]) -> Version:
         if digest(schema, {}) not in FIRST:
             raise DamagedError(f"columns are not those of version {OLDEST}, and it says no other")
         return OLDEST
-    said = {key: value for key, value in entries.items() if key != DIGEST}
-    if entries.get(DIGEST) != digest(schema, said):
+    others = {key: value for key, value in entries.items() if key != DIGEST}
+    if entries.get(DIGEST) != digest(schema, others):
         raise DamagedError("columns are not those that were written")
     found = parsed(entries[KEY])
     if found.major > VERSION.major:

@@ -49,16 +49,16 @@ def run(arguments: argparse.Namespace) -> int:
     at = None if arguments.at is None else moment(arguments.at, "at")
     options = Options(
         at=at, stations=arguments.stations, least_vehicles=arguments.min_vehicles,
-        step_s=arguments.step, say=_say,
+        step_s=arguments.step, report=_report,
     )  # fmt: skip
-    _say(f"{question.name}: {len(engine.files('observations'))} files, {engine.rows():,} observations")
+    _report(f"{question.name}: {len(engine.files('observations'))} files, {engine.rows():,} observations")
     found = question.ask(engine, options)
     print(output.text(found, question))
     if arguments.out is not None:
         output.write(found, question, arguments.out)
-        _say(f"written: {arguments.out}")
+        _report(f"written: {arguments.out}")
     return 0
 
 
-def _say(line: str) -> None:
+def _report(line: str) -> None:
     print(line, file=sys.stderr, flush=True)

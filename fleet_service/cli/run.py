@@ -40,8 +40,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.weather is not None:
         config = config.model_copy(update={"weather": arguments.weather})
     try:
-        say = line_logger(config.log, sys.stdout, service=config.name)
-        service = Service(config, arguments.archive, say)
+        log_line = line_logger(config.log, sys.stdout, service=config.name)
+        service = Service(config, arguments.archive, log_line)
     except OSError as error:
         problem = f"cannot use {error.filename} ({error.strerror})"
         raise InputError("archive", problem, "give a folder you may read and write") from error
@@ -49,13 +49,15 @@ def run(arguments: argparse.Namespace) -> int:
     gc.collect()
     gc.freeze()  # what came from the archive stays: looking through it takes longer than an alert may
     gone = threading.Event()
-    threading.Thread(target=_leave_at_last, args=(stop, gone, service, say), daemon=True).start()
+    threading.Thread(target=_leave_at_last, args=(stop, gone, service, log_line), daemon=True).start()
     service.run(stop)
     gone.set()
     return 0
 
 
-def _leave_at_last(stop: threading.Event, gone: threading.Event, service: Service, say: Callable[[str], None]) -> None:
+def _leave_at_last(
+    stop: threading.Event, gone: threading.Event, service: Service, log_line: Callable[[str], None]
+) -> None:
     """A session that hangs on a frozen router, or a long compaction, must not keep a stopped service.
 
     Whatever it was doing may end at any instant: what is not acknowledged its senders keep. The exit code is the one
@@ -63,7 +65,7 @@ def _leave_at_last(stop: threading.Event, gone: threading.Event, service: Servic
     """
     stop.wait()
     if not gone.wait(LEAVE_AT_LAST_S):
-        say("left at last: a session or a job did not end in time")
+        log_line("left at last: a session or a job did not end in time")
         if service.failure is not None:
             traceback.print_exception(service.failure)
         end_now(service.exit_code)

@@ -57,14 +57,14 @@ def observations_of(columns: Mapping[str, NDArray[Any]], vehicle: IntArray) -> O
     """Columns (n,) of admitted rows as the fusion takes them.
 
     Args:
-        columns: those of the archive, times in ns; `told` is whether a sender gave its `log_likelihood` (n, 32).
+        columns: those of the archive, times in ns; `with_likelihood` (n,) is true for rows with a `log_likelihood`.
         vehicle: (n,) number of each vehicle.
 
     Times are those that the archive keeps, in whole microseconds.
     """
     _, second = grid.sectors_touched(np.nan_to_num(columns["yaw"]))
     first = columns["sector"].astype(np.int8)
-    steps, reported = evidence(columns, columns["told"])
+    steps, reported = evidence(columns, columns["with_likelihood"])
     other, share = other_cells(columns["cell"], columns["latitude"], columns["yaw"], columns["position_std"])
     return Observations(
         time=columns["leave_time"] // _US * _US,

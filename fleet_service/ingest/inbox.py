@@ -238,7 +238,7 @@ class Intake:
 
 def _chosen(found: Decoded, places: list[int]) -> tuple[Rows, Heads, IntArray]:
     """Rows, heads and sizes of the batches at these places, which are in order."""
-    rows: Rows = {**found.columns, "told": found.with_likelihood}
+    rows: Rows = {**found.columns, "with_likelihood": found.with_likelihood}
     if len(places) == len(found.sizes):
         return rows, found.heads, found.sizes
     kept = np.zeros(len(found.sizes), bool)

@@ -169,7 +169,7 @@ def _broken_observation(columns: Columns, clock: Clock) -> list[tuple[NDArray[np
     with np.errstate(invalid="ignore"):  # an infinite yaw is out of range anyway
         turned = np.cos(columns["yaw"] - columns["sector"] * (np.pi / 2)) < np.cos(YAW_TOLERANCE)
     mu, lower, upper = columns["mu"], columns["mu_lower"], columns["mu_upper"]
-    no_peak = columns["told"] & (columns["log_likelihood"].min(axis=1) > 0)
+    no_peak = columns["with_likelihood"] & (columns["log_likelihood"].min(axis=1) > 0)
     return [
         (_untimely(enter, leave, clock), "time", "leave_time: too old or in the future; set the clock"),
         ((leave < enter) | (leave - enter > MAX_VISIT_NS), "time", "leave_time: before or long after enter_time; mend"),

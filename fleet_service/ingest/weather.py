@@ -32,7 +32,7 @@ AHEAD_NS: Final = 86_400 * NS  # a forecast for tomorrow is weather, one for nex
 COLUMNS: Final = ("region", "time", *weather.RANGES, "prior")
 
 
-class Heard(NamedTuple):
+class WeatherMessage(NamedTuple):
     """One sample on a weather key."""
 
     key: str
@@ -40,7 +40,7 @@ class Heard(NamedTuple):
     encoding: str
 
 
-class WeatherDesk:
+class WeatherInbox:
     """Takes reports in for one fusion.
 
     Args:
@@ -52,20 +52,20 @@ class WeatherDesk:
 
     def __init__(self, root: Path, name: str, fusion: Fusion, counts: Counter[str]) -> None:
         self._folder, self._name, self._fusion, self._counts = root / FOLDER, name, fusion, counts
-        self._waiting: deque[Heard] = deque(maxlen=WAITING)
+        self._waiting: deque[WeatherMessage] = deque(maxlen=WAITING)
         self._last = 0
 
-    def hear(self, heard: Heard) -> None:
+    def enqueue(self, message: WeatherMessage) -> None:
         """Keep a sample for the next `take`; from any thread."""
-        self._waiting.append(heard)
+        self._waiting.append(message)
 
     def take(self, now: int) -> Reports | None:
         """Archive what was heard; returns it for the map, None where there is nothing."""
         found: list[tuple[int, Report]] = []
         while self._waiting:
-            heard = self._waiting.popleft()
+            message = self._waiting.popleft()
             try:
-                found.append(_report(heard, now))
+                found.append(_report(message, now))
             except InputError:
                 self._counts["refused.weather"] += 1
         return self._archived(found, now) if found else None
@@ -96,9 +96,9 @@ class WeatherDesk:
         return _reports(table)
 
 
-def _report(heard: Heard, now: int) -> tuple[int, Report]:
-    region = keys.parse(heard.key).place
-    report = weather.decode(heard.payload, heard.encoding)
+def _report(message: WeatherMessage, now: int) -> tuple[int, Report]:
+    region = keys.parse(message.key).place
+    report = weather.decode(message.payload, message.encoding)
     if region is None or not now - VALID_NS <= report.time <= now + AHEAD_NS:
         raise InputError("time", "too old, or more than a day ahead", "set the clock")
     return region, report

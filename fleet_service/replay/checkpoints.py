@@ -34,9 +34,9 @@ def save(root: Path, tables: dict[str, pa.Table], received: int) -> Path:
     draft.mkdir(parents=True)
     for name, table in tables.items():
         with written(draft / f"{name}.arrow", named=False) as file:
-            said = {**(table.schema.metadata or {}), KEY.encode(): str(VERSION).encode()}
-            with pa.ipc.new_file(file, table.schema.with_metadata(said)) as writer:
-                writer.write_table(table.replace_schema_metadata(said))
+            metadata = {**(table.schema.metadata or {}), KEY.encode(): str(VERSION).encode()}
+            with pa.ipc.new_file(file, table.schema.with_metadata(metadata)) as writer:
+                writer.write_table(table.replace_schema_metadata(metadata))
     sync_directory(draft)
     shutil.rmtree(path, ignore_errors=True)
     draft.rename(path)

@@ -106,7 +106,7 @@ def questions(root: Path, readings: Path) -> list[Figure]:
     """Seconds of four questions on all rows; milliseconds of the history of one cell."""
     found = []
     for name in TIMED:
-        options = Options(stations=readings, say=lambda _: None)
+        options = Options(stations=readings, report=lambda _: None)
         began = time.process_time()
         spent = median_s(partial(_ask, name, root, options))
         busy = (time.process_time() - began) / ROUNDS
@@ -160,7 +160,7 @@ def _geo_files(root: Path) -> Iterator[Path]:
     yield from (root / "map").rglob("*.parquet")
     for name in ("worst", "spells", "grip"):
         path = root.parent / f"{name}.geo.parquet"
-        answer = QUESTIONS[name].ask(QueryEngine("duckdb", root, PART), Options(say=lambda _: None))
+        answer = QUESTIONS[name].ask(QueryEngine("duckdb", root, PART), Options(report=lambda _: None))
         output.write(answer, QUESTIONS[name], path)
         yield path
 
@@ -183,7 +183,7 @@ def _different(root: Path, readings: Path) -> int:
     for question in QUESTIONS.values():
         if question.name == "replay":  # asks no engine
             continue
-        options = Options(at=HALF, stations=readings, say=lambda _: None)
+        options = Options(at=HALF, stations=readings, report=lambda _: None)
         one, other = (question.ask(QueryEngine(name, root, PART), options) for name in ("duckdb", "spark"))
         said = differs(one, other, question)
         tell(f"{question.name}: {said or 'the engines agree'}")

@@ -24,5 +24,5 @@ def visits(rows: int, vehicles: int, cells: int) -> Columns:
     columns["log_likelihood"] = np.minimum(shape * rng.integers(2, 12, (rows, 1)), 255).astype(np.uint8)
     columns["boot"], columns["region"] = np.ones(rows, np.int64), grid.region_of(columns["cell"])
     columns["seq"], columns["row"] = np.arange(1, rows + 1), np.zeros(rows, np.int32)
-    columns["vehicle_number"], columns["told"] = rng.integers(0, vehicles, rows), np.ones(rows, bool)
+    columns["vehicle_number"], columns["with_likelihood"] = rng.integers(0, vehicles, rows), np.ones(rows, bool)
     return columns

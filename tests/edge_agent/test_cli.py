@@ -289,14 +289,14 @@ def test_a_setting_that_zenoh_refuses_is_named(drive: Path, tmp_path: Path, caps
     _one_error(capsys, "^error: zenoh.config.connect/retri: ")
 
 
-def test_a_spool_in_use_is_refused(drive: Path, tmp_path: Path, router: Router, capsys: Output) -> None:
-    from edge_agent.publish.outbox import Spool
+def test_an_outbox_in_use_is_refused(drive: Path, tmp_path: Path, router: Router, capsys: Output) -> None:
+    from edge_agent.publish.outbox import Outbox
 
     options = ["--publish", *config(tmp_path, router), "--name", "car-one"]
-    spool = Spool(tmp_path / "spool.sqlite")
+    outbox = Outbox(tmp_path / "spool.sqlite")
     assert main(replay(drive, tmp_path / "out", *options)) == 2
-    spool.close()
-    _one_error(capsys, "^error: spool: .* is used by another agent; give each agent its own")
+    outbox.close()
+    _one_error(capsys, "^error: outbox: .* is used by another agent; give each agent its own")
 
 
 @pytest.mark.parametrize("name", [command.name for command in COMMANDS])

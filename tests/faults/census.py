@@ -23,7 +23,7 @@ class Census:
     """Counts after everything came to rest.
 
     Attributes:
-        stored: batches that were committed to a spool.
+        stored: batches that were committed to a outbox.
         settled: of those, batches that an acknowledgement settled.
         acknowledged_lost: settled batches of which a row is missing in the archive.
         lost: stored batches of which a row is missing, settled or not.

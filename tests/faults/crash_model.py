@@ -53,7 +53,7 @@ class Batch(NamedTuple):
 def rows_of(batches: list[Batch]) -> Rows:
     """Rows of batches of one kind as the log takes them."""
     kind, n = batches[0].kind, ROWS * len(batches)
-    rows: Rows = {"told": np.ones(n, bool), "log_likelihood": np.zeros((n, 32), np.uint8)}
+    rows: Rows = {"with_likelihood": np.ones(n, bool), "log_likelihood": np.zeros((n, 32), np.uint8)}
     for f in segments.SCHEMAS[kind]:
         if f.name not in rows:
             rows[f.name] = np.full(n, "") if f.type == pa.string() else np.zeros(n, np.int64)
@@ -166,11 +166,11 @@ def _memory() -> str | None:
 
 
 def run(site: Site) -> list[Figure]:
-    """5 000 histories of the log and 500 of the spool; in a quick run, a hundred and ten."""
-    logs, spools = site.of(5000, 100), site.of(500, 10)
+    """5 000 histories of the log and 500 of the outbox; in a quick run, a hundred and ten."""
+    logs, outboxes = site.of(5000, 100), site.of(500, 10)
     first, bad = site.seed * 1_000_000, 0
     with ProcessPoolExecutor(mp_context=get_context("spawn"), initializer=_quiet) as pool:
-        for kind, one, count in (("log", history, logs), ("spool", spool_history, spools)):
+        for kind, one, count in (("log", history, logs), ("spool", spool_history, outboxes)):
             for number, found in enumerate(pool.map(one, range(first, first + count), chunksize=10)):
                 bad += bool(found)
                 for problem in found[:3]:
@@ -179,7 +179,7 @@ def run(site: Site) -> list[Figure]:
                     site.say(f"{number + 1} histories of the {kind}, {bad} with a violation so far")
     return [
         figure("faults.crash_model.violations", bad),
-        Figure("faults.crash_model.histories", logs + spools, "histories"),
+        Figure("faults.crash_model.histories", logs + outboxes, "histories"),
     ]
 
 

@@ -1,4 +1,4 @@
-"""Histories of the agent's spool: power lost at any byte that SQLite had not yet synced.
+"""Histories of the agent's outbox: power lost at any byte that SQLite had not yet synced.
 
 SQLite writes by itself, so its files are looked at from outside: before and after each commit. When a commit has
 returned its bytes are synced; what power loss leaves in the middle of the next one is the old files with a part of the
@@ -13,7 +13,8 @@ import tempfile
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from edge_agent.publish.outbox import Draft, Spool, Stream
+from edge_agent.publish.batching import Draft
+from edge_agent.publish.outbox import Outbox, Stream
 from schemas.wire import Kind
 
 PAGE: Final = 4096
@@ -44,15 +45,15 @@ def spool_history(number: int) -> list[str]:
 
 def _history(random_: random.Random, folder: Path) -> list[str]:
     path, boot = folder / "spool.sqlite", 5
-    spool = Spool(path, boot=boot, capacity_bytes=CAPACITY)
+    outbox = Outbox(path, boot=boot, capacity_bytes=CAPACITY)
     stream, held, found = Stream("car-a", boot, Kind.OBSERVATION, 1), {0: b""}, []
     held.clear()
     for _ in range(COMMITS):
         before, sure = Files.of(path), set(held)
         settled = {seq for seq in held if random_.random() < 0.3}
-        spool.settle(stream, [(seq, seq) for seq in settled])
+        outbox.settle(stream, [(seq, seq) for seq in settled])
         payload = random_.randbytes(random_.choice((50, 3000, 400_000)))
-        batches = spool.store([Draft("car-a", Kind.OBSERVATION, 1, 1, lambda s, f, p=payload: p)] * 2, 0.0)  # type: ignore[misc]
+        batches = outbox.store([Draft("car-a", Kind.OBSERVATION, 1, 1, lambda s, f, p=payload: p)] * 2, 0.0)  # type: ignore[misc]
         held.update({batch.seq: batch.payload for batch in batches})
         after = Files.of(path)
         for image in (after, _torn(random_, before, after)):
@@ -60,7 +61,7 @@ def _history(random_: random.Random, folder: Path) -> list[str]:
             found += _problems(folder / "image.sqlite", image, owed, held)
         for seq in settled:
             del held[seq]
-    spool.close()
+    outbox.close()
     return found
 
 
@@ -81,7 +82,7 @@ def _problems(path: Path, image: Files, owed: set[int], known: dict[int, bytes])
     path.write_bytes(image.database)
     Path(f"{path}-wal").write_bytes(image.log)
     Path(f"{path}-shm").unlink(missing_ok=True)
-    again = Spool(path, boot=6, capacity_bytes=CAPACITY)
+    again = Outbox(path, boot=6, capacity_bytes=CAPACITY)
     there = {batch.seq: batch.payload for batch in again.due(0.0, 10**6)}
     again.close()
     found = [f"batch {seq} is lost" for seq in owed - there.keys()]

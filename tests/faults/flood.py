@@ -38,7 +38,7 @@ FLOODER: Final = "flood-001"
 CELLS: Final = 20
 FLOODED_MU: Final = 0.8
 EVERY_S: Final = 0.5  # of each honest vehicle
-RESEND_S: Final = 2.0  # as a spool does
+RESEND_S: Final = 2.0  # as a outbox does
 START_S: Final = 300.0  # the first start compiles the kernels
 _ASKED: Final = "gripmap/v1/map/**"
 
@@ -97,7 +97,7 @@ class Honest:
         self._put(one)
 
     def resend(self) -> None:
-        """Send again what waits for longer than a spool waits."""
+        """Send again what waits for longer than a outbox waits."""
         now = time.monotonic()
         for seq in [seq for seq in self._last if seq in self.delays]:
             del self._last[seq]

@@ -72,7 +72,7 @@ class Ground:
         return self.service.engine.counts[wire.Kind.OBSERVATION]
 
     def drive(self, session: zenoh.Session | None = None, name: str = HONEST) -> None:
-        """Put a good batch of one observation until the service has it on disk, as a spool does."""
+        """Put a good batch of one observation until the service has it on disk, as a outbox does."""
         self._seq += 1
         sent = batch(name, self._seq, time.time_ns() - SECOND, [0.8])
         session = session or self.honest.session

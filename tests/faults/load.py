@@ -1,7 +1,7 @@
-"""Load: observations of made-up visits through the agent's real publisher and spool, with a journal of what is safe.
+"""Load: observations of made-up visits through the agent's real publisher and outbox, with a journal of what is safe.
 
 `python -m tests.faults.load FILE` with a JSON file of the fields of `Plan`. The journal is its standard output:
-one line per batch that was committed to the spool, and one per batch that an acknowledgement settled; unbuffered, so
+one line per batch that was committed to the outbox, and one per batch that an acknowledgement settled; unbuffered, so
 that it survives kill -9. SIGUSR1: offer nothing more, leave when everything is settled. SIGTERM: leave as an agent
 does. At the end, one line of JSON.
 """
@@ -22,7 +22,8 @@ import numpy as np
 
 from edge_agent.app.live_loop import STOPPED_DRAIN_S
 from edge_agent.observe.observation_builder import RecordBlock
-from edge_agent.publish.outbox import Draft, Held, Spool, Stream
+from edge_agent.publish.batching import Draft
+from edge_agent.publish.outbox import Outbox, StoredBatch, Stream
 from edge_agent.publish.publisher import Publisher
 from schemas import grid, mugrid
 from schemas.config import AgentConfig, ZenohSettings
@@ -40,7 +41,7 @@ class Plan:
     endpoint: str
     names: list[str]
     rate: float
-    spool: str
+    outbox: str
     seed: int = 0
     flush_s: float = 0.5
     capacity_mb: float = 256.0
@@ -54,18 +55,18 @@ def note(sign: str, events: Iterable[tuple[Stream, int, int]]) -> None:
         os.write(sys.stdout.fileno(), f"{sign} {' '.join(map(str, stream))} {seq} {records} {at}\n".encode())
 
 
-class WatchedSpool(Spool):
-    """The agent's spool, with a journal."""
+class WatchedOutbox(Outbox):
+    """The agent's outbox, with a journal."""
 
-    def store(self, drafts: Sequence[Draft], now: float) -> list[Held]:
+    def store(self, drafts: Sequence[Draft], now: float) -> list[StoredBatch]:
         held = super().store(drafts, now)
         note("+", ((batch.stream, batch.seq, batch.records) for batch in held))
         return held
 
     def settle(self, stream: Stream, ranges: Iterable[tuple[int, int]]) -> int:
-        told = list(ranges)
-        note("-", ((stream, seq, 0) for first, last in told for seq in range(first, last + 1)))
-        return super().settle(stream, told)
+        settled = list(ranges)
+        note("-", ((stream, seq, 0) for first, last in settled for seq in range(first, last + 1)))
+        return super().settle(stream, settled)
 
 
 def visits(rng: np.random.Generator, vehicle: IntArray, now: int, cells_across: int) -> RecordBlock:
@@ -118,17 +119,17 @@ def main(path: str) -> int:
     signal.signal(signal.SIGUSR1, lambda *_: quiet.set())
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: _set(leave, quiet))
-    spool = WatchedSpool(Path(plan.spool), capacity_bytes=round(plan.capacity_mb * 1e6))
+    outbox = WatchedOutbox(Path(plan.outbox), capacity_bytes=round(plan.capacity_mb * 1e6))
     config = AgentConfig(zenoh=ZenohSettings(connect=[plan.endpoint]), flush_s=plan.flush_s)
-    publisher = Publisher(plan.names, spool, config, "load")
+    publisher = Publisher(plan.names, outbox, config, "load")
     publisher.start()
     print("ready: load", flush=True)
     late, longest = drive(plan, publisher, quiet)
     while publisher.unsettled() and not leave.wait(BLOCK_S):
         pass
     clean = publisher.close(STOPPED_DRAIN_S)
-    told = {"late_blocks": late, "longest_lag_s": round(longest, 3), "unsettled": publisher.unsettled()}
-    print(json.dumps({**told, "dropped": publisher.dropped, "resent": publisher.counts.resent_batches}), flush=True)
+    found = {"late_blocks": late, "longest_lag_s": round(longest, 3), "unsettled": publisher.unsettled()}
+    print(json.dumps({**found, "dropped": publisher.dropped, "resent": publisher.counts.resent_batches}), flush=True)
     if not clean:
         os._exit(0)
     return 0

@@ -125,9 +125,9 @@ class Stage:
         """A generator of observations for these vehicles, `rate` per second each; not yet started."""
         name = f"load-{len(self.loads):02}"
         config = self.folder / f"{name}.json"
-        spool = str(self.folder / f"{name}.sqlite")
+        outbox = str(self.folder / f"{name}.sqlite")
         config.write_text(
-            json.dumps({"endpoint": self.endpoint, "names": list(names), "rate": rate, "spool": spool, **more})
+            json.dumps({"endpoint": self.endpoint, "names": list(names), "rate": rate, "outbox": outbox, **more})
         )
         self.loads.append(Part(name, [sys.executable, "-m", "tests.faults.load", str(config)], self.folder))
         return self.loads[-1]
@@ -147,7 +147,7 @@ class Stage:
         for part in self.loads:
             part.line_with("ready: ")  # before, the signal would end it
             part.send(signal.SIGUSR1)
-        with suppress(TimeoutError):  # what is left in a spool then is missing in the archive, and counted there
+        with suppress(TimeoutError):  # what is left in a outbox then is missing in the archive, and counted there
             until(lambda: not any(part.alive for part in self.loads), patience_s)
 
 

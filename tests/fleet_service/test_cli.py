@@ -160,7 +160,7 @@ service.archive_jobs = lambda *_: [Job("hangs", .001, lambda _: print("hangs", f
 {more}
 sys.exit(main(sys.argv[1:]))
 """
-BREAKS = "service.Service._leave = lambda self, session: [][0]"
+BREAKS = "service.Service._shut_down = lambda self, session: [][0]"
 
 
 @pytest.mark.parametrize(("more", "code"), [("", 0), (BREAKS, 1)])

@@ -96,7 +96,7 @@ def turns(made: Service) -> tuple[int, int]:
             patch.setattr(made.engine, name, counted(name))
         for _ in range(10):
             clock[0] += 0.3
-            made._turn(None, threading.Event())  # type: ignore[arg-type]
+            made._step(None, threading.Event())  # type: ignore[arg-type]
     return calls["begin_flush"], calls["tiles"]
 
 

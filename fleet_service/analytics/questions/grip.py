@@ -16,14 +16,14 @@ PERCENTILES: Final = {"mu_p10": 0.1, "mu_p50": 0.5, "mu_p90": 0.9}
 
 def expression(t: Table) -> Table:
     """One row per day, cell and sector. Without a value there are no percentiles: mu is at least `utilised_max`."""
-    told = ibis.ifelse(value(t), t.mu.cast("float64"), ibis.null("float64"))
-    t = t.select("day", "cell", "sector", "vehicle", told=told, used=t.mu_utilised.nullif(float("nan")))
+    reported = ibis.ifelse(value(t), t.mu.cast("float64"), ibis.null("float64"))
+    t = t.select("day", "cell", "sector", "vehicle", reported=reported, used=t.mu_utilised.nullif(float("nan")))
     found = t.group_by(["day", "cell", "sector"]).aggregate(
         observations=t.count(),
-        values=t.told.count(),
+        values=t.reported.count(),
         vehicles=t.vehicle.nunique(),
         utilised_max=t.used.max(),
-        all=t.told.quantile(list(PERCENTILES.values())),  # at once: a third cheaper than one by one
+        all=t.reported.quantile(list(PERCENTILES.values())),  # at once: a third cheaper than one by one
     )
     return found.mutate(**{name: found["all"][k] for k, name in enumerate(PERCENTILES)}).drop("all")
 
@@ -32,7 +32,7 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
     """Rows of `expression`; says the coverage of the network (every cell and sector seen in these days) per day."""
     found = engine.answer(expression(engine.observations()))
     for line in coverage(found):
-        options.say(line)
+        options.report(line)
     return found
 
 
@@ -45,8 +45,8 @@ def coverage(found: pa.Table) -> list[str]:
     lines = []
     for day in np.unique(days):
         here = days == day
-        told, visited = int((here & known).sum()), int(here.sum())
-        shares = (told / network, (visited - told) / network, 1.0 - visited / network)
+        reported, visited = int((here & known).sum()), int(here.sum())
+        shares = (reported / network, (visited - reported) / network, 1.0 - visited / network)
         lines.append("{}: {:.0%} of {} cells measured, {:.0%} only bounded, {:.0%} not visited".format(
             np.datetime64(int(day), "D"), shares[0], network, *shares[1:]
         ))  # fmt: skip

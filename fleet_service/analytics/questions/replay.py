@@ -16,7 +16,7 @@ from fleet_service.serve.encode import cell_table
 from schemas import grid, tables
 from schemas.thresholds import NS
 
-TOLD_ROWS: Final = 1_000_000  # between two lines of progress
+REPORT_ROWS: Final = 1_000_000  # between two lines of progress
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
@@ -28,8 +28,8 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
         rows = 0
         for updated in replay(engine.root, fusion, Since(until=at, box=engine.part.bbox)):
             rows += len(updated.late)
-            if rows // TOLD_ROWS > (rows - len(updated.late)) // TOLD_ROWS:
-                options.say(f"{rows:,} observations replayed, {fusion.size:,} cells")
+            if rows // REPORT_ROWS > (rows - len(updated.late)) // REPORT_ROWS:
+                options.report(f"{rows:,} observations replayed, {fusion.size:,} cells")
         return _frame(engine, fusion, at)
     step, due, frames = int(options.step_s * NS), engine.part.since, []
     for updated in replay(engine.root, fusion, Since(until=engine.part.until, box=engine.part.bbox)):
@@ -37,7 +37,7 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
         while due + step <= now:
             due += step
             frames.append(_frame(engine, fusion, due))
-            options.say(f"frame {np.datetime64(due, 'ns').astype('datetime64[s]')}: {frames[-1].num_rows} cells")
+            options.report(f"frame {np.datetime64(due, 'ns').astype('datetime64[s]')}: {frames[-1].num_rows} cells")
     return pa.concat_tables([*frames, _frame(engine, fusion, engine.part.until)])
 
 

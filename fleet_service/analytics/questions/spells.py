@@ -1,7 +1,7 @@
 """`spells`: when cells became slippery, for how long, and how long an alert of two vehicles took.
 
 A spell is a run of values below SLIPPERY_MU in one cell and sector, in order of time; it ends with the first value of
-grip. `least_vehicles` or more told it. The alert is the first value of a second vehicle, as the service raises it.
+grip. `least_vehicles` or more reported it. The alert is the first value of a second vehicle, as the service raises it.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ def expression(t: Table) -> Table:
     `bias` is the mean of (own mean - mean of the others) over cells and hours, `bias_std` its standard error, `z` their
     ratio's size.
     """
-    told = value(t)
+    reported = value(t)
     mine = t.group_by("vehicle").aggregate(
         observations=t.count(),
         late=t.late.sum(),
@@ -25,7 +25,7 @@ def expression(t: Table) -> Table:
         weight=t.weight.cast("float64").mean(),
         speed=t.speed.cast("float64").mean(),
     )
-    v = t.filter(told).select(
+    v = t.filter(reported).select(
         "cell", "sector", "vehicle", hour=(t.time / HOUR_S).floor().cast("int64"), y=t.mu.cast("float64")
     )
     place = ["cell", "sector", "hour"]

@@ -20,14 +20,14 @@ SHARE: Final = 0.1  # of the values of a cell that were slippery: a stretch that
 
 
 def expression(t: Table, least_vehicles: int) -> Table:
-    """Cells and sectors of which SHARE or more of the values were slippery, told by enough vehicles."""
-    told = value(t)
+    """Cells and sectors of which SHARE or more of the values were slippery, reported by enough vehicles."""
+    reported = value(t)
     cells = t.group_by(["cell", "sector"]).aggregate(
         observations=t.count(),
-        values=told.sum(),
-        slippery=(told & (t.mu < SLIPPERY_MU)).sum(),
-        mu_sum=ibis.ifelse(told & (t.mu < SLIPPERY_MU), t.mu.cast("float64"), 0.0).sum(),
-        witnesses=ibis.ifelse(told & (t.mu < SLIPPERY_MU), t.vehicle, ibis.null("string")).nunique(),
+        values=reported.sum(),
+        slippery=(reported & (t.mu < SLIPPERY_MU)).sum(),
+        mu_sum=ibis.ifelse(reported & (t.mu < SLIPPERY_MU), t.mu.cast("float64"), 0.0).sum(),
+        witnesses=ibis.ifelse(reported & (t.mu < SLIPPERY_MU), t.vehicle, ibis.null("string")).nunique(),
     )
     return cells.filter(
         cells.slippery >= SHARE * cells["values"], cells.slippery > 0, cells.witnesses >= least_vehicles

@@ -1,4 +1,4 @@
-"""The spool: named densely, on disk first, settled by ranges, resent with patience, bounded, one agent only."""
+"""The outbox: named densely, on disk first, settled by ranges, resent with patience, bounded, one agent only."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from edge_agent.publish.outbox import HURRY_S, JITTER, LONGEST_RESEND_S, Draft, Held, Spool, Stream
+from edge_agent.publish.batching import Draft
+from edge_agent.publish.outbox import JITTER, LONGEST_RESEND_S, REOFFER_S, Outbox, StoredBatch, Stream
 from schemas.errors import InputError
 from schemas.wire import Kind
 
@@ -28,7 +29,7 @@ def stream(vehicle: str = "car-a", kind: Kind = Kind.OBSERVATION, boot: int = BO
     return Stream(vehicle, boot, kind, REGION)
 
 
-def seqs(batches: list[Held]) -> list[int]:
+def seqs(batches: list[StoredBatch]) -> list[int]:
     return [batch.seq for batch in batches]
 
 
@@ -38,10 +39,10 @@ def path(tmp_path: Path) -> Path:
 
 
 def test_seq_is_dense_from_one_in_each_stream(path: Path) -> None:
-    spool = Spool(path, boot=BOOT)
-    held = spool.store([draft(), draft(kind=Kind.STATE), draft(), draft("car-b"), draft(region=9)], now=0.0)
-    held += spool.store([draft(), draft(kind=Kind.STATE)], now=0.0)
-    spool.close()
+    outbox = Outbox(path, boot=BOOT)
+    held = outbox.store([draft(), draft(kind=Kind.STATE), draft(), draft("car-b"), draft(region=9)], now=0.0)
+    held += outbox.store([draft(), draft(kind=Kind.STATE)], now=0.0)
+    outbox.close()
     by_stream: dict[Stream, list[int]] = {}
     for batch in held:
         by_stream.setdefault(batch.stream, []).append(batch.seq)
@@ -56,92 +57,93 @@ def test_seq_is_dense_from_one_in_each_stream(path: Path) -> None:
 def test_each_start_draws_another_boot_of_63_bits(tmp_path: Path) -> None:
     boots = set()
     for number in range(20):
-        spool = Spool(tmp_path / str(number))
-        boots.add(spool.boot)
-        spool.close()
+        outbox = Outbox(tmp_path / str(number))
+        boots.add(outbox.boot)
+        outbox.close()
     assert len(boots) == 20
     assert all(0 < boot < 2**63 for boot in boots)
 
 
 def test_settled_ranges_leave_and_first_held_moves_on(path: Path) -> None:
-    spool = Spool(path, boot=BOOT)
-    spool.store([draft(records=2) for _ in range(6)], now=0.0)
-    assert spool.settle(stream(), [(1, 2), (4, 4)]) == 6
-    assert spool.store([draft()], now=0.0)[0].payload == b"7/3"
-    assert spool.settle(stream(), [(1, 7)]) == 7
-    assert spool.store([draft()], now=0.0)[0].payload == b"8/8"
-    assert spool.batches == 1
-    spool.close()
+    outbox = Outbox(path, boot=BOOT)
+    outbox.store([draft(records=2) for _ in range(6)], now=0.0)
+    assert outbox.settle(stream(), [(1, 2), (4, 4)]) == 6
+    assert outbox.store([draft()], now=0.0)[0].payload == b"7/3"
+    assert outbox.settle(stream(), [(1, 7)]) == 7
+    assert outbox.store([draft()], now=0.0)[0].payload == b"8/8"
+    assert outbox.batches == 1
+    outbox.close()
 
 
 def test_an_acknowledgement_of_what_is_not_held_changes_nothing(path: Path) -> None:
-    spool = Spool(path, boot=BOOT)
-    spool.store([draft()], now=0.0)
-    assert spool.settle(stream(boot=BOOT + 1), [(1, 1)]) == 0
-    assert spool.settle(stream(), [(2, 2**62)]) == 0
-    assert spool.batches == 1
-    spool.close()
+    outbox = Outbox(path, boot=BOOT)
+    outbox.store([draft()], now=0.0)
+    assert outbox.settle(stream(boot=BOOT + 1), [(1, 1)]) == 0
+    assert outbox.settle(stream(), [(2, 2**62)]) == 0
+    assert outbox.batches == 1
+    outbox.close()
 
 
 def test_what_was_stored_survives_a_kill_and_is_due_at_once_under_its_old_name(path: Path) -> None:
     """A child process stores, says so, and is killed without closing anything."""
     script = f"""
 import os, pathlib, signal
-from edge_agent.publish.outbox import Draft, Spool
+from edge_agent.publish.batching import Draft
+from edge_agent.publish.outbox import Outbox
 from schemas.wire import Kind
-spool = Spool(pathlib.Path({str(path)!r}), boot={BOOT})
-spool.store([Draft("car-a", Kind.OBSERVATION, {REGION}, 3, lambda s, f: b"kept %d" % s) for _ in range(4)], 0.0)
-spool.settle(spool.store([Draft("car-a", Kind.STATE, {REGION}, 3, lambda s, f: b"gone")], 0.0)[0].stream, [(1, 1)])
-spool.tidy()
+outbox = Outbox(pathlib.Path({str(path)!r}), boot={BOOT})
+outbox.store([Draft("car-a", Kind.OBSERVATION, {REGION}, 3, lambda s, f: b"kept %d" % s) for _ in range(4)], 0.0)
+outbox.settle(outbox.store([Draft("car-a", Kind.STATE, {REGION}, 3, lambda s, f: b"gone")], 0.0)[0].stream, [(1, 1)])
+outbox.delete_settled()
 os.kill(os.getpid(), signal.SIGKILL)
 """
     child = subprocess.run([sys.executable, "-c", script], check=False)
     assert child.returncode == -9
-    spool = Spool(path, boot=BOOT + 1)
-    assert spool.records({"car-a"}) == 12
-    left = spool.due(now=0.0, limit=10)
+    outbox = Outbox(path, boot=BOOT + 1)
+    assert outbox.records({"car-a"}) == 12
+    left = outbox.due(now=0.0, limit=10)
     assert [(b.stream.boot, b.seq, b.payload) for b in left] == [(BOOT, s, b"kept %d" % s) for s in (1, 2, 3, 4)]
-    assert spool.store([draft()], now=0.0)[0].seq == 1
-    assert spool.settle(stream(), [(1, 4)]) == 12
-    assert spool.batches == 1
-    spool.close()
+    assert outbox.store([draft()], now=0.0)[0].seq == 1
+    assert outbox.settle(stream(), [(1, 4)]) == 12
+    assert outbox.batches == 1
+    outbox.close()
 
 
 def test_unsettled_batches_are_offered_again_oldest_first_and_less_and_less_often(path: Path) -> None:
-    spool = Spool(path, boot=BOOT, first_resend_s=1.0)
-    spool.store([draft() for _ in range(5)], now=0.0)
-    assert spool.due(now=1.0 - JITTER - 0.01, limit=9) == []
-    assert seqs(spool.due(now=1.0 + JITTER, limit=3)) == [1, 2, 3]
-    assert seqs(spool.due(now=1.0 + JITTER, limit=3)) == [4, 5]
+    outbox = Outbox(path, boot=BOOT, first_resend_s=1.0)
+    outbox.store([draft() for _ in range(5)], now=0.0)
+    assert outbox.due(now=1.0 - JITTER - 0.01, limit=9) == []
+    assert seqs(outbox.due(now=1.0 + JITTER, limit=3)) == [1, 2, 3]
+    assert seqs(outbox.due(now=1.0 + JITTER, limit=3)) == [4, 5]
     second = 1.0 + JITTER
-    assert spool.due(now=second + 2 * (1 - JITTER) - 0.01, limit=9) == []
-    assert seqs(spool.due(now=second + 2 * (1 + JITTER), limit=9)) == [1, 2, 3, 4, 5]
-    spool.close()
+    assert outbox.due(now=second + 2 * (1 - JITTER) - 0.01, limit=9) == []
+    assert seqs(outbox.due(now=second + 2 * (1 + JITTER), limit=9)) == [1, 2, 3, 4, 5]
+    outbox.close()
 
 
 def test_the_wait_between_offers_is_bounded(path: Path) -> None:
-    spool = Spool(path, boot=BOOT, first_resend_s=1.0)
-    spool.store([draft()], now=0.0)
+    outbox = Outbox(path, boot=BOOT, first_resend_s=1.0)
+    outbox.store([draft()], now=0.0)
     now = 0.0
     for _ in range(40):
         now += LONGEST_RESEND_S * (1 + JITTER)
-        assert seqs(spool.due(now, limit=1)) == [1]
-    spool.close()
+        assert seqs(outbox.due(now, limit=1)) == [1]
+    outbox.close()
 
 
 def test_after_an_outage_all_is_offered_anew_within_a_second_oldest_first_and_nothing_twice(path: Path) -> None:
-    spool = Spool(path, boot=BOOT, first_resend_s=4.0)
-    spool.store([draft() for _ in range(5)] + [draft("car-b")], now=0.0)
-    assert len(spool.due(now=4.0 * (1 + JITTER), limit=9)) == 6
-    spool.hurry("car-a", now=5.3)
-    offered = [seq for now in (5.5, 5.7, 5.9, 6.1, 5.3 + HURRY_S) for seq in seqs(spool.due(now, limit=9))]
+    outbox = Outbox(path, boot=BOOT, first_resend_s=4.0)
+    outbox.store([draft() for _ in range(5)] + [draft("car-b")], now=0.0)
+    assert len(outbox.due(now=4.0 * (1 + JITTER), limit=9)) == 6
+    outbox.reoffer("car-a", now=5.3)
+    offered = [seq for now in (5.5, 5.7, 5.9, 6.1, 5.3 + REOFFER_S) for seq in seqs(outbox.due(now, limit=9))]
     assert offered == [1, 2, 3, 4, 5]
-    assert spool.due(now=5.5 + 4.0 * (1 - JITTER) - 0.01, limit=9) == []
-    assert sorted(seqs(spool.due(now=6.3 + 4.0 * (1 + JITTER), limit=9))) == [1, 1, 2, 3, 4, 5]  # and once the other's
-    spool.close()
+    assert outbox.due(now=5.5 + 4.0 * (1 - JITTER) - 0.01, limit=9) == []
+    assert sorted(seqs(outbox.due(now=6.3 + 4.0 * (1 + JITTER), limit=9))) == [1, 1, 2, 3, 4, 5]  # and once the other's
+    outbox.close()
 
 
-def test_folders_made_for_a_spool_are_synced_into_the_ones_above(
+def test_folders_made_for_an_outbox_are_synced_into_the_ones_above(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     synced: list[Path] = []
@@ -152,29 +154,29 @@ def test_folders_made_for_a_spool_are_synced_into_the_ones_above(
         fsync(handle)
 
     monkeypatch.setattr(os, "fsync", seen)
-    Spool(tmp_path / "a" / "b" / "spool.sqlite").close()
+    Outbox(tmp_path / "a" / "b" / "spool.sqlite").close()
     assert synced == [tmp_path, tmp_path / "a"]
 
 
-def test_a_full_spool_gives_up_the_oldest_states_then_the_oldest_observations_and_counts_them(path: Path) -> None:
-    spool = Spool(path, boot=BOOT, capacity_bytes=4_500)
+def test_a_full_outbox_gives_up_the_oldest_states_then_the_oldest_observations_and_counts_them(path: Path) -> None:
+    outbox = Outbox(path, boot=BOOT, capacity_bytes=4_500)
     for _ in range(2):
-        spool.store([draft(size=1_000), draft(kind=Kind.STATE, size=1_000, records=7)], now=0.0)
-    spool.store([draft(size=1_000)], now=0.0)
-    assert spool.counts.evicted == {Kind.STATE: 7, Kind.OBSERVATION: 0}
-    spool.store([draft(size=1_000), draft(size=1_000)], now=0.0)
-    assert spool.counts.evicted == {Kind.STATE: 14, Kind.OBSERVATION: 1}
-    assert spool.bytes <= 4_500
-    assert seqs(spool.due(now=9.0, limit=9)) == [2, 3, 4, 5]
-    assert spool.store([draft()], now=0.0)[0].payload == b"6/2"
-    spool.close()
+        outbox.store([draft(size=1_000), draft(kind=Kind.STATE, size=1_000, records=7)], now=0.0)
+    outbox.store([draft(size=1_000)], now=0.0)
+    assert outbox.counts.evicted == {Kind.STATE: 7, Kind.OBSERVATION: 0}
+    outbox.store([draft(size=1_000), draft(size=1_000)], now=0.0)
+    assert outbox.counts.evicted == {Kind.STATE: 14, Kind.OBSERVATION: 1}
+    assert outbox.bytes <= 4_500
+    assert seqs(outbox.due(now=9.0, limit=9)) == [2, 3, 4, 5]
+    assert outbox.store([draft()], now=0.0)[0].payload == b"6/2"
+    outbox.close()
 
 
 def test_what_was_given_up_does_not_come_back_after_a_restart(path: Path) -> None:
-    spool = Spool(path, boot=BOOT, capacity_bytes=2_500)
-    spool.store([draft(size=1_000) for _ in range(4)], now=0.0)
-    spool.close()
-    again = Spool(path, boot=BOOT + 1)
+    outbox = Outbox(path, boot=BOOT, capacity_bytes=2_500)
+    outbox.store([draft(size=1_000) for _ in range(4)], now=0.0)
+    outbox.close()
+    again = Outbox(path, boot=BOOT + 1)
     assert seqs(again.due(now=0.0, limit=9)) == [3, 4]
     again.close()
 
@@ -183,47 +185,48 @@ def test_a_settled_batch_that_a_crash_brings_back_is_offered_again(path: Path) -
     """Nothing is lost by it: the service knows the batch and acknowledges it again."""
     script = f"""
 import os, pathlib, signal
-from edge_agent.publish.outbox import Draft, Spool, Stream
+from edge_agent.publish.batching import Draft
+from edge_agent.publish.outbox import Outbox, Stream
 from schemas.wire import Kind
-spool = Spool(pathlib.Path({str(path)!r}), boot={BOOT})
-held = spool.store([Draft("car-a", Kind.STATE, {REGION}, 3, lambda s, f: b"seen") for _ in range(2)], 0.0)
-spool.settle(held[0].stream, [(1, 1)])
+outbox = Outbox(pathlib.Path({str(path)!r}), boot={BOOT})
+held = outbox.store([Draft("car-a", Kind.STATE, {REGION}, 3, lambda s, f: b"seen") for _ in range(2)], 0.0)
+outbox.settle(held[0].stream, [(1, 1)])
 os.kill(os.getpid(), signal.SIGKILL)
 """
     subprocess.run([sys.executable, "-c", script], check=False)
-    spool = Spool(path)
-    assert seqs(spool.due(now=0.0, limit=9)) == [1, 2]
-    spool.close()
+    outbox = Outbox(path)
+    assert seqs(outbox.due(now=0.0, limit=9)) == [1, 2]
+    outbox.close()
 
 
 def test_a_batch_that_cannot_be_encoded_leaves_no_gap(path: Path) -> None:
     def broken(seq: int, first_held: int) -> bytes:
         raise ValueError(f"{seq} {first_held}")
 
-    spool = Spool(path, boot=BOOT)
+    outbox = Outbox(path, boot=BOOT)
     with pytest.raises(ValueError, match="2 1"):
-        spool.store([draft(), Draft("car-a", Kind.OBSERVATION, REGION, 1, broken)], now=0.0)
-    assert spool.batches == 0
-    assert seqs(spool.store([draft()], now=0.0)) == [1]
-    spool.close()
+        outbox.store([draft(), Draft("car-a", Kind.OBSERVATION, REGION, 1, broken)], now=0.0)
+    assert outbox.batches == 0
+    assert seqs(outbox.store([draft()], now=0.0)) == [1]
+    outbox.close()
 
 
-def test_one_spool_never_serves_two_agents(path: Path) -> None:
-    spool = Spool(path)
+def test_one_outbox_never_serves_two_agents(path: Path) -> None:
+    outbox = Outbox(path)
     with pytest.raises(InputError, match="spool: .* is used by another agent; give each agent its own"):
-        Spool(path)
-    spool.close()
-    Spool(path).close()
+        Outbox(path)
+    outbox.close()
+    Outbox(path).close()
 
 
-def test_a_spool_below_a_file_is_refused(path: Path) -> None:
+def test_an_outbox_below_a_file_is_refused(path: Path) -> None:
     path.write_text("no folder")
     with pytest.raises(InputError, match="spool: .* cannot be opened"):
-        Spool(path / "spool.sqlite")
+        Outbox(path / "spool.sqlite")
 
 
-def test_a_file_that_is_no_spool_is_refused_and_left_alone(path: Path) -> None:
+def test_a_file_that_is_no_outbox_is_refused_and_left_alone(path: Path) -> None:
     path.write_bytes(b"my shopping list, and it is longer than a header" * 40)
     with pytest.raises(InputError, match="spool: .* cannot be opened"):
-        Spool(path)
+        Outbox(path)
     assert path.read_bytes().startswith(b"my shopping list")

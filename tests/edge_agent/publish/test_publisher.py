@@ -11,7 +11,7 @@ import pytest
 
 from edge_agent.observe.observation_builder import RecordBlock
 from edge_agent.publish.batching import Batcher
-from edge_agent.publish.outbox import Spool
+from edge_agent.publish.outbox import Outbox
 from edge_agent.publish.publisher import Publisher
 from schemas import grid, keys
 from schemas.config import AgentConfig, ZenohSettings
@@ -41,7 +41,7 @@ def settings(router: Router, tmp_path: Path, **changes: object) -> AgentConfig:
 
 
 def publisher_of(config: AgentConfig, names: tuple[str, ...] = NAMES) -> Publisher:
-    publisher = Publisher(names, Spool(config.spool, first_resend_s=config.resend_s), config, "test")
+    publisher = Publisher(names, Outbox(config.spool, first_resend_s=config.resend_s), config, "test")
     publisher.start()
     return publisher
 
@@ -135,7 +135,7 @@ def test_without_a_router_it_leaves_in_time_and_keeps_everything_for_the_next_st
     publisher.offer(observations)
     assert publisher.close(within_s=0.5)
     assert publisher.unsettled() == len(observations.vehicle)
-    again = Spool(config.spool)
+    again = Outbox(config.spool)
     assert again.records(set(NAMES)) == len(observations.vehicle)
     again.close()
 
@@ -196,15 +196,15 @@ def test_a_full_disk_is_waited_for(
 ) -> None:
     """SQLite may not grow its file beyond the pages that it has, then it may."""
     config = settings(router, tmp_path)
-    spool = Spool(config.spool)
-    database = spool._database
+    outbox = Outbox(config.spool)
+    database = outbox._database
     (pages,) = database.execute("PRAGMA page_count").fetchone()
     database.execute(f"PRAGMA max_page_count = {pages}")
-    publisher = Publisher(NAMES, spool, config, "test")
+    publisher = Publisher(NAMES, outbox, config, "test")
     publisher.start()
     observations, states = drive(samples=1000)
     publisher.offer(observations, states)
-    until(lambda: "the spool refuses" in caplog.text)
+    until(lambda: "the outbox refuses" in caplog.text)
     assert publisher.unsettled() == len(observations.vehicle) + len(states.vehicle)
     database.execute("PRAGMA max_page_count = 1000000")
     assert publisher.close(within_s=20.0)

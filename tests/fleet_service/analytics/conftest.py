@@ -84,7 +84,7 @@ def asked(archive: Path) -> Callable[..., pa.Table]:
 
     def ask(name: str, engine: str = "duckdb", part: Extract = PART, **options: object) -> pa.Table:
         said: list[str] = []
-        found = QUESTIONS[name].ask(QueryEngine(engine, archive, part), Options(say=said.append, **options))  # type: ignore[arg-type]
+        found = QUESTIONS[name].ask(QueryEngine(engine, archive, part), Options(report=said.append, **options))  # type: ignore[arg-type]
         return found.replace_schema_metadata({"said": "\n".join(said)})
 
     return ask

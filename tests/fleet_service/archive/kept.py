@@ -27,7 +27,7 @@ from fleet_service.app.engine import Engine
 from fleet_service.archive import rollup, snapshots
 from fleet_service.archive.compaction import compact
 from fleet_service.ingest.inbox import Message
-from fleet_service.ingest.weather import Heard
+from fleet_service.ingest.weather import WeatherMessage
 from fleet_service.replay import checkpoints
 from fleet_service.serve.encode import cell_table
 from schemas import grid, keys, weather, wire
@@ -118,7 +118,7 @@ def make(root: Path) -> dict[str, Any]:
             if turn == 2:
                 report = weather.encode(weather.Report(now_of(2), air_temperature=-3.0, precipitation=1.0))
                 region = int(grid.region_of(grid.cell_of(*PLACES[0])))
-                engine.weather.hear(Heard(keys.weather_key(region), report, wire.WEATHER_ENCODING))
+                engine.weather.enqueue(WeatherMessage(keys.weather_key(region), report, wire.WEATHER_ENCODING))
                 engine.update_weather(now_of(2))
             engine.ingest(list(messages(turn)), now_of(turn))
             if turn % 2:

@@ -23,8 +23,10 @@ def rows_of(kind: Kind, count: int, seed: int = 0, vehicles: int = 5) -> Rows:
     rows: Rows = {}
     for field in SCHEMAS[kind]:
         if field.type == tables.LIKELIHOOD:
-            rows["told"] = rng.random(count) < 0.8
-            rows[field.name] = rng.integers(0, 256, (count, mugrid.BINS)).astype(np.uint8) * rows["told"][:, None]
+            rows["with_likelihood"] = rng.random(count) < 0.8
+            rows[field.name] = (
+                rng.integers(0, 256, (count, mugrid.BINS)).astype(np.uint8) * rows["with_likelihood"][:, None]
+            )
         elif field.type == tables.US:
             rows[field.name] = START + rng.integers(0, 1200 * 10**9, count)
         else:

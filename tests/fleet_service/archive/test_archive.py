@@ -161,7 +161,7 @@ def test_rows_read_back_are_the_rows_written(engine: Engine, tmp_path: Path) -> 
     engine.flush()
     (table,) = reading.read(tmp_path, Kind.OBSERVATION)
     rows = segments.rows_of(table)
-    assert rows["told"].tolist() == [True, True, False, False]
+    assert rows["with_likelihood"].tolist() == [True, True, False, False]
     assert not rows["log_likelihood"][2:].any()
     again = segments.rows_of(segments.table_of(Kind.OBSERVATION, rows))
     assert again.keys() == rows.keys()

@@ -15,7 +15,7 @@ import zenoh
 
 from fleet_service.app.engine import Engine
 from fleet_service.ingest.inbox import Message
-from fleet_service.ingest.weather import Heard, archived, read_file
+from fleet_service.ingest.weather import WeatherMessage, archived, read_file
 from schemas import grid, keys, mugrid, tables, weather, wire
 from schemas.config import ServiceConfig
 from schemas.errors import InputError, WireError
@@ -94,8 +94,8 @@ def test_a_restart_from_the_archive_has_the_weather_that_was_used_and_gives_the_
     engine = Engine(config, tmp_path / "a")
     drive(engine, start, 1)
     told = weather.encode(Report(start + 1200 * SECOND, road_temperature=-1.0, precipitation=1.0))
-    engine.weather.hear(Heard(keys.weather_key(REGION), told, wire.WEATHER_ENCODING))
-    engine.weather.hear(Heard(keys.weather_key(REGION), b"garbage", ""))
+    engine.weather.enqueue(WeatherMessage(keys.weather_key(REGION), told, wire.WEATHER_ENCODING))
+    engine.weather.enqueue(WeatherMessage(keys.weather_key(REGION), b"garbage", ""))
     engine.update_weather(start + 1300 * SECOND)
     drive(engine, start + 3000 * SECOND, 2)
     assert (engine.counts["weather"], engine.counts["refused.weather"]) == (2, 1)
