@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_service.archive import reading
-from fleet_service.lab.whole_way import false_ice
+from fleet_service.lab.end_to_end import false_ice
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.figures import Figure
 from schemas.thresholds import EXCITED_SHARE, SLIPPERY_MU

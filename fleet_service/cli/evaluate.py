@@ -12,9 +12,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="figures, table and plots go there")
     parser.add_argument("--quick", action="store_true", help="one seed, to see that it works; judges nothing")
+    # the second names are those of earlier versions
     way = parser.add_mutually_exclusive_group()
-    way.add_argument("--skip-whole-way", action="store_true", help="leave the vehicles with real estimators out")
-    way.add_argument("--whole-way", action="store_true", help="those alone, in a level town and on hills")
+    way.add_argument(
+        "--skip-end-to-end", "--skip-whole-way", action="store_true", help="leave the vehicles with real estimators out"
+    )
+    way.add_argument(
+        "--end-to-end", "--whole-way", action="store_true", help="those alone, in a level town and on hills"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -22,13 +27,13 @@ def run(arguments: argparse.Namespace) -> int:
     from fleet_service.lab import campaign
     from schemas.runtime import figures
 
-    drives = {} if arguments.skip_whole_way else campaign.whole_ways(arguments.quick)
+    drives = {} if arguments.skip_end_to_end else campaign.drives_end_to_end(arguments.quick)
 
     def tell(line: str) -> None:
         print(line, flush=True)
 
     try:
-        found = campaign.run(arguments.out, arguments.quick, drives, tell, alone=arguments.whole_way)
+        found = campaign.run(arguments.out, arguments.quick, drives, tell, alone=arguments.end_to_end)
     except OSError as error:
         raise InputError("out", f"cannot write {error.filename} ({error.strerror})", "give another folder") from error
     print(f"\n{figures.markdown([figure for figure in found if figure.bar is not None])}\n")

@@ -31,7 +31,7 @@ from schemas.thresholds import EXCITED_SHARE
 
 BIAS_RELATIVE: Final = 0.05
 BIAS_ABSOLUTE: Final = 0.015
-# What all vehicles of a place share, relative: in six drives of the whole way (real estimator) cells of 20 and more
+# What all vehicles of a place share, relative: in six end-to-end drives (real estimator) cells of 20 and more
 # excited vehicles err about the mean of their surface by .059 dry, .046 wet and .044 snow (robust standard deviations;
 # plain ones are .088, .088 and .066).
 COMMON: Final = 0.05

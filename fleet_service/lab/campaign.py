@@ -10,17 +10,17 @@ from typing import Final
 
 import numpy as np
 
-from fleet_service.lab import attacks, bars, changes, exact, fleets, plots, whole_way
+from fleet_service.lab import attacks, bars, changes, end_to_end, exact, fleets, plots
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
 
 SEEDS, QUICK_SEEDS = 40, 1
-WHOLE_WAYS: Final = {whole_way.LEVEL: (200, 60.0), whole_way.HILLS: (120, 180.0)}  # vehicles, seconds
+LENGTHS: Final = {end_to_end.LEVEL: (200, 60.0), end_to_end.HILLS: (120, 180.0)}  # vehicles, seconds
 EXACT_SEEDS: Final = 8  # drives of 20 minutes; nothing random is averaged there, the largest difference counts
 
 Tell = Callable[[str], None]
 Part = Callable[[], dict[str, float]]
-Drives = Mapping[whole_way.World, whole_way.Drive]
+Drives = Mapping[end_to_end.World, end_to_end.Drive]
 
 
 def run(folder: Path, quick: bool, drives: Drives, tell: Tell, *, alone: bool = False) -> list[Figure]:
@@ -29,9 +29,9 @@ def run(folder: Path, quick: bool, drives: Drives, tell: Tell, *, alone: bool = 
     Args:
         folder: is made.
         quick: one seed, to see that everything works; says nothing about the bars.
-        drives: of the whole way; without one, its figures are missing.
+        drives: end to end; without one, its figures are missing.
         tell: hears progress lines.
-        alone: the whole way and nothing else; other figures are then not listed.
+        alone: end to end and nothing else; other figures are then not listed.
     """
     folder.mkdir(parents=True, exist_ok=True)
     seeds = range(QUICK_SEEDS if quick else SEEDS)
@@ -40,7 +40,7 @@ def run(folder: Path, quick: bool, drives: Drives, tell: Tell, *, alone: bool = 
         began = time.perf_counter()
         found |= part()
         tell(f"{name}: {time.perf_counter() - began:.0f} s")
-    judged = [figure for figure in bars.judged(found) if not alone or figure.name.startswith(whole_way.LEVEL.prefix)]
+    judged = [figure for figure in bars.judged(found) if not alone or figure.name.startswith(end_to_end.LEVEL.prefix)]
     figures.write(folder / "figures.json", "fusion" + (" --quick" if quick else ""), list(seeds), judged)
     barred = [figure for figure in judged if figure.bar is not None]
     shown = [figure for figure in judged if figure.bar is None and not _curve(figure.name)]
@@ -50,10 +50,10 @@ def run(folder: Path, quick: bool, drives: Drives, tell: Tell, *, alone: bool = 
     return judged
 
 
-def whole_ways(quick: bool) -> Drives:
-    """The drives of the whole way, level and rough, or a few seconds of them."""
+def drives_end_to_end(quick: bool) -> Drives:
+    """The end-to-end drives, level and rough, or a few seconds of them."""
     return {
-        world: whole_way.command(*((4, 3.0) if quick else length), world) for world, length in WHOLE_WAYS.items()
+        world: end_to_end.command(*((4, 3.0) if quick else length), world) for world, length in LENGTHS.items()
     }  # fmt: skip
 
 
@@ -68,7 +68,7 @@ def _curve(name: str) -> bool:
 
 def _ways(drives: Drives, folder: Path) -> list[tuple[str, Part]]:
     return [
-        (f"the whole way, {world.scenario}", partial(whole_way.measure, drive, folder, world))
+        (f"end to end, {world.scenario}", partial(end_to_end.measure, drive, folder, world))
         for world, drive in drives.items()
     ]  # fmt: skip
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_agent.dynamics.parameters import Parameter
-from edge_agent.lab.simulation.chance import uniform
+from edge_agent.lab.simulation.counter_rng import uniform
 from edge_agent.lab.simulation.friction import PatchColumn, look_up
 from edge_agent.lab.simulation.plant import Motion, Wheel, strongest_pull
 from edge_agent.lab.simulation.roads import LanePoint

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge_agent.lab.simulation.chance import checked_seed, key_of
+from edge_agent.lab.simulation.counter_rng import checked_seed, key_of
 from edge_agent.lab.simulation.driver import ALERT_STREAM, ROUTE_STREAM, Driver, KeyArray, Lanes, Route, drive
 from edge_agent.lab.simulation.friction import PatchColumn, look_up
 from edge_agent.lab.simulation.misaligned import memory_of

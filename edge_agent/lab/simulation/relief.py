@@ -20,7 +20,7 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.lab.simulation.chance import checked_seed, key_of, normal, uniform
+from edge_agent.lab.simulation.counter_rng import checked_seed, key_of, normal, uniform
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled

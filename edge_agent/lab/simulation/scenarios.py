@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.lab.simulation.chance import checked_seed, key_of, uniform
+from edge_agent.lab.simulation.counter_rng import checked_seed, key_of, uniform
 from edge_agent.lab.simulation.friction import DRY, ICE, SNOW, WET, Patch, PatchColumn, friction_table, look_up_many
 from edge_agent.lab.simulation.place import GOTHENBURG, Origin
 from edge_agent.lab.simulation.relief import LEVEL, Relief, Wave

@@ -15,7 +15,7 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_agent.lab.simulation.chance import key_of, normal, uniform
+from edge_agent.lab.simulation.counter_rng import key_of, normal, uniform
 from edge_agent.lab.simulation.misaligned import (
     ALIGNED,
     COLUMNS,

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from edge_agent.dynamics.parameters import Parameter
-from edge_agent.lab.simulation.chance import checked_seed
+from edge_agent.lab.simulation.counter_rng import checked_seed
 from edge_agent.lab.simulation.faults import Fault, apply_faults
 from edge_agent.lab.simulation.manoeuvres import MANOEUVRES, Friction, Manoeuvre, Moment
 from edge_agent.lab.simulation.place import GOTHENBURG, Origin

@@ -48,13 +48,13 @@ def test_a_quick_campaign_writes_every_figure_with_its_bar_the_table_and_the_plo
     }  # fmt: skip
 
 
-def test_the_whole_way_alone_lists_its_figures_and_no_others(tmp_path: Path) -> None:
+def test_end_to_end_alone_lists_its_figures_and_no_others(tmp_path: Path) -> None:
     found = campaign.run(tmp_path, True, {}, lambda _line: None, alone=True)
     names = {figure.name for figure in found}
     assert names == {name for name in bars.BARS if name.startswith("fusion.whole_way")}
     assert "fusion.whole_way.hills.coverage90" in names
     assert not any(figure.holds for figure in found)
-    assert [world.rough for world in campaign.whole_ways(quick=True)] == [0.0, 0.5]
+    assert [world.rough for world in campaign.drives_end_to_end(quick=True)] == [0.0, 0.5]
 
 
 def test_a_missing_figure_fails_the_campaign() -> None:

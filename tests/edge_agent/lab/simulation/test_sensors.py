@@ -7,7 +7,7 @@ import pyarrow as pa
 import pytest
 
 from edge_agent.lab.simulation import FAULTS, PRESETS, SENSORS, Fault, simulate_manoeuvre
-from edge_agent.lab.simulation.chance import key_of, normal, uniform
+from edge_agent.lab.simulation.counter_rng import key_of, normal, uniform
 from edge_agent.lab.simulation.faults import apply_faults
 from edge_agent.lab.simulation.place import GOTHENBURG
 from edge_agent.lab.simulation.presets import KNOWN

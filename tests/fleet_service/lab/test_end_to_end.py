@@ -1,4 +1,4 @@
-"""The whole way's joint: what the vehicles' command writes is what the campaign reads and sets beside the truth."""
+"""End-to-end drives: what the vehicles write is what the campaign reads and sets beside the truth."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from deploy.whole_way import main
+from deploy.end_to_end import main
 from fleet_service.fusion import Fusion
-from fleet_service.lab import whole_way
+from fleet_service.lab import end_to_end
 from schemas import grid
 from schemas.thresholds import NS
 from schemas.wire import Alert
@@ -21,27 +21,27 @@ from tests.fleet_service.examples import CELL, START, observations, value
 @pytest.mark.timeout(600)  # compiles the estimator where nobody did before
 def test_what_the_vehicles_write_is_joined_with_their_truth(tmp_path: Path) -> None:
     def drive(folder: Path) -> None:
-        world = ["--scenario", whole_way.HILLS.scenario, "--rough", "0.5"]
+        world = ["--scenario", end_to_end.HILLS.scenario, "--rough", "0.5"]
         assert main(["--out", str(folder), "--vehicles", "4", "--duration", "20", "--seed", "3", *world]) == 0
 
-    figures = whole_way.measure(drive, tmp_path, whole_way.HILLS)
+    figures = end_to_end.measure(drive, tmp_path, end_to_end.HILLS)
     assert figures["fusion.whole_way.hills.observations"] > 4
     assert figures["fusion.whole_way.hills.false_ice"] <= figures["fusion.whole_way.hills.alerts"]
-    columns = whole_way.read(tmp_path / "whole_way.hills" / whole_way.OBSERVATIONS)
-    truth = pq.read_table(tmp_path / "whole_way.hills" / whole_way.TRUTH)
+    columns = end_to_end.read(tmp_path / "whole_way.hills" / end_to_end.OBSERVATIONS)
+    truth = pq.read_table(tmp_path / "whole_way.hills" / end_to_end.TRUTH)
     told = set(zip(columns["cell"].tolist(), columns["sector"].tolist(), strict=True))
     true = set(zip(truth["cell"].to_pylist(), truth["sector"].to_pylist(), strict=True))
     assert len(told & true) > 0.5 * len(told)
     fusion = Fusion(120.0)
-    fusion.update(whole_way.observations_in(columns))
-    slots, mu = whole_way.joined(fusion, truth)
+    fusion.update(end_to_end.observations_in(columns))
+    slots, mu = end_to_end.joined(fusion, truth)
     assert 0 < len(slots) <= fusion.size
     assert ((mu > 0.05) & (mu < 1.2)).all()
 
 
 def test_a_figure_of_nothing_is_not_a_number_and_holds_no_bar() -> None:
-    assert np.isnan(whole_way.mean(np.array([])))
-    assert whole_way.mean(np.array([True, False])) == 0.5
+    assert np.isnan(end_to_end.mean(np.array([])))
+    assert end_to_end.mean(np.array([True, False])) == 0.5
 
 
 def visits(*rows: tuple[int, float, float]) -> pa.Table:
@@ -58,7 +58,7 @@ def visits(*rows: tuple[int, float, float]) -> pa.Table:
 def test_the_truth_of_a_cell_is_that_of_its_last_half_minute_and_of_all_visits_where_there_was_none() -> None:
     fusion = Fusion(120.0)
     fusion.update(observations([1.0, 1.0], [1, 2], value([0.5, 0.5]), cell=[CELL, CELL + 1]))
-    slots, mu = whole_way.joined(
+    slots, mu = end_to_end.joined(
         fusion, visits((0, 10.0, 0.9), (0, 80.0, 0.2), (0, 99.0, 0.4), (1, 5.0, 0.8), (1, 6.0, 0.6), (7, 99.0, 0.1))
     )
     found = dict(zip(fusion.cell[slots].tolist(), mu.tolist(), strict=True))
@@ -73,15 +73,15 @@ def test_an_alert_is_false_where_nothing_near_was_slippery_before_it() -> None:
         return Alert(cell, 0, True, START + int(seconds * NS), 0.2, 0.1, 0.3, 0.95, 2, 57.7, 11.97, "test")
 
     rows = visits((0, 10.0, 0.2), (0, 2.0, 0.9))
-    assert whole_way.false_ice([alert(0, 20.0)], rows) == (0, 0)
-    assert whole_way.false_ice([alert(0, 5.0)], rows) == (1, 0)  # the ice came later
-    assert whole_way.false_ice([alert(1, 20.0), alert(2, 20.0)], rows) == (1, 1)
-    assert whole_way.false_ice([], rows) == (0, 0)
+    assert end_to_end.false_ice([alert(0, 20.0)], rows) == (0, 0)
+    assert end_to_end.false_ice([alert(0, 5.0)], rows) == (1, 0)  # the ice came later
+    assert end_to_end.false_ice([alert(1, 20.0), alert(2, 20.0)], rows) == (1, 1)
+    assert end_to_end.false_ice([], rows) == (0, 0)
 
 
 def test_alerts_are_those_of_a_service_that_hears_second_by_second() -> None:
     fusion = Fusion(120.0)
-    raised = whole_way.told(fusion, observations(list(range(1, 9)), [1, 2] * 4, value([0.15] * 8)))
+    raised = end_to_end.told(fusion, observations(list(range(1, 9)), [1, 2] * 4, value([0.15] * 8)))
     assert [alert.cell for alert in raised] == [CELL]
 
 
@@ -89,12 +89,12 @@ def test_excited_vehicles_are_counted_once_per_cell() -> None:
     fusion = Fusion(120.0)
     fusion.update(observations([1.0, 1.0], [1, 2], value([0.5, 0.5]), cell=[CELL, CELL + 1]))
     rows = visits((0, 1.0, 0.9), (0, 2.0, 0.9), (0, 3.0, 0.9), (1, 4.0, 0.1), (1, 5.0, 0.9))
-    counts = whole_way.excited(fusion, rows)
+    counts = end_to_end.excited(fusion, rows)
     assert counts[fusion.slots_of(np.array([CELL, CELL + 1]), np.zeros(2, np.int64))].tolist() == [2, 1]
 
 
 def test_a_cell_of_two_surfaces_is_told_apart() -> None:
     fusion = Fusion(120.0)
     fusion.update(observations([1.0, 1.0], [1, 2], value([0.5, 0.5]), cell=[CELL, CELL + 1]))
-    same = whole_way.one_surface(fusion, visits((0, 1.0, 0.9), (0, 2.0, 0.8), (1, 4.0, 0.6), (1, 5.0, 0.61)))
+    same = end_to_end.one_surface(fusion, visits((0, 1.0, 0.9), (0, 2.0, 0.8), (1, 4.0, 0.6), (1, 5.0, 0.61)))
     assert same[fusion.slots_of(np.array([CELL, CELL + 1]), np.zeros(2, np.int64))].tolist() == [False, True]

@@ -1,4 +1,4 @@
-"""The whole way: simulated vehicles with the real estimator, their observations through the fusion, beside the truth.
+"""End to end: simulated vehicles with the real estimator, their observations through the fusion, beside the truth.
 
 The vehicles are driven by a command of the deployment, since the service does not know the agent; what it writes is
 read.
@@ -47,15 +47,15 @@ HILLS: Final = World("hills-20000", 0.5, "fusion.whole_way.hills")  # frictions 
 
 
 def command(vehicles: int, seconds: float, world: World) -> Drive:
-    """A drive by `python -m deploy.whole_way`."""
+    """A drive by `python -m deploy.end_to_end`."""
     import sys
 
     def drive(folder: Path) -> None:
         options = ["--out", str(folder), "--vehicles", str(vehicles), "--duration", str(seconds)]
         options += ["--scenario", world.scenario, "--rough", str(world.rough)]
-        done = subprocess.run([sys.executable, "-m", "deploy.whole_way", *options], check=False)
+        done = subprocess.run([sys.executable, "-m", "deploy.end_to_end", *options], check=False)
         if done.returncode:
-            raise InputError("whole-way", "the simulated vehicles failed", "see above, or --skip-whole-way")
+            raise InputError("end-to-end", "the simulated vehicles failed", "see above, or --skip-end-to-end")
 
     return drive
 
