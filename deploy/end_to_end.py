@@ -31,7 +31,7 @@ from schemas.wire import Columns
 RATE_HZ = 100.0
 BLOCK = 50  # samples
 START_NS = 1_800_000_000 * NS
-TELL_S = 30.0
+REPORT_S = 30.0
 
 
 def drive(fleet: SimulatedFleet, duration_s: float, truth: Path) -> Columns:
@@ -48,7 +48,7 @@ def drive(fleet: SimulatedFleet, duration_s: float, truth: Path) -> Columns:
         position = fleet.scenario.origin.to_latlon(true.x, true.y)
         recorder.add(samples.time, position, true.yaw, true.mu_wheel, true.utilisation)
         parts.append(pipeline.step(samples)[1])
-        if not block % int(TELL_S * RATE_HZ / BLOCK):
+        if not block % int(REPORT_S * RATE_HZ / BLOCK):
             print(f"  {block * BLOCK / RATE_HZ:.0f} s driven", flush=True)
     last = pipeline.finish()
     parts += [last] if last is not None else []

@@ -1,1 +1,1 @@
-"""The contract of GripMap: what is said on the wire, kept on disk and asked in a query, for people and for programs."""
+"""The contract of GripMap: messages, tables on disk, keys and queries, for people and for programs."""

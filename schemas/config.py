@@ -60,7 +60,7 @@ class AgentConfig(MonitoringSettings):
     )
     resend_s: Positive = Field(default=2.0, description="first wait before a batch is sent again; doubles up to 6 s")
     trip_end_m: float = Field(
-        default=0.0, ge=0.0, allow_inf_nan=False, description="[m] at both ends of a trip of which nothing is told"
+        default=0.0, ge=0.0, allow_inf_nan=False, description="[m] at both ends of a trip; nothing is published of them"
     )
     trip_end_s: float = Field(
         default=0.0, ge=0.0, allow_inf_nan=False, description="[s] likewise; both must have passed"

@@ -1,6 +1,6 @@
 """Road weather: its rules, and its bytes on the wire. A temperature or precipitation that is not known is NaN.
 
-One report tells of a z10 region from a time on. Everything in it is optional, but something must be said.
+One report is of a z10 region from a time on. Everything in it is optional, but not all of it may be missing.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def decode(payload: bytes, encoding: str = wire.WEATHER_ENCODING) -> Report:
     """Read a report, protobuf or JSON, and ask the rules.
 
     Raises:
-        WireError: no Weather, a value out of range, a prior that is none, or nothing said.
+        WireError: no Weather, a value out of range, a prior that is none, or nothing given.
     """
     message: Any = wire.parse(payload, encoding, pb.Weather, wire.WEATHER_ENCODING)
     values = {name: getattr(message, name) if message.HasField(name) else np.nan for name in RANGES}

@@ -25,7 +25,7 @@ from schemas.runtime.zenoh_session import open_session
 from schemas.thresholds import NS
 
 FOLDER = Path(".demo")
-TELL_S = 5.0
+REPORT_S = 5.0
 
 
 def drive(folder: Path, endpoint: str, args: argparse.Namespace) -> tuple[Listener, dict[str, float]]:
@@ -37,10 +37,10 @@ def drive(folder: Path, endpoint: str, args: argparse.Namespace) -> tuple[Listen
     fleet = processes.fleet(folder, args.vehicles, args.duration, args.seed)
     began = time.monotonic()
 
-    def tell() -> None:
+    def tick() -> None:
         print(f"  {time.monotonic() - began:4.0f} s  {listener.progress()}", flush=True)
 
-    if fleet.wait(TELL_S, tell) != 0:
+    if fleet.wait(REPORT_S, tick) != 0:
         raise processes.DemoError(f"the fleet ended with an error; see {fleet.log}")
     return listener, fleet.report()
 

@@ -48,13 +48,13 @@ class ManagedProcess:
             time.sleep(0.05)
         raise DemoError(f"{self.name} did not say {start!r}; see {self.log}")
 
-    def wait(self, every_s: float, tell: Callable[[], None]) -> int:
-        """Wait for the end, calling `tell` now and then; returns the exit code."""
+    def wait(self, every_s: float, tick: Callable[[], None]) -> int:
+        """Wait for the end, calling `tick` now and then; returns the exit code."""
         while True:
             try:
                 return self.process.wait(every_s)
             except subprocess.TimeoutExpired:
-                tell()
+                tick()
 
     def stop(self) -> None:
         """Ask it to end, and make it end."""

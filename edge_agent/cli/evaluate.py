@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     began, seeds = time.monotonic(), range(FIGURES, FIGURES + count)
     results = campaign(
         seeds, quick=args.quick,
-        tell=lambda line: print(f"{time.monotonic() - began:6.1f} s  {line}", file=sys.stderr, flush=True),
+        log_line=lambda line: print(f"{time.monotonic() - began:6.1f} s  {line}", file=sys.stderr, flush=True),
     )  # fmt: skip
     figures = figures_of(results, quick=args.quick)
     name = "edge-agent evaluate" + (" --quick" if args.quick else "")

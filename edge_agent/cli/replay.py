@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
                 "publish", f"{len(args.log)} logs into a folder", "publish one log, to one file, at a time"
             )
         tasks = tasks_of(args.log, args.vehicle, args.out)
-        return _told(backfill(tasks, estimator, args.jobs), len(tasks))
+        return _print_outcomes(backfill(tasks, estimator, args.jobs), len(tasks))
     path = args.log[0]
     vehicle = load_vehicle(args.vehicle or beside(path))
     bank = bank_of(estimator, [vehicle])
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _told(outcomes: Iterator[Outcome], count: int) -> int:
+def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:
     """Say how it goes on stderr; 2 where a log could not be read, else 0."""
     bad, samples, began, last = 0, 0, time.monotonic(), 0.0
     for done, outcome in enumerate(outcomes, 1):

@@ -148,7 +148,7 @@ def reporter(way: str, iterations: int, clock: Callable[[], float], write: Calla
     """Progress as one line per iteration: best, mean, elapsed and expected remaining time by `clock` [s]."""
     began = clock()
 
-    def tell(line: Iteration) -> None:
+    def log_line(line: Iteration) -> None:
         elapsed = clock() - began
         left = elapsed / line.iteration * (iterations - line.iteration)
         write(
@@ -156,7 +156,7 @@ def reporter(way: str, iterations: int, clock: Callable[[], float], write: Calla
             f"evaluations {line.evaluations:>4}   elapsed {elapsed:4.0f} s   left {left:4.0f} s"
         )
 
-    return tell
+    return log_line
 
 
 def _score(memberships: Memberships, drives: TuningSet) -> Score:

@@ -43,7 +43,7 @@ class Pipeline:
     def finish(self) -> RecordBlock | None:
         """Close the open visits and return their observations; None when there was no sample.
 
-        A visit's evidence is told at the sample that follows it, so one sample without readings is added, with the
+        A visit's evidence is reported at the sample that follows it, so one sample without readings is added, with the
         position given up.
         """
         if self._last is None:

@@ -1,8 +1,8 @@
-"""Trip ends stay at home: what a vehicle learns near the beginning and the end of a trip is not told.
+"""Trip ends stay at home: what a vehicle learns near the beginning and the end of a trip is not published.
 
 Where somebody parks says who they are. A record passes when the trip's beginning lies `metres` and `seconds` behind it,
 and its end at least as far ahead; so it waits until the vehicle has driven on. A trip is the life of a pipeline: what
-waits when it ends is never told. Pure; with both at zero every record passes at once.
+waits when it ends is never published. Pure; with both at zero every record passes at once.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class TripEnds:
         self._forget()
 
     def cut(self, records: RecordBlock) -> RecordBlock:
-        """Those of the records, and of the earlier ones that waited, that may be told now."""
+        """Those of the records, and of the earlier ones that waited, that may be published now."""
         if self._off or self._began is None:
             return records
         held = self._held.get(records.kind)

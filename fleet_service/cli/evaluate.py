@@ -29,11 +29,11 @@ def run(arguments: argparse.Namespace) -> int:
 
     drives = {} if arguments.skip_end_to_end else campaign.drives_end_to_end(arguments.quick)
 
-    def tell(line: str) -> None:
+    def log_line(line: str) -> None:
         print(line, flush=True)
 
     try:
-        found = campaign.run(arguments.out, arguments.quick, drives, tell, alone=arguments.end_to_end)
+        found = campaign.run(arguments.out, arguments.quick, drives, log_line, alone=arguments.end_to_end)
     except OSError as error:
         raise InputError("out", f"cannot write {error.filename} ({error.strerror})", "give another folder") from error
     print(f"\n{figures.markdown([figure for figure in found if figure.bar is not None])}\n")

@@ -37,11 +37,11 @@ class Acks:
 
     def messages(self) -> list[tuple[str, bytes]]:
         """Vehicle and `Ack` bytes of everything gathered; starts anew."""
-        told: dict[str, dict[AckedStream, list[int]]] = {vehicle: {} for vehicle in self._rejected}
+        settled: dict[str, dict[AckedStream, list[int]]] = {vehicle: {} for vehicle in self._rejected}
         for stream, seqs in self._durable.items():
-            told.setdefault(stream.vehicle, {}).setdefault(stream.key[1:], []).extend(seqs)
+            settled.setdefault(stream.vehicle, {}).setdefault(stream.key[1:], []).extend(seqs)
         out = []
-        for vehicle, durable in sorted(told.items()):
+        for vehicle, durable in sorted(settled.items()):
             rejected = self._rejected.get(vehicle, {})
             streams = [
                 part

@@ -250,11 +250,11 @@ def _chosen(found: Decoded, places: list[int]) -> tuple[Rows, Heads, IntArray]:
 def _named(kind: Kind, batches: list[BatchId], heads: Heads, rows: Rows, sizes: IntArray, clock: Clock) -> Rows:
     """Rows with what their batches say of themselves, as the archive wants them."""
     numbers = np.array([stream.key[0] for stream, _ in batches], np.int64)
-    told = {
+    identity = {
         "vehicle": texts(numbers), "vehicle_number": numbers, "estimator": np.array(heads.estimator, np.bytes_),
         "boot": heads.boot, "seq": heads.seq, "first_held": heads.first_held,
     }  # fmt: skip
-    rows |= {name: np.repeat(values, sizes) for name, values in told.items()}
+    rows |= {name: np.repeat(values, sizes) for name, values in identity.items()}
     rows["received_at"] = np.full(len(rows["row"]), clock.now, np.int64)
     if kind is Kind.STATE:
         rows["cell"] = cell_of(rows["latitude"], rows["longitude"])

@@ -76,11 +76,11 @@ class WeatherInbox:
         Raises:
             InputError: the file cannot be read, or a row breaks a rule.
         """
-        told = set(zip(known.region.tolist(), known.time.tolist(), strict=True))
+        seen = set(zip(known.region.tolist(), known.time.tolist(), strict=True))
         found = []
         for region, report in read_file(path):
             acts = max(report.time, self._fusion.next_epoch)
-            if report.time > acts - VALID_NS and not {(region, report.time), (region, acts)} & told:
+            if report.time > acts - VALID_NS and not {(region, report.time), (region, acts)} & seen:
                 found.append((region, report))
         return self._archived(found, now) if found else None
 
@@ -178,6 +178,6 @@ def _row(number: int, row: dict[str, Any]) -> tuple[int, Report]:
         raise InputError("weather", f"row {number}: no region, time and numbers", fix) from error
     problem = weather.broken(values, prior)
     if problem is not None or not 0 <= region < 1 << (2 * grid.REGION_ZOOM):
-        said = problem or InputError("region", "is no z10 region", "use its quadint or quadkey")
-        raise InputError(f"weather row {number}, {said.field}", said.problem, said.fix)
+        refusal = problem or InputError("region", "is no z10 region", "use its quadint or quadkey")
+        raise InputError(f"weather row {number}, {refusal.field}", refusal.problem, refusal.fix)
     return region, Report(when, prior=prior, **values)

@@ -41,7 +41,7 @@ NOISE_PER_SHARE: Final = 0.10  # ... more for each share that was left: .09 at E
 CORRELATION: Final = 0.5  # of e between a vehicle's visits to neighbouring cells
 SLOPE_NATS: Final = 0.5
 USED_STD: Final = 0.02
-SURE_STD: Final = 0.02  # of a liar
+OVERCONFIDENT_STD: Final = 0.02  # of a liar
 BOUND_STD: Final = 0.05  # what the agent admits
 
 
@@ -64,8 +64,8 @@ class Errors:
 
 
 @dataclass(frozen=True)
-class Told:
-    """What visits told: readings z and σ (n,), NaN where unexcited; grip used (n,); log-likelihood (n, 32)."""
+class SimulatedReports:
+    """What visits report: readings z and σ (n,), NaN where unexcited; grip used (n,); log-likelihood (n, 32)."""
 
     reading: FloatArray
     std: FloatArray
@@ -87,11 +87,11 @@ def noise(rng: Generator, along: IntArray) -> FloatArray:
     return e
 
 
-def tell(
+def report(
     rng: Generator, errors: Errors, vehicle: IntArray, mu: FloatArray, common: FloatArray, share: FloatArray,
     e: FloatArray,
-) -> Told:  # fmt: skip
-    """What the vehicles (n,) say after using `share` of a grip `mu` with a `common` error and noise `e`; all (n,)."""
+) -> SimulatedReports:  # fmt: skip
+    """Reports of vehicles (n,) after using `share` of a grip `mu` with a `common` error and noise `e`; all (n,)."""
     excited = share >= EXCITED_SHARE
     relative = NOISE_AT_LIMIT + NOISE_PER_SHARE * (1.0 - share)
     seen = np.maximum(mu * (1.0 + errors.relative[vehicle] + common) + errors.additive[vehicle], mugrid.LOWER)
@@ -102,7 +102,7 @@ def tell(
     above = np.clip((mugrid.CENTRES - used[:, None]) / (mugrid.UPPER - mugrid.LOWER), 0.0, 1.0)
     sloping = bound + errors.slope[vehicle, None] * above
     log_likelihood = np.where(excited[:, None], likelihood(reading, relative), sloping)
-    return Told(np.where(excited, reading, np.nan), np.where(excited, std, np.nan), used, log_likelihood)
+    return SimulatedReports(np.where(excited, reading, np.nan), np.where(excited, std, np.nan), used, log_likelihood)
 
 
 def likelihood(reading: FloatArray, relative: FloatArray) -> FloatArray:
@@ -111,6 +111,6 @@ def likelihood(reading: FloatArray, relative: FloatArray) -> FloatArray:
     return -0.5 * np.square((reading[:, None] - mugrid.CENTRES) / std) - np.log(std)
 
 
-def sure(claim: FloatArray | float, std: float = SURE_STD) -> FloatArray:
+def overconfident(claim: FloatArray | float, std: float = OVERCONFIDENT_STD) -> FloatArray:
     """Normal log-likelihoods (n, 32) of one who claims μ (n,) and no doubt."""
     return np.asarray(-0.5 * np.square((mugrid.CENTRES - np.reshape(claim, (-1, 1))) / std))

@@ -22,7 +22,7 @@ from numpy.random import Generator
 from fleet_service.app.engine import Engine
 from fleet_service.ingest.inbox import Message
 from fleet_service.lab import agent, town
-from fleet_service.lab.agent import Errors, Told
+from fleet_service.lab.agent import Errors, SimulatedReports
 from fleet_service.lab.bars import ATTACKS
 from fleet_service.lab.drive import CELL, watch
 from fleet_service.lab.messages import SentMessage, clock_of, messages, rebadged
@@ -90,18 +90,18 @@ def random(rng: Generator, drive: AttackedDrive) -> Visits:
 
 
 def _claiming(v: Visits, lying: BoolArray, claim: FloatArray) -> Visits:
-    told = Told(
-        v.told.reading, v.told.std, np.where(lying, claim, v.told.used),
-        np.where(lying[:, None], agent.sure(claim), v.told.log_likelihood),
+    reports = SimulatedReports(
+        v.reports.reading, v.reports.std, np.where(lying, claim, v.reports.used),
+        np.where(lying[:, None], agent.overconfident(claim), v.reports.log_likelihood),
     )  # fmt: skip
-    return Visits(v.seconds, v.vehicle, v.place, v.mu, v.excited & ~lying, told)
+    return Visits(v.seconds, v.vehicle, v.place, v.mu, v.excited & ~lying, reports)
 
 
 def shifted_pose(rng: Generator, drive: AttackedDrive) -> Visits:
-    """What they truly learn, told of a place elsewhere in the town."""
+    """What they truly learn, reported of a place elsewhere in the town."""
     v = drive.visits
     moved = (v.place + int(rng.integers(CELLS // 4, 3 * CELLS // 4))) % CELLS
-    return Visits(v.seconds, v.vehicle, np.where(_attackers(v, ATTACKERS), moved, v.place), v.mu, v.excited, v.told)
+    return Visits(v.seconds, v.vehicle, np.where(_attackers(v, ATTACKERS), moved, v.place), v.mu, v.excited, v.reports)
 
 
 def victims(drive: AttackedDrive) -> IntArray:
@@ -129,12 +129,13 @@ def newcomers(rng: Generator, drive: AttackedDrive) -> Visits:
 
 
 def _added(v: Visits, seconds: FloatArray, vehicle: IntArray, place: IntArray, claim: FloatArray) -> Visits:
-    std = np.full(len(claim), agent.SURE_STD)
-    told = (claim, std, claim, agent.sure(claim))
-    joined = (np.concatenate([a, b]) for a, b in zip(vars(v.told).values(), told, strict=True))
+    std = np.full(len(claim), agent.OVERCONFIDENT_STD)
+    reports = (claim, std, claim, agent.overconfident(claim))
+    joined = (np.concatenate([a, b]) for a, b in zip(vars(v.reports).values(), reports, strict=True))
     both = Visits(
         np.append(v.seconds, seconds), np.append(v.vehicle, vehicle), np.append(v.place, place),
-        np.append(v.mu, np.full(len(claim), np.nan)), np.append(v.excited, np.zeros(len(claim), bool)), Told(*joined),
+        np.append(v.mu, np.full(len(claim), np.nan)), np.append(v.excited, np.zeros(len(claim), bool)),
+        SimulatedReports(*joined),
     )  # fmt: skip
     return town.take(both, np.argsort(both.seconds, kind="stable"))
 

@@ -18,12 +18,12 @@ SEEDS, QUICK_SEEDS = 40, 1
 LENGTHS: Final = {end_to_end.LEVEL: (200, 60.0), end_to_end.HILLS: (120, 180.0)}  # vehicles, seconds
 EXACT_SEEDS: Final = 8  # drives of 20 minutes; nothing random is averaged there, the largest difference counts
 
-Tell = Callable[[str], None]
+LogLine = Callable[[str], None]
 Part = Callable[[], dict[str, float]]
 Drives = Mapping[end_to_end.World, end_to_end.Drive]
 
 
-def run(folder: Path, quick: bool, drives: Drives, tell: Tell, *, alone: bool = False) -> list[Figure]:
+def run(folder: Path, quick: bool, drives: Drives, log_line: LogLine, *, alone: bool = False) -> list[Figure]:
     """Run all parts and write `figures.json` and `figures.md` into `folder`.
 
     Args:
@@ -36,17 +36,17 @@ def run(folder: Path, quick: bool, drives: Drives, tell: Tell, *, alone: bool = 
     folder.mkdir(parents=True, exist_ok=True)
     seeds = range(QUICK_SEEDS if quick else SEEDS)
     found: dict[str, float] = {}
-    for name, part in ([] if alone else _parts(seeds, tell)) + _ways(drives, folder):
+    for name, part in ([] if alone else _parts(seeds, log_line)) + _ways(drives, folder):
         began = time.perf_counter()
         found |= part()
-        tell(f"{name}: {time.perf_counter() - began:.0f} s")
+        log_line(f"{name}: {time.perf_counter() - began:.0f} s")
     judged = [figure for figure in bars.judged(found) if not alone or figure.name.startswith(end_to_end.LEVEL.prefix)]
     figures.write(folder / "figures.json", "fusion" + (" --quick" if quick else ""), list(seeds), judged)
     barred = [figure for figure in judged if figure.bar is not None]
     shown = [figure for figure in judged if figure.bar is None and not _curve(figure.name)]
     (folder / "figures.md").write_text(f"{figures.markdown(barred)}\n\n{figures.markdown(shown)}\n")
     for path in [] if alone else plots.draw(judged, folder):
-        tell(f"plot {path}")
+        log_line(f"plot {path}")
     return judged
 
 
@@ -73,12 +73,12 @@ def _ways(drives: Drives, folder: Path) -> list[tuple[str, Part]]:
     ]  # fmt: skip
 
 
-def _parts(seeds: range, tell: Tell) -> list[tuple[str, Part]]:
+def _parts(seeds: range, log_line: LogLine) -> list[tuple[str, Part]]:
     few = range(min(EXACT_SEEDS, len(seeds)))
     return [
         ("order, replay, unexcited", lambda: _exact(few)),
         ("ice comes and goes", lambda: changes.measure(seeds)),
-        ("fleets and rules", lambda: fleets.measure(seeds, tell)),
+        ("fleets and rules", lambda: fleets.measure(seeds, log_line)),
         ("attacks", lambda: attacks.measure(seeds)),
     ]
 

@@ -67,7 +67,7 @@ def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float
     columns = read(folder / OBSERVATIONS)
     visits = pq.read_table(folder / TRUTH)
     fusion = Fusion(LATENESS_S)
-    raised = told(fusion, observations_in(columns))
+    raised = raised_alerts(fusion, observations_in(columns))
     false, beside = false_ice(raised, visits)
     slots, truth = joined(fusion, visits)
     several = fusion.live.vehicles[slots] >= SEVERAL
@@ -85,7 +85,7 @@ def measure(drive: Drive, folder: Path, world: World = LEVEL) -> dict[str, float
     return {f"{world.prefix}.{name}": value for name, value in found.items()}
 
 
-def told(fusion: Fusion, o: Observations) -> list[Alert]:
+def raised_alerts(fusion: Fusion, o: Observations) -> list[Alert]:
     """Fuse the observations second by second, as a service would, and return the alerts that were raised."""
     alerts, raised = Alerts(fusion), []
     second = (o.time - o.time.min()) // NS
@@ -99,7 +99,7 @@ def false_ice(raised: Sequence[Alert], visits: pa.Table) -> tuple[int, int]:
     """Alerts on wet and dry road: those with no slippery road near, and those in a cell beside one.
 
     Slippery is what any vehicle truly found below SURE_GRIP there before the alert. A fix is metres off and a cell ten
-    metres wide: who is told of the cell beside the ice is warned rightly.
+    metres wide: who is warned of the cell beside the ice is warned rightly.
     """
     east, north = grid.deinterleave(visits["cell"].to_numpy())
     mu, enter = visits["mu"].to_numpy(), visits["enter_time"].cast(pa.int64()).to_numpy()
@@ -148,7 +148,7 @@ def read(path: Path) -> dict[str, Any]:
 def observations_in(columns: dict[str, Any]) -> Observations:
     """As the service would take them, each row a batch of its own."""
     n = len(columns["cell"])
-    told = np.full(n, columns["log_likelihood"].shape[1] > 0)
+    with_likelihood = np.full(n, columns["log_likelihood"].shape[1] > 0)
     identity = {
         "boot": columns["vehicle"] + 1, "region": grid.region_of(columns["cell"]), "seq": np.arange(1, n + 1),
         "row": np.zeros(n, np.int32), "with_likelihood": told,

@@ -37,7 +37,7 @@ def difference(a: Fusion, b: Fusion) -> float:
 def drive(rng: Generator) -> Visits:
     """Twenty minutes in a town where some vehicles lie, so that weights differ."""
     visits = town.drive(rng, town.build(rng, MINUTES, 0.3), Errors.draw(rng, VEHICLES), MINUTES)
-    return town.lied(visits, np.arange(VEHICLES) < VEHICLES // 8, 0.25)
+    return town.wrong(visits, np.arange(VEHICLES) < VEHICLES // 8, 0.25)
 
 
 def order(rng: Generator) -> float:
@@ -79,9 +79,11 @@ def upper_shift(rng: Generator) -> float:
             who, along = rng.integers(0, vehicles, n), np.zeros(n, np.int64)
             shares = agent.shares(rng, np.zeros(n, bool))
             road: FloatArray = np.full(n, mu)
-            told = agent.tell(rng, Errors.draw(rng, vehicles), who, road, 0.0 * road, shares, agent.noise(rng, along))
+            reports = agent.report(
+                rng, Errors.draw(rng, vehicles), who, road, 0.0 * road, shares, agent.noise(rng, along)
+            )
             fusion = Fusion(LATENESS_S)
-            fusion.update(observations_of(rows_of(Visits(seconds, who, along, road, along > 0, told)), who))
+            fusion.update(observations_of(rows_of(Visits(seconds, who, along, road, along > 0, reports)), who))
             slot = fusion.slots_of(CELL[:1], np.zeros(1, np.int64))
             belief = fusion.beliefs(slot, int(fusion.live.time[slot[0]]))
             worst = max(worst, prior - float(mugrid.quantiles(belief, 0.95)[0]))

@@ -71,12 +71,12 @@ class Found:
 
 
 def one(fleet: Fleet, seed: int, found: Found) -> None:
-    """Drive one seed and note what the map said."""
+    """Drive one seed and note what the map shows."""
     rng = np.random.default_rng([seed, 1])
     place, errors = town.build(rng, fleet.minutes, CHANGING), Errors.draw(rng, VEHICLES)
     visits = town.drive(rng, place, errors, fleet.minutes)
     if fleet.share:
-        visits = town.lied(visits, np.arange(VEHICLES) < round(fleet.share * VEHICLES), fleet.claim)
+        visits = town.wrong(visits, np.arange(VEHICLES) < round(fleet.share * VEHICLES), fleet.claim)
     watched = watch(rng, visits, fleet.minutes)
     at = tuple(minute for minute in AT if minute > fleet.begin)
     found.ours.append(snapshots(watched.beliefs, place, visits, at, VEHICLES))
@@ -95,14 +95,14 @@ def one(fleet: Fleet, seed: int, found: Found) -> None:
             found.missed_settled.append(icy)
 
 
-def measure(seeds: range, tell: Callable[[str], None]) -> dict[str, float]:
-    """All campaigns; `tell` hears the progress."""
+def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
+    """All campaigns; `log_line` hears the progress."""
     out: dict[str, float] = {}
     for fleet in FLEETS:
         found = Found()
         for seed in seeds:
             one(fleet, seed, found)
-        tell(f"{fleet.name}: {len(joined(found.ours).error)} answers")
+        log_line(f"{fleet.name}: {len(joined(found.ours).error)} answers")
         out |= _figures(fleet, found)
     return out
 

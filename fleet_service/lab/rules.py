@@ -77,8 +77,8 @@ def fuse(place: IntArray, seconds: FloatArray, sent: FloatArray, reading: FloatA
                     share = own / (own + added)
                     own, added = share * own, (1.0 - share) * added
                 elif rule == _FEDERATED:
-                    told = np.isfinite(reading[k])
-                    added, m1 = (1.0 / std[k] ** 2, reading[k]) if told else (0.0, m0)
+                    reports = np.isfinite(reading[k])
+                    added, m1 = (1.0 / std[k] ** 2, reading[k]) if reports else (0.0, m0)
                 mean[rule, cell] = (own * m0 + added * m1) / (own + added)
                 variance[rule, cell] = 1.0 / (own + added)
             k += 1
@@ -88,9 +88,9 @@ def fuse(place: IntArray, seconds: FloatArray, sent: FloatArray, reading: FloatA
 
 def scores(v: Visits, town: Town, at: tuple[int, ...], vehicles: int) -> list[Scores]:
     """Scores of each of RULES at some minutes, for the cells with an excited vehicle."""
-    sent = posteriors(v.vehicle, v.told.reading, v.told.std, vehicles)
+    sent = posteriors(v.vehicle, v.reports.reading, v.reports.std, vehicles)
     asked = 60.0 * np.array(at, float)
-    found = fuse(v.place, v.seconds, sent, v.told.reading, v.told.std, asked, CELLS)
+    found = fuse(v.place, v.seconds, sent, v.reports.reading, v.reports.std, asked, CELLS)
     out: list[list[Scores]] = [[] for _ in RULES]
     for k, minute in enumerate(at):
         n = excited_vehicles(v, town, minute, vehicles)

@@ -39,7 +39,7 @@ def joined(scores: list[Scores]) -> Scores:
 
 
 def excited_vehicles(v: Visits, town: Town, minute: int, vehicles: int) -> IntArray:
-    """Distinct excited vehicles that told of each cell until then, and since its surface changed, (CELLS,)."""
+    """Distinct excited vehicles that reported each cell until then, and since its surface changed, (CELLS,)."""
     since = np.where(town.changed <= minute, town.changed, 0.0) * 60.0
     rows = v.excited & (v.seconds < 60.0 * minute) & (v.seconds >= since[v.place])
     there = np.zeros((CELLS, vehicles), bool)

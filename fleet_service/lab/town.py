@@ -2,7 +2,7 @@
 
 Every road has stretches of one surface; most passes are unexcited, and where drivers brake or steer is a property of
 the place: a few cells hear many excited vehicles, most hear hardly any. Where all do the same they share an error.
-Fixes are noisy, so that a visit is sometimes told of the cell before or behind.
+Fixes are noisy, so that a visit is sometimes reported of the cell before or behind.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.random import Generator
 
 from fleet_service.lab import agent
-from fleet_service.lab.agent import Errors, Told
+from fleet_service.lab.agent import Errors, SimulatedReports
 from schemas import grid
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.thresholds import NS
@@ -78,14 +78,14 @@ def build(rng: Generator, minutes: int, changing: float) -> Town:
 
 @dataclass(frozen=True)
 class Visits:
-    """Visits in order of time, (n,): seconds since the start, vehicle, place told, true μ, whether excited, what."""
+    """Visits in order of time, (n,): seconds since the start, vehicle, place reported, true μ, excited, reports."""
 
     seconds: FloatArray
     vehicle: IntArray
     place: IntArray
     mu: FloatArray
     excited: BoolArray
-    told: Told
+    reports: SimulatedReports
 
     def __len__(self) -> int:
         return len(self.seconds)
@@ -102,27 +102,29 @@ def drive(rng: Generator, town: Town, errors: Errors, minutes: float, roads_per_
     excited = rng.random(len(place)) < town.excitement[place]
     mu = town.at(seconds, place)
     shares, noise = agent.shares(rng, excited), agent.noise(rng, along)
-    told = agent.tell(rng, errors, vehicle, mu, town.common[place], shares, noise)
+    reports = agent.report(rng, errors, vehicle, mu, town.common[place], shares, noise)
     offset = rng.uniform(0.0, CELL_M, len(place)) + FIX_STD_M * rng.normal(size=len(place))
-    told_at = place + np.clip(np.floor(offset / CELL_M).astype(np.int64), -1, 1)
-    told_place = np.where(told_at // LENGTH == place // LENGTH, told_at, place)
+    reported_at = place + np.clip(np.floor(offset / CELL_M).astype(np.int64), -1, 1)
+    reported_place = np.where(reported_at // LENGTH == place // LENGTH, reported_at, place)
     order = np.argsort(seconds, kind="stable")
-    visits = Visits(seconds, vehicle, told_place, mu, excited, told)
+    visits = Visits(seconds, vehicle, reported_place, mu, excited, reports)
     return take(visits, order)
 
 
 def take(v: Visits, rows: IntArray | BoolArray) -> Visits:
     """Some of the visits."""
-    told = Told(v.told.reading[rows], v.told.std[rows], v.told.used[rows], v.told.log_likelihood[rows])
-    return Visits(v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], told)
+    reports = SimulatedReports(
+        v.reports.reading[rows], v.reports.std[rows], v.reports.used[rows], v.reports.log_likelihood[rows]
+    )
+    return Visits(v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], reports)
 
 
-def lied(v: Visits, liars: BoolArray, claim: float) -> Visits:
+def wrong(v: Visits, liars: BoolArray, claim: float) -> Visits:
     """The visits with those of `liars` (V,) claiming `claim`, sure, at every visit."""
     lying = liars[v.vehicle]
-    readings = np.where(lying, claim, v.told.reading)
-    told = Told(
-        readings, np.where(lying, agent.SURE_STD, v.told.std), np.where(lying, claim, v.told.used),
-        np.where(lying[:, None], agent.sure(claim), v.told.log_likelihood),
+    readings = np.where(lying, claim, v.reports.reading)
+    reports = SimulatedReports(
+        readings, np.where(lying, agent.OVERCONFIDENT_STD, v.reports.std), np.where(lying, claim, v.reports.used),
+        np.where(lying[:, None], agent.overconfident(claim), v.reports.log_likelihood),
     )  # fmt: skip
-    return Visits(v.seconds, v.vehicle, v.place, v.mu, v.excited & ~lying, told)
+    return Visits(v.seconds, v.vehicle, v.place, v.mu, v.excited & ~lying, reports)

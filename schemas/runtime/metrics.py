@@ -1,4 +1,4 @@
-"""How a running part is seen: OpenMetrics at `/metrics`, its health at `/healthz`, on loopback unless told otherwise.
+"""How a running part is seen: OpenMetrics at `/metrics`, its health at `/healthz`, on loopback unless set otherwise.
 
 Values are read when they are asked for; nothing is counted twice for the sake of being shown.
 """

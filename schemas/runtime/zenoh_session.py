@@ -65,14 +65,14 @@ def open_session(settings: ZenohSettings, stop: threading.Event | None = None, n
 
     A session that lost its router reconnects by itself. Why it waits is logged, once for each reason.
     """
-    stop, told = stop or threading.Event(), set[str]()
+    stop, logged = stop or threading.Event(), set[str]()
     while not stop.is_set():
         try:
             return zenoh.open(configuration(settings, name))
         except zenoh.ZError as error:
             reason = str(error)
-            if reason not in told:
-                told.add(reason)
+            if reason not in logged:
+                logged.add(reason)
                 log.warning("no session at %s yet: %s", ", ".join(settings.connect), reason)
             stop.wait(RETRY_S)
     return None

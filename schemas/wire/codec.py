@@ -152,13 +152,13 @@ def encode_ack(vehicle: str, streams: list[StreamAck]) -> bytes:
     """Protobuf bytes of an acknowledgement."""
     message = pb.Ack(vehicle=vehicle)
     for stream in streams:
-        told = message.streams.add()  # field by field: half of what keyword arguments take
-        told.boot, told.kind, told.region = stream.boot, _PB_KIND[stream.kind], stream.region
+        part = message.streams.add()  # field by field: half of what keyword arguments take
+        part.boot, part.kind, part.region = stream.boot, _PB_KIND[stream.kind], stream.region
         for first, last in stream.durable:
-            run = told.durable.add()
+            run = part.durable.add()
             run.first, run.last = first, last
         for seq, row, reason in stream.rejected:
-            told.rejected.add(seq=seq, row=row, reason=reason)
+            part.rejected.add(seq=seq, row=row, reason=reason)
     return message.SerializeToString()
 
 

@@ -101,11 +101,11 @@ class Watch:
         """Nothing seen yet."""
         return Watch(new_tracks(vehicles), OpenVisits.start(vehicles), config or AgentConfig())
 
-    def step(self, block: Block, told: MadeUp) -> tuple[Located, RecordBlock, RecordBlock]:
+    def step(self, block: Block, output: MadeUp) -> tuple[Located, RecordBlock, RecordBlock]:
         """One block."""
         self.tracks, located = locate(self.tracks, block.t, block.signals)
-        said = cast("Estimates", told)  # which has more, of what nobody reads here
-        self.open, observations, states = observe(self.open, block.time, located, said, self.config)
+        reported = cast("Estimates", output)  # which has more, of what nobody reads here
+        self.open, observations, states = observe(self.open, block.time, located, reported, self.config)
         return located, observations, states
 
 

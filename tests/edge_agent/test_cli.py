@@ -110,9 +110,9 @@ def test_replay_publishes_observations_and_states_at_the_time_of_the_drive_and_w
 ) -> None:
     more = ["--publish", *config(tmp_path, router), "--name", "car-one", "--start", "2026-01-31T07:00:00Z"]
     assert main(replay(drive, tmp_path / "out", *more)) == 0
-    told = counts(capsys)
-    assert told["unsettled"] == 0
-    assert told["published"] == told["acknowledged"] == sum(b.rows for b in service.batches) > 20
+    reported = counts(capsys)
+    assert reported["unsettled"] == 0
+    assert reported["published"] == reported["acknowledged"] == sum(b.rows for b in service.batches) > 20
     assert {b.vehicle for b in service.batches} == {"car-one"}
     assert {b.kind for b in service.batches} == set(Kind)
     enter = np.concatenate([b.columns["enter_time"] for b in service.batches if b.kind is Kind.OBSERVATION])
@@ -157,10 +157,10 @@ def test_run_drives_a_log_in_real_time_and_publishes_it(
 ) -> None:
     source = ["--source", str(drive / "log.parquet"), "--vehicle", str(drive / "vehicle.json"), "--name", "car-two"]
     assert main(["run", *source, "--estimator", "ckf", "--duration", "1", *config(tmp_path, router)]) == 0
-    told = counts(capsys)
-    assert told["acknowledged"] == told["published"] == sum(b.rows for b in service.batches) >= 3
+    reported = counts(capsys)
+    assert reported["acknowledged"] == reported["published"] == sum(b.rows for b in service.batches) >= 3
     assert {b.estimator for b in service.batches} == {"ckf"}
-    assert told["unsettled"] == 0
+    assert reported["unsettled"] == 0
 
 
 def test_fleet_gives_each_vehicle_its_name_and_writes_what_is_true(
@@ -172,9 +172,9 @@ def test_fleet_gives_each_vehicle_its_name_and_writes_what_is_true(
     names = {f"sim-{n:03}" for n in range(1, 5)}
     assert {b.vehicle for b in service.batches} == names == set(pq.read_table(truth)["vehicle"].to_pylist())
     assert {b.estimator for b in service.batches} == {"ckf"}
-    told = counts(capsys)
-    assert told["unsettled"] == told["observations_unsettled"] == 0
-    assert told["observations_published"] >= 4
+    reported = counts(capsys)
+    assert reported["unsettled"] == reported["observations_unsettled"] == 0
+    assert reported["observations_published"] >= 4
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=["SIGTERM", "Ctrl-C"])
@@ -187,10 +187,10 @@ def test_a_signalled_agent_flushes_hears_the_answer_and_leaves(
         agent.send_signal(number)
         out, _ = agent.communicate(timeout=60)
     assert agent.returncode == 0
-    told = json.loads(out.splitlines()[-1])
-    assert told["unsettled"] == 0
-    assert told["published"] == sum(b.rows for b in service.batches)
-    assert told["observations_published"] >= 1
+    reported = json.loads(out.splitlines()[-1])
+    assert reported["unsettled"] == 0
+    assert reported["published"] == sum(b.rows for b in service.batches)
+    assert reported["observations_published"] >= 1
 
 
 def test_what_a_killed_agent_had_stored_is_sent_by_the_next(

@@ -196,15 +196,15 @@ def test_log_vehicle_estimator_and_configuration_of_a_replay_change_what_it_says
         assert main(["simulate", "slalom", "--duration", "3", "--seed", seed, *files]) == 0
     (tmp_path / "agent.json").write_text(json.dumps({"estimator": "sr-ukf"}))
 
-    def said(log: str = "one", vehicle: str = "one", *more: str) -> FloatArray:
+    def reported(log: str = "one", vehicle: str = "one", *more: str) -> FloatArray:
         out = tmp_path / "out.parquet"
         files = [str(tmp_path / f"{log}.parquet"), "--vehicle", str(tmp_path / f"{vehicle}.json"), "--out", str(out)]
         assert main(["replay", *files, *more]) == 0
         return np.asarray(pq.read_table(out)["mu"].to_numpy())
 
-    usual, configured = said(), said("one", "one", "--config", str(tmp_path / "agent.json"))
-    named = said("one", "one", "--estimator", "sr-ukf")
-    for other in (said("other"), said("one", "other"), named):
+    usual, configured = reported(), reported("one", "one", "--config", str(tmp_path / "agent.json"))
+    named = reported("one", "one", "--estimator", "sr-ukf")
+    for other in (reported("other"), reported("one", "other"), named):
         assert not np.array_equal(usual, other)
     assert np.array_equal(named, configured)
 
@@ -224,10 +224,10 @@ def recorded(
 def records(config: AgentConfig) -> list[object]:
     block, fleet = recorded()
     pipeline = Pipeline(bank_of(config.estimator, fleet.vehicles), 2, config)
-    _, *told = pipeline.step(block)
+    _, *output = pipeline.step(block)
     return [
         [part.vehicle.tolist(), part.urgent.tolist(), *(np.nan_to_num(part.columns[n]).tolist() for n in part.columns)]
-        for part in told
+        for part in output
     ]
 
 

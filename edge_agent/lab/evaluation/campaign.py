@@ -27,10 +27,10 @@ FAULTY_SEEDS = 4  # drives per manoeuvre under each sensor fault: three manoeuvr
 
 @dataclass(frozen=True)
 class PlottedDrive:
-    """The first drive of a scenario and what was said of it, kept for plots."""
+    """The first drive of a scenario and what was estimated, kept for plots."""
 
     batch: DriveSet
-    said: Estimates
+    reported: Estimates
 
 
 @dataclass
@@ -50,37 +50,37 @@ class Results:
     drives: dict[tuple[str, str], PlottedDrive] = field(default_factory=dict)
 
 
-def run(seeds: Sequence[int], *, quick: bool, tell: Callable[[str], None]) -> Results:
-    """All measurements; `tell` is given one line of progress at a time."""
+def run(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str], None]) -> Results:
+    """All measurements; `log_line` is given one line of progress at a time."""
     results = Results(seeds=len(seeds))
     names = QUICK_ESTIMATORS if quick else tuple(ESTIMATORS)
     results.noise, plotted = experiments(seeds)
-    for key, (batch, said) in plotted.items():
-        results.drives[key, "paper-aco-fckf"] = PlottedDrive(batch, said)
-    tell("paper 004, its two noise experiments")
+    for key, (batch, reported) in plotted.items():
+        results.drives[key, "paper-aco-fckf"] = PlottedDrive(batch, reported)
+    log_line("paper 004, its two noise experiments")
     for name, scenario in (PAPERS | OTHERS | VEHICLES).items():
         if quick and name not in QUICK_SCENARIOS:
             continue
         batch = realistic(scenario, seeds)
         exact = repeated(ideal(scenario), 1) if name in PAPERS and not quick else None
         for estimator in names if name in PAPERS else (DEFAULT,):
-            said, ranks = watched(bank_of(estimator, batch.vehicles), batch)
-            results.real[name, estimator] = _all(name, batch, said) | consistency(batch, said)
+            reported, ranks = watched(bank_of(estimator, batch.vehicles), batch)
+            results.real[name, estimator] = _all(name, batch, reported) | consistency(batch, reported)
             results.ranks.setdefault(estimator, []).append(ranks.ravel())
-            results.drives[name, estimator] = PlottedDrive(batch, said)
+            results.drives[name, estimator] = PlottedDrive(batch, reported)
             if exact is not None:
                 results.ideal[name, estimator] = _all(name, exact, estimates(_as_in_paper(estimator, exact), exact))
-        tell(f"{name}: {scenario.about or scenario.manoeuvre}, {len(seeds)} drives")
+        log_line(f"{name}: {scenario.about or scenario.manoeuvre}, {len(seeds)} drives")
     manoeuvres = tuple(faults.DRIVES)[: 1 if quick else None]
     results.faults = faults.campaign(seeds[:FAULTY_SEEDS], names, manoeuvres)
-    tell(f"{len(faults.CASES) - 1} sensor faults")
+    log_line(f"{len(faults.CASES) - 1} sensor faults")
     results.rough = real_world.campaign(seeds, names, quick=quick)
     results.world = results.rough.found
-    tell(f"rough cars in {1 if quick else real_world.TOWNS} hilly towns, and standing on slopes")
+    log_line(f"rough cars in {1 if quick else real_world.TOWNS} hilly towns, and standing on slopes")
     if not quick:
         results.oracle = {"002.sine.rmse_vx": oracle.speed(seeds), "003.accel.mu_error": oracle.friction(seeds)[0]}
-        tell("what an oracle makes of two of the papers' manoeuvres")
-        results.foreign = _foreign_tyres(seeds, tell)
+        log_line("what an oracle makes of two of the papers' manoeuvres")
+        results.foreign = _foreign_tyres(seeds, log_line)
     return results
 
 
@@ -94,26 +94,26 @@ def _as_in_paper(estimator: str, batch: DriveSet) -> EstimatorBank:
     return bank_of(estimator, batch.vehicles)
 
 
-def _all(name: str, batch: DriveSet, said: Estimates) -> dict[str, FloatArray]:
-    found = measures(batch, said)
+def _all(name: str, batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
+    found = measures(batch, reported)
     if "split" in name:
-        found |= sides(batch, said)
+        found |= sides(batch, reported)
     if "jump" in name:
-        found["arrival_s"] = arrival(batch, said)
+        found["arrival_s"] = arrival(batch, reported)
     elif not any(word in name for word in HARD):
-        found["false_changes"] = false_changes(batch, said)
+        found["false_changes"] = false_changes(batch, reported)
         found["hours"] = (batch.t[-1] - batch.t[0]) / 3600.0
     return found
 
 
-def _foreign_tyres(seeds: Sequence[int], tell: Callable[[str], None]) -> dict[str, FloatArray]:
+def _foreign_tyres(seeds: Sequence[int], log_line: Callable[[str], None]) -> dict[str, FloatArray]:
     """Coverage of the default in all scenarios, each seed with the next kind of tyre."""
     found: dict[str, list[float]] = {kind: [] for kind in FOREIGN}
     kinds = list(FOREIGN)
     for scenario in (PAPERS | OTHERS).values():
         for place, kind in enumerate(kinds):
             batch = realistic(foreign(scenario, kind), seeds[place :: len(kinds)] or seeds[:1])
-            said = estimates(bank_of(DEFAULT, batch.vehicles), batch)
-            found[kind].extend(measures(batch, said)["coverage90"])
-    tell("all scenarios on foreign tyres")
+            reported = estimates(bank_of(DEFAULT, batch.vehicles), batch)
+            found[kind].extend(measures(batch, reported)["coverage90"])
+    log_line("all scenarios on foreign tyres")
     return {kind: np.array(values) for kind, values in found.items()}

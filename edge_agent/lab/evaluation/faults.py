@@ -1,6 +1,6 @@
 """Sensor faults: what goes wrong, what is expected then, and what every estimator makes of it.
 
-The drives are ordinary ones; a fault begins at BEGINS. `told` is whether the health of every drive carries the flag.
+The drives are ordinary ones; a fault begins at BEGINS. `told` is whether health reports the flag in every drive.
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ def late_samples(t: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Case:
-    """One row of the table of faults: `says` is the flag that health must carry, OK where no sensor can tell."""
+    """One row of the table of faults: `flag` is the flag that health must carry, OK where no sensor can tell."""
 
     faults: tuple[Fault, ...]
-    says: Health
+    flag: Health
     expected: str
     clock: Callable[[FloatArray], FloatArray] = in_order
 
@@ -109,19 +109,19 @@ def harmed(batch: DriveSet, case: Case) -> DriveSet:
     return replace(batch, t=case.clock(batch.t), signals=np.stack(each, axis=1))
 
 
-def outcome(batch: DriveSet, said: Estimates, case: Case) -> dict[str, FloatArray]:
+def outcome(batch: DriveSet, reported: Estimates, case: Case) -> dict[str, FloatArray]:
     """What is measured of a case, per drive: `finite`, `told` (1 or 0), coverage and width from BEGINS on, RMSE."""
     after = batch.t[:, 0] >= BEGINS
-    whole = np.isfinite(said.values).all(axis=-1)
-    ordered = (said.mu_lower <= said.mu) & (said.mu <= said.mu_upper)
+    whole = np.isfinite(reported.values).all(axis=-1)
+    ordered = (reported.mu_lower <= reported.mu) & (reported.mu <= reported.mu_upper)
     found = {
         "finite": (whole & ordered).all(axis=0).astype(float),
-        "told": ((said.health & int(case.says)) != 0).any(axis=0).astype(float),
-        "coverage90": covered(batch, said)[after].mean(axis=0),
-        "width": (said.mu_upper - said.mu_lower)[after].mean(axis=0),
+        "told": ((reported.health & int(case.flag)) != 0).any(axis=0).astype(float),
+        "coverage90": covered(batch, reported)[after].mean(axis=0),
+        "width": (reported.mu_upper - reported.mu_lower)[after].mean(axis=0),
     }
     for name in ("vx", "vy"):
-        found[f"rmse_{name}"] = np.sqrt((errors(batch, said)[name][after] ** 2).mean(axis=0))
+        found[f"rmse_{name}"] = np.sqrt((errors(batch, reported)[name][after] ** 2).mean(axis=0))
     return found
 
 

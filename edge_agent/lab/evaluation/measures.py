@@ -20,45 +20,45 @@ SLOWEST_M_S = 1.0
 COMPONENTS = {"nees": 2, "nis": 3}  # independent squares in each; no estimator measures fewer than three rows
 
 
-def errors(batch: DriveSet, said: Estimates) -> dict[str, FloatArray]:
+def errors(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
     """Errors (T, N) of the motion: vx, vy [m/s], yaw_rate [rad/s], beta [rad]."""
     truth = batch.truth
     beta = np.arctan2(truth["true_vy"], np.maximum(truth["true_vx"], SLOWEST_M_S))
     return {
-        "vx": said.vx - truth["true_vx"],
-        "vy": said.vy - truth["true_vy"],
-        "yaw_rate": said.yaw_rate - truth["true_yaw_rate"],
-        "beta": said.sideslip - beta,
+        "vx": reported.vx - truth["true_vx"],
+        "vy": reported.vy - truth["true_vy"],
+        "yaw_rate": reported.yaw_rate - truth["true_yaw_rate"],
+        "beta": reported.sideslip - beta,
     }
 
 
-def covered(batch: DriveSet, said: Estimates) -> BoolArray:
+def covered(batch: DriveSet, reported: Estimates) -> BoolArray:
     """Whether the 90 % interval holds the mean friction, (T, N)."""
-    return np.asarray((said.mu_lower <= batch.mu) & (batch.mu <= said.mu_upper))
+    return np.asarray((reported.mu_lower <= batch.mu) & (batch.mu <= reported.mu_upper))
 
 
-def measures(batch: DriveSet, said: Estimates) -> dict[str, FloatArray]:
+def measures(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
     """All measures that every drive has."""
     end = batch.last(LAST_S)
     found: dict[str, FloatArray] = {}
-    for name, error in errors(batch, said).items():
+    for name, error in errors(batch, reported).items():
         found[f"mae_{name}"] = np.abs(error).mean(axis=0)
         found[f"rmse_{name}"] = np.sqrt((error**2).mean(axis=0))
-    found["rmse_mu"] = np.sqrt(((said.mu - batch.mu) ** 2).mean(axis=0))
-    found["mae_mu"] = np.abs(said.mu - batch.mu).mean(axis=0)
-    found["mu_error"] = np.abs(said.mu - batch.mu)[end].mean(axis=0)
-    found["coverage90"] = covered(batch, said).mean(axis=0)
-    found["end_coverage90"] = covered(batch, said)[end].mean(axis=0)
-    found["width"] = (said.mu_upper - said.mu_lower).mean(axis=0)
-    found["nis"] = said.innovation_nis.mean(axis=0)
-    found["nees"] = nees(batch, said).mean(axis=0)
+    found["rmse_mu"] = np.sqrt(((reported.mu - batch.mu) ** 2).mean(axis=0))
+    found["mae_mu"] = np.abs(reported.mu - batch.mu).mean(axis=0)
+    found["mu_error"] = np.abs(reported.mu - batch.mu)[end].mean(axis=0)
+    found["coverage90"] = covered(batch, reported).mean(axis=0)
+    found["end_coverage90"] = covered(batch, reported)[end].mean(axis=0)
+    found["width"] = (reported.mu_upper - reported.mu_lower).mean(axis=0)
+    found["nis"] = reported.innovation_nis.mean(axis=0)
+    found["nees"] = nees(batch, reported).mean(axis=0)
     return found
 
 
-def nees(batch: DriveSet, said: Estimates) -> FloatArray:
+def nees(batch: DriveSet, reported: Estimates) -> FloatArray:
     """Squared error of (v_x, v_y) over its stated variance, per component, (T, N)."""
-    off = errors(batch, said)
-    return np.asarray(0.5 * ((off["vx"] / said.vx_std) ** 2 + (off["vy"] / said.vy_std) ** 2))
+    off = errors(batch, reported)
+    return np.asarray(0.5 * ((off["vx"] / reported.vx_std) ** 2 + (off["vy"] / reported.vy_std) ** 2))
 
 
 def bounds(measure: str, drives: int) -> tuple[float, float]:
@@ -69,47 +69,47 @@ def bounds(measure: str, drives: int) -> tuple[float, float]:
     return float(chi2.ppf(0.025, count)) / count, float(chi2.ppf(0.975, count)) / count
 
 
-def consistency(batch: DriveSet, said: Estimates) -> dict[str, FloatArray]:
+def consistency(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
     """Share of instants whose mean NEES, and NIS, over the drives lies within its bounds, (1,) each."""
     found = {}
-    for name, value in (("nees", nees(batch, said)), ("nis", said.innovation_nis)):
+    for name, value in (("nees", nees(batch, reported)), ("nis", reported.innovation_nis)):
         low, high = bounds(name, value.shape[1])
         mean = value.mean(axis=1)
         found[f"{name}_within"] = np.array([((low <= mean) & (mean <= high)).mean()])
     return found
 
 
-def sides(batch: DriveSet, said: Estimates) -> dict[str, FloatArray]:
+def sides(batch: DriveSet, reported: Estimates) -> dict[str, FloatArray]:
     """Of split friction, in the last second: error of the lower side, coverage of the higher."""
     end, truth = batch.last(LAST_S), batch.mu_wheel
-    told = said.mu_wheel
-    if told is None:
-        whole = np.stack([said.mu, said.mu_lower, said.mu_upper], axis=-1)
-        told = np.repeat(whole[:, :, None, :], 4, axis=2)
+    wheels = reported.mu_wheel
+    if wheels is None:
+        whole = np.stack([reported.mu, reported.mu_lower, reported.mu_upper], axis=-1)
+        wheels = np.repeat(whole[:, :, None, :], 4, axis=2)
     low = truth <= truth.min(axis=-1, keepdims=True)
-    middle = np.abs(told[..., 0] - truth)
-    inside = (told[..., 1] <= truth) & (truth <= told[..., 2])
+    middle = np.abs(wheels[..., 0] - truth)
+    inside = (wheels[..., 1] <= truth) & (truth <= wheels[..., 2])
     return {
         "low_error": np.asarray(np.nanmean(np.where(low, middle, np.nan)[end], axis=(0, 2))),
         "high_coverage90": np.asarray(np.nanmean(np.where(low, np.nan, inside)[end], axis=(0, 2))),
     }
 
 
-def arrival(batch: DriveSet, said: Estimates) -> FloatArray:
+def arrival(batch: DriveSet, reported: Estimates) -> FloatArray:
     """Seconds from the change of friction until mu is within NEAR of it; what never arrives counts to the end."""
     changed = batch.mu == batch.mu[-1]
     seconds = np.empty(batch.t.shape[1])
     for n in range(len(seconds)):
         first = int(np.argmax(changed[:, n]))
-        near = np.abs(said.mu[first:, n] - batch.mu[first:, n]) <= NEAR
+        near = np.abs(reported.mu[first:, n] - batch.mu[first:, n]) <= NEAR
         last = int(np.argmax(near)) if near.any() else len(near) - 1
         seconds[n] = batch.t[first + last, n] - batch.t[first, n]
     return seconds
 
 
-def false_changes(batch: DriveSet, said: Estimates) -> FloatArray:
+def false_changes(batch: DriveSet, reported: Estimates) -> FloatArray:
     """How often the interval lies more than NEAR beside an unchanged friction for HOLD_S or longer, per drive."""
-    wrong = (said.mu_upper < batch.mu - NEAR) | (said.mu_lower > batch.mu + NEAR)
+    wrong = (reported.mu_upper < batch.mu - NEAR) | (reported.mu_lower > batch.mu + NEAR)
     hold = max(1, round(HOLD_S / float(batch.t[1, 0] - batch.t[0, 0])))
     count = np.zeros(wrong.shape[1])
     run = np.zeros(wrong.shape[1], dtype=np.int64)

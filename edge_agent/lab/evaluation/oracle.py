@@ -1,6 +1,6 @@
-"""How well anybody could do with these sensors: two bars of the papers, and an oracle that is told nearly everything.
+"""How well anybody could do with these sensors: two bars of the papers, and an oracle that knows nearly everything.
 
-An oracle is a Bayesian who hears the same noisy readings, knows the friction and the motion, and is told the truth of
+An oracle is a Bayesian who hears the same noisy readings, knows the friction and the motion, and is given the truth of
 all that is not listed as unknown. What is unknown to him is what vehicle file and data sheet leave open to anybody.
 Everything is linear about the truth, so that his estimate is that of least squares with a Gaussian prior.
 
@@ -90,9 +90,9 @@ def _speed(heard: OracleSignals, n: int, rho: float) -> float:
         off[now] = wheels[now] / (1.0 + estimate) - v[now]
         starts = range(now.start, min(now.stop, len(v)) - stretch + 1, stretch)
         long = np.stack([ahead[k : k + stretch].mean(axis=0) for k in starts])
-        told = np.array([along[k : k + stretch].mean() for k in starts])
+        measured = np.array([along[k : k + stretch].mean() for k in starts])
         rows = np.concatenate([sideways[now], np.sqrt(stretch) * long]) / white
-        readings = np.concatenate([across[now], np.sqrt(stretch) * told]) / white
+        readings = np.concatenate([across[now], np.sqrt(stretch) * measured]) / white
         information, vector = information + rows.T @ rows, vector + rows.T @ readings
         estimate = float(np.linalg.solve(information, vector)[0])
     return float(np.sqrt(np.mean(off**2)))
@@ -112,9 +112,9 @@ def friction(seeds: Sequence[int]) -> tuple[FloatArray, FloatArray]:
     }  # fmt: skip
     errors, expected = [], []
     for n, vehicle in enumerate(batch.vehicles):
-        told = vehicle.wheel_radius * batch.signals[:, n, S.OMEGA : S.OMEGA + 4].mean(axis=1)
+        measured = vehicle.wheel_radius * batch.signals[:, n, S.OMEGA : S.OMEGA + 4].mean(axis=1)
         stiff = float(np.log(vehicle.longitudinal_stiffness / car.vehicle.longitudinal_stiffness))
-        cost = np.array([_cost(told, v, slip, vehicle.wheel_radius, stiff) for slip in slips.values()])
+        cost = np.array([_cost(measured, v, slip, vehicle.wheel_radius, stiff) for slip in slips.values()])
         weight = np.exp(cost.min() - cost).reshape(len(LIKELY), -1).sum(axis=1)
         median = float(np.interp(0.5, np.cumsum(weight) / weight.sum(), LIKELY))
         errors.append(abs(median - truth))
@@ -135,7 +135,7 @@ def _curve(shape: float, curvature: float) -> FloatArray:
     return curve[: int(np.argmax(curve)) + 1]
 
 
-def _cost(told: FloatArray, v: FloatArray, slip: FloatArray, radius: float, stiff: float) -> float:
+def _cost(measured: FloatArray, v: FloatArray, slip: FloatArray, radius: float, stiff: float) -> float:
     """−ln of the likelihood of a friction and a shape, the other unknowns fitted and integrated out (Laplace)."""
     t = np.arange(len(v)) / 100.0
     std = np.array([
@@ -147,7 +147,7 @@ def _cost(told: FloatArray, v: FloatArray, slip: FloatArray, radius: float, stif
     for _ in range(3):
         k, rho, offset, leak, start = z
         ground, turned = v + offset * t + leak * (v - v[0]) + start, 1.0 + slip * np.exp(-k)
-        off = told - (1.0 + rho) * ground * turned
+        off = measured - (1.0 + rho) * ground * turned
         slopes = np.stack(
             [-ground * slip * np.exp(-k), ground * turned, t * turned, (v - v[0]) * turned, turned], axis=1
         )
@@ -155,6 +155,6 @@ def _cost(told: FloatArray, v: FloatArray, slip: FloatArray, radius: float, stif
         step = np.linalg.solve(information, slopes.T @ off / white**2 + (centre - z) / std**2)
         z = z + step
     k, rho, offset, leak, start = z
-    off = told - (1.0 + rho) * (v + offset * t + leak * (v - v[0]) + start) * (1.0 + slip * np.exp(-k))
+    off = measured - (1.0 + rho) * (v + offset * t + leak * (v - v[0]) + start) * (1.0 + slip * np.exp(-k))
     squares = float((off @ off) / white**2 + (((z - centre) / std) ** 2).sum())
     return 0.5 * (squares + float(np.linalg.slogdet(information)[1]))

@@ -59,7 +59,7 @@ def experiments(
         for estimator, sets in (
             ("paper-ckf", STILL), ("paper-fckf", Memberships()), ("paper-aco-fckf", shipped(TUNED["paper-aco-fckf"]))
         ):  # fmt: skip
-            said = estimates(bank(batch.vehicles, sets, AT_THE_TRUTH), batch)
-            found[name, estimator] = measures(batch, said)
-        drives[f"004.{name}"] = (batch, said)
+            reported = estimates(bank(batch.vehicles, sets, AT_THE_TRUTH), batch)
+            found[name, estimator] = measures(batch, reported)
+        drives[f"004.{name}"] = (batch, reported)
     return found, drives

@@ -52,17 +52,17 @@ def _scenario(scenario: str, drives: dict[str, PlottedDrive], path: Path) -> Pat
     ):
         axis.plot(t, first.batch.truth[f"true_{name}"][:, 0], "k", label="true")
         for estimator, drive in drives.items():
-            axis.plot(t, getattr(drive.said, name)[:, 0], lw=0.8, label=estimator)
+            axis.plot(t, getattr(drive.reported, name)[:, 0], lw=0.8, label=estimator)
         axis.set_ylabel(label)
     axes[3].plot(t, first.batch.mu[:, 0], "k")
     for estimator, drive in drives.items():
-        line = axes[3].plot(t, drive.said.mu[:, 0], lw=0.8)[0]
+        line = axes[3].plot(t, drive.reported.mu[:, 0], lw=0.8)[0]
         if estimator == DEFAULT or len(drives) == 1:
             axes[3].fill_between(
-                t, drive.said.mu_lower[:, 0], drive.said.mu_upper[:, 0], color=line.get_color(), alpha=0.2, lw=0
+                t, drive.reported.mu_lower[:, 0], drive.reported.mu_upper[:, 0], color=line.get_color(), alpha=0.2, lw=0
             )
-        axes[4].plot(t, drive.said.adaptation[:, 0], lw=0.8)
-        axes[5].semilogy(t, nees(drive.batch, drive.said).mean(axis=1), lw=0.8)
+        axes[4].plot(t, drive.reported.adaptation[:, 0], lw=0.8)
+        axes[5].semilogy(t, nees(drive.batch, drive.reported).mean(axis=1), lw=0.8)
     axes[3].set(ylabel="μ and its 90 % band", ylim=(0.0, 1.25))
     axes[4].set(ylabel="factor on R")
     axes[5].axhspan(*bounds("nees", first.batch.t.shape[1]), color="k", alpha=0.15, lw=0)
@@ -79,14 +79,14 @@ def _rough(world: RealWorldResults, path: Path) -> Path:
     from matplotlib import pyplot as plt
 
     batch, car = world.batch, int(np.argmax(np.ptp(world.batch.truth["true_slope"], axis=0)))
-    t, first = batch.t[:, car], next(iter(world.said.values()))
+    t, first = batch.t[:, car], next(iter(world.reported.values()))
     figure, axes = plt.subplots(5, 1, figsize=(9, 12), sharex=True, layout="constrained")
     wheels = batch.vehicles[car].wheel_radius * np.nanmean(batch.signals[:, car, S.OMEGA : S.OMEGA + 4], axis=-1)
     axes[0].plot(t, batch.truth["true_vx"][:, car], "k", label="true")
     axes[1].plot(t, wheels - batch.truth["true_vx"][:, car], color="0.7", lw=0.8, label="mean of the wheels")
-    for name, said in world.said.items():
-        line = axes[0].plot(t, said.vx[:, car], lw=0.8, label=name)[0]
-        axes[1].plot(t, said.vx[:, car] - batch.truth["true_vx"][:, car], lw=0.8, color=line.get_color())
+    for name, reported in world.reported.items():
+        line = axes[0].plot(t, reported.vx[:, car], lw=0.8, label=name)[0]
+        axes[1].plot(t, reported.vx[:, car] - batch.truth["true_vx"][:, car], lw=0.8, color=line.get_color())
     axes[2].plot(t, 100.0 * batch.truth["true_slope"][:, car], "k")
     axes[3].plot(t, batch.mu[:, car], "k")
     axes[3].plot(t, first.mu[:, car], lw=0.8)
@@ -95,7 +95,7 @@ def _rough(world: RealWorldResults, path: Path) -> Path:
         if flag and (when := (first.health[:, car].astype(np.int64) & int(flag)) != 0).any():
             axes[4].plot(t[when], [flag.name] * int(when.sum()), "|")
     axes[0].set(
-        ylabel="v_x [m/s]", title=f"car {car + 1} of a hilly town; interval and health: {next(iter(world.said))}"
+        ylabel="v_x [m/s]", title=f"car {car + 1} of a hilly town; interval and health: {next(iter(world.reported))}"
     )
     axes[1].set(ylabel="error of v_x [m/s]", ylim=(-2.0, 2.0))
     axes[2].set(ylabel="slope [%]")

@@ -58,7 +58,7 @@ class Tally:
         self.count[name] = self.count.get(name, 0) + taken.size
 
     def means(self) -> dict[str, float]:
-        """Mean by name; NaN of nothing. What ends in "_squared" is told as its root, without that end."""
+        """Mean by name; NaN of nothing. What ends in "_squared" is reported as its root, without that end."""
         found = {name: total / self.count[name] if self.count[name] else np.nan for name, total in self.total.items()}
         return {
             name.removesuffix("_squared"): float(np.sqrt(mean)) if name.endswith("_squared") else mean
@@ -96,22 +96,22 @@ def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> F
     return np.asarray(upper - lower + MISS * (np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0)))
 
 
-def count(tally: Tally, batch: DriveSet, said: Estimates, used: FloatArray) -> None:
+def count(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatArray) -> None:
     """Add one town to the tally of an estimator."""
-    mu, inside, width = batch.mu, covered(batch, said), said.mu_upper - said.mu_lower
+    mu, inside, width = batch.mu, covered(batch, reported), reported.mu_upper - reported.mu_lower
     excited = lately(used) >= EXCITED_SHARE
     tally.add("coverage90", inside)
     for name, (above, most) in SURFACES.items():
         tally.add(f"coverage90.{name}", inside, (mu > above) & (mu <= most))
     tally.add("coverage90.excited", inside, excited)
     tally.add("coverage90.no_torque", inside[:, np.isnan(batch.signals[:, :, S.TORQUE]).all(axis=0)])
-    tally.add("false_ice", said.mu_upper < SLIPPERY_MU, mu > SURFACES["wet"][0])
-    tally.add("below", said.mu_upper < in_use(batch))
+    tally.add("false_ice", reported.mu_upper < SLIPPERY_MU, mu > SURFACES["wet"][0])
+    tally.add("below", reported.mu_upper < in_use(batch))
     tally.add("width", width / (PRIOR[1] - PRIOR[0]), excited)
     tally.add("width.all", width / (PRIOR[1] - PRIOR[0]))
-    tally.add("score", interval_score(said.mu_lower, said.mu_upper, mu))
-    off = errors(batch, said)
-    for name, std in (("vx", said.vx_std), ("vy", said.vy_std)):
+    tally.add("score", interval_score(reported.mu_lower, reported.mu_upper, mu))
+    off = errors(batch, reported)
+    for name, std in (("vx", reported.vx_std), ("vy", reported.vy_std)):
         tally.add(f"rmse_{name}_squared", off[name] ** 2)
         tally.add(f"coverage90.{name}", np.abs(off[name]) <= Z_95 * std)
     tally.add("lost", np.abs(off["vx"]) > LOST_M_S)
@@ -139,8 +139,8 @@ def standing(slope: float, seeds: Sequence[int], seconds: float) -> list[DriveSe
 
 def fastest(estimator: str, batches: Sequence[DriveSet]) -> float:
     """Largest speed [m/s], in any direction, that the estimator gives to any of the cars."""
-    said = [estimates(bank_of(estimator, batch.vehicles), batch) for batch in batches]
-    return max(float(np.hypot(each.vx, each.vy).max()) for each in said)
+    reported = [estimates(bank_of(estimator, batch.vehicles), batch) for batch in batches]
+    return max(float(np.hypot(each.vx, each.vy).max()) for each in reported)
 
 
 @dataclass
@@ -149,7 +149,7 @@ class RealWorldResults:
 
     found: dict[str, dict[str, float]]
     batch: DriveSet
-    said: dict[str, Estimates]
+    reported: dict[str, Estimates]
 
 
 def campaign(seeds: Sequence[int], estimators: Sequence[str], *, quick: bool) -> RealWorldResults:
@@ -161,9 +161,9 @@ def campaign(seeds: Sequence[int], estimators: Sequence[str], *, quick: bool) ->
         baseline(tallies["baseline"], batch)
         world = world or RealWorldResults({}, batch, {})
         for name in estimators:
-            said = estimates(bank_of(name, batch.vehicles), batch)
-            count(tallies[name], batch, said, used)
-            world.said.setdefault(name, said)
+            reported = estimates(bank_of(name, batch.vehicles), batch)
+            count(tallies[name], batch, reported, used)
+            world.reported.setdefault(name, reported)
     if world is None:
         raise InputError("seeds", "are none", "give at least one")
     world.found = {name: tally.means() for name, tally in tallies.items()}

@@ -42,14 +42,14 @@ def joined(parts: list[Estimates]) -> Estimates:
     return Estimates(np.concatenate([part.values for part in parts]))
 
 
-def _rank(bank: EstimatorBank, batch: DriveSet, now: int, said: Estimates) -> FloatArray:
+def _rank(bank: EstimatorBank, batch: DriveSet, now: int, reported: Estimates) -> FloatArray:
     """Share of the posterior below the true friction of the sample before `now`, (N,)."""
     truth = batch.mu[now - 1]
     closes = np.ones((1, len(truth)), np.bool_)
-    told = copy.deepcopy(bank).advance(batch.t[now : now + 1], batch.signals[now : now + 1], closes).evidence
-    if told is None:
-        return between_quantiles(truth, said.mu_lower[-1], said.mu[-1], said.mu_upper[-1])
-    return on_the_grid(truth, told[0])
+    likelihood = copy.deepcopy(bank).advance(batch.t[now : now + 1], batch.signals[now : now + 1], closes).evidence
+    if likelihood is None:
+        return between_quantiles(truth, reported.mu_lower[-1], reported.mu[-1], reported.mu_upper[-1])
+    return on_the_grid(truth, likelihood[0])
 
 
 def on_the_grid(truth: FloatArray, log_likelihood: FloatArray) -> FloatArray:

@@ -56,7 +56,7 @@ ORACLE_HEAD: Final = """\
 ## What anybody could do
 
 Two bars of the papers that are hard, and an oracle on the same sensors (`oracle.py`): a Bayesian who knows the friction
-and the motion, and is told everything but what vehicle file and data sheet leave open."""
+and the motion, and knows everything but what vehicle file and data sheet leave open."""
 FRICTION: Final = ("paper-aco-fckf", "federated-ckf", "sr-ukf")  # papers' estimators that estimate friction
 SHOWN_LEVELS: Final = LEVELS[::2]
 
@@ -170,13 +170,15 @@ def faults(values: dict[str, float]) -> str:
     shown = ("coverage90", "width", "rmse_vx", "rmse_vy")
     rows = []
     for name, case in CASES.items():
-        told = [value for key, value in values.items() if key.startswith(f"faults.{name}.") and key.endswith(".told")]
+        recognised = [
+            value for key, value in values.items() if key.startswith(f"faults.{name}.") and key.endswith(".told")
+        ]
         whole = [
             value for key, value in values.items() if key.startswith(f"faults.{name}.") and key.endswith(".finite")
         ]
         rows.append([
             name, case.expected,
-            "–" if not case.says else verdict(told), verdict(whole),
+            "–" if not case.flag else verdict(recognised), verdict(whole),
             *(number(values, f"faults.{name}.{DEFAULT}.{measure}", spread=False) for measure in shown),
             ", ".join(number(values, f"faults.{name}.{paper}.coverage90", spread=False) for paper in FRICTION),
         ])  # fmt: skip

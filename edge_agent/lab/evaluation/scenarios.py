@@ -36,9 +36,9 @@ def steered_behind(speed: float) -> TrueVehicle:
 
     Paper 001, equation 53: (K*m*a*v^2 - b) / (K*m*b*v^2 + a), K = 1/(axle stiffness*wheelbase), alike at both axles.
     """
-    told = LIGHT.vehicle
-    a, b = told.cg_to_front_axle, told.cg_to_rear_axle
-    pull = told.mass * speed * speed / (2.0 * told.cornering_stiffness * (a + b))
+    light = LIGHT.vehicle
+    a, b = light.cg_to_front_axle, light.cg_to_rear_axle
+    pull = light.mass * speed * speed / (2.0 * light.cornering_stiffness * (a + b))
     return replace(LIGHT, rear_steer=(pull * a - b) / (pull * b + a))
 
 

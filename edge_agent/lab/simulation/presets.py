@@ -116,8 +116,8 @@ def matched(vehicle: TrueVehicle) -> TrueVehicle:
 
 def nominal(truth: TrueVehicle, rng: np.random.Generator) -> Vehicle:
     """What the vehicle file says: the true parameters, each off by a normal error of the size in KNOWN."""
-    told = {name: getattr(truth.vehicle, name) * (1.0 + rng.normal(0.0, std)) for name, std in KNOWN.items()}
-    return truth.vehicle.model_copy(update=told)
+    file_values = {name: getattr(truth.vehicle, name) * (1.0 + rng.normal(0.0, std)) for name, std in KNOWN.items()}
+    return truth.vehicle.model_copy(update=file_values)
 
 
 def one_of_a_fleet(index: int, name: str, rng: np.random.Generator) -> TrueVehicle:

@@ -170,13 +170,13 @@ def read_late(
     records: FloatArray, lead: int, error: FloatArray, place: FloatArray, rate_hz: float, signals: FloatArray
 ) -> None:
     """Fill `signals` (18,) with what each device says of its own past; records (T, 32), of which row `lead` is now."""
-    record, told = np.empty(records.shape[1]), np.empty(signals.size)
+    record, readings = np.empty(records.shape[1]), np.empty(signals.size)
     for device in range(DEVICES):
         late(records, lead, error[ErrorColumn.MOUNTED + Misaligned.LAG + device] * rate_hz, record)
-        read_out(record, error, place, told)
+        read_out(record, error, place, readings)
         for c in range(signals.size):
             if DEVICE_OF[c] == device:
-                signals[c] = told[c]
+                signals[c] = readings[c]
     misalign(error[ErrorColumn.MOUNTED :], signals)
 
 

@@ -74,7 +74,7 @@ def simulate_manoeuvre(
         InputError: an argument is out of range or unknown.
     """
     manoeuvre = _named(name)
-    told = sensors_named(sensors)
+    chosen = sensors_named(sensors)
     truth = true_vehicle(vehicle)
     seed = checked_seed(seed)
     _check(speed=speed, rate_hz=rate_hz, duration_s=duration_s)
@@ -82,10 +82,10 @@ def simulate_manoeuvre(
     duration = manoeuvre.duration if duration_s is None else duration_s
     world = TestTrack(_friction(manoeuvre.friction if mu is None else mu), road_named(road, seed, slope).table)
     records = _drive(manoeuvre, truth, world, speed, rate_hz, max(1, round(duration * rate_hz)))
-    signals = _sensed(records, told, origin, seed, rate_hz)
+    signals = _sensed(records, chosen, origin, seed, rate_hz)
     t = np.arange(len(records)) / rate_hz
     signals = apply_faults(t, signals, faults)
-    file = truth.vehicle if told == SENSORS["ideal"] else nominal(truth, np.random.default_rng([seed, 0]))
+    file = truth.vehicle if chosen == SENSORS["ideal"] else nominal(truth, np.random.default_rng([seed, 0]))
     return _table(t, signals, records), file
 
 

@@ -37,7 +37,7 @@ SETTLED_S: Final = 1.0  # scored from here on; before, the score is that of the 
 WORST: Final = -1e3  # [nat] of an update whose log-likelihood is lower or no number: one broken one is not the score
 MISS: Final = 20.0  # 2/alpha of a 90 % interval
 
-# Sensor sets: as good as the estimator takes them to be, and with white noise it was not told of.
+# Sensor sets: as good as the estimator takes them to be, and with white noise that it does not know of.
 USUAL: Final = SENSORS["mems-leak"]
 NOISY: Final = replace(USUAL, acceleration=(0.25, 0.03), yaw_rate=(0.01, 0.001), wheel_speed=0.12)
 
@@ -148,11 +148,11 @@ def worth(memberships: Memberships, drives: TuningSet, estimator: str) -> Tuning
     estimates = create(estimator, drives.vehicles, memberships=memberships).advance(drives.t, drives.signals)
     settled = drives.t[:, 0] >= SETTLED_S
     lower, upper, truth = estimates.mu_lower[settled], estimates.mu_upper[settled], drives.mu[settled]
-    told = np.nan_to_num(estimates.innovation_log_likelihood[settled], nan=WORST, neginf=WORST, posinf=WORST)
+    log_likelihoods = np.nan_to_num(estimates.innovation_log_likelihood[settled], nan=WORST, neginf=WORST, posinf=WORST)
     return TuningScores(
         interval_score=float(interval_score(lower, upper, truth).mean()),
         coverage=float(((lower <= truth) & (truth <= upper)).mean()),
-        log_likelihood=float(np.maximum(told, WORST).mean()) * RATE_HZ,
+        log_likelihood=float(np.maximum(log_likelihoods, WORST).mean()) * RATE_HZ,
         nis_ratio=float(np.nanmean(estimates.innovation_nis[settled])),
     )
 

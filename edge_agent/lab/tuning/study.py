@@ -123,21 +123,23 @@ def setting(condition: Condition) -> Setting:
 def worth(memberships: Memberships, drives: StudySet, name: str) -> StudyScores:
     """Run the filter over the drives under the condition of that name."""
     filters = bank(drives.vehicles, memberships, setting(CONDITIONS[name]))
-    said = filters.advance(drives.t, drives.signals[name])
-    told = np.nan_to_num(said.innovation_log_likelihood[1:], nan=WORST, neginf=WORST, posinf=WORST)
-    motion = np.stack([said.vx, said.vy, said.yaw_rate], axis=-1)
+    reported = filters.advance(drives.t, drives.signals[name])
+    log_likelihoods = np.nan_to_num(reported.innovation_log_likelihood[1:], nan=WORST, neginf=WORST, posinf=WORST)
+    motion = np.stack([reported.vx, reported.vy, reported.yaw_rate], axis=-1)
     rmse = np.sqrt(((motion - drives.truth) ** 2).mean(axis=0)).mean(axis=0)
     return StudyScores(
-        float(np.maximum(told, WORST).mean()) * RATE_HZ, float(said.innovation_nis[1:].mean()), *map(float, rmse)
+        float(np.maximum(log_likelihoods, WORST).mean()) * RATE_HZ,
+        float(reported.innovation_nis[1:].mean()),
+        *map(float, rmse),
     )
 
 
 def interval(memberships: Memberships, drives: StudySet, name: str) -> tuple[float, float]:
     """(interval score, coverage) of the 90 % friction interval under a condition."""
-    said = bank(drives.vehicles, memberships, setting(CONDITIONS[name])).advance(drives.t, drives.signals[name])
-    truth = np.full(said.mu.shape, MU)
-    inside = (said.mu_lower <= truth) & (truth <= said.mu_upper)
-    return float(interval_score(said.mu_lower, said.mu_upper, truth).mean()), float(inside.mean())
+    reported = bank(drives.vehicles, memberships, setting(CONDITIONS[name])).advance(drives.t, drives.signals[name])
+    truth = np.full(reported.mu.shape, MU)
+    inside = (reported.mu_lower <= truth) & (truth <= reported.mu_upper)
+    return float(interval_score(reported.mu_lower, reported.mu_upper, truth).mean()), float(inside.mean())
 
 
 def overall(memberships: Memberships, drives: StudySet) -> float:

@@ -115,11 +115,11 @@ def markdown(listed: Sequence[Figure]) -> str:
         cells = " | ".join(cell(f"tuning.overall.{way}.{drives}") for way in SHOWN)
         rows.append(f"| {title} | log likelihood [nat/s] | {cells} |")
     gain = "tuning.colony_over_random.held_out"
-    told = (
+    summary = (
         f"Colony over random search of the same seed and budget, held out: {cell(gain)} nat/s,"
         f" better in {100 * values[f'{gain}.wins']:.0f} % of the searches."
     )
-    return "\n".join(rows) + f"\n\n{told}\n"
+    return "\n".join(rows) + f"\n\n{summary}\n"
 
 
 def scores(done: Study, way: str) -> dict[str, Score]:

@@ -22,8 +22,8 @@ def test_at_the_peak_of_a_set_its_output_alone_speaks() -> None:
 
 
 def test_inference_rises_with_the_mismatch_and_covers_its_whole_range() -> None:
-    said = [infer(float(x), INPUTS, OUTPUTS) for x in np.linspace(-1.0, 50.0, 2000)]
-    assert (np.diff(said) >= 0).all()
+    reported = [infer(float(x), INPUTS, OUTPUTS) for x in np.linspace(-1.0, 50.0, 2000)]
+    assert (np.diff(reported) >= 0).all()
 
 
 def test_noise_grows_where_the_actual_innovation_exceeds_the_theoretical_one() -> None:

@@ -48,9 +48,9 @@ def test_a_bad_log_is_told_and_the_others_are_estimated(
     bad.write_bytes(b"not a log")
     vehicle = ["--vehicle", str(drives / "d0.json"), "--estimator", "ckf"]
     assert main(["replay", str(bad), str(drives / "d0.parquet"), *vehicle, "--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert f"error: {bad}: log:" in said
-    assert "2 of 2 logs, 100 samples" in said
+    reported = capsys.readouterr().err
+    assert f"error: {bad}: log:" in reported
+    assert "2 of 2 logs, 100 samples" in reported
     assert [path.name for path in logs(tmp_path / "out")] == ["d0.parquet"]
 
 

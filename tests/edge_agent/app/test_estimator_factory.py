@@ -17,11 +17,11 @@ from tests.edge_agent.estimators.drives import drive
 def test_a_tuned_estimator_runs_with_the_memberships_of_its_file_and_not_with_untuned_ones(name: str) -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=6.0)
     t, signals = t[:, None], signals[:, None]
-    said = bank_of(name, [vehicle]).advance(t, signals)
+    reported = bank_of(name, [vehicle]).advance(t, signals)
     tuned = create(name, [vehicle], memberships=shipped(TUNED[name])).advance(t, signals)
     untuned = create(name, [vehicle], memberships=Memberships()).advance(t, signals)
-    assert np.array_equal(said.vx, tuned.vx)
-    assert not np.array_equal(said.vx, untuned.vx)
+    assert np.array_equal(reported.vx, tuned.vx)
+    assert not np.array_equal(reported.vx, untuned.vx)
 
 
 @pytest.mark.parametrize("name", TUNED)
@@ -33,8 +33,8 @@ def test_the_pure_core_reads_no_file_and_says_who_does(name: str) -> None:
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_every_estimator_has_a_bank(name: str) -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=1.5)
-    said = bank_of(name, [vehicle] * 2).advance(np.repeat(t[:3, None], 2, 1), np.repeat(signals[:3, None], 2, 1))
-    assert said.mu.shape == (3, 2)
+    reported = bank_of(name, [vehicle] * 2).advance(np.repeat(t[:3, None], 2, 1), np.repeat(signals[:3, None], 2, 1))
+    assert reported.mu.shape == (3, 2)
 
 
 def test_an_unknown_estimator_is_refused_by_name() -> None:

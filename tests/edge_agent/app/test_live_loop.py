@@ -94,10 +94,10 @@ def test_a_pipeline_without_samples_has_nothing_to_finish() -> None:
 def run(
     parts: Iterator[Block], fleet: SimulatedFleet, stop: threading.Event, **options: object
 ) -> tuple[Progress, Basket, list[float]]:
-    basket, told = Basket(), []
-    report = lambda progress: told.append(progress.signals_s)  # noqa: E731
+    basket, reported = Basket(), []
+    report = lambda progress: reported.append(progress.signals_s)  # noqa: E731
     progress = drive(parts, pipeline_of(fleet), basket, stop, report, **options)  # type: ignore[arg-type]
-    return progress, basket, told
+    return progress, basket, reported
 
 
 def test_a_loop_that_keeps_up_is_not_behind_and_takes_its_time() -> None:
@@ -111,11 +111,11 @@ def test_a_loop_that_keeps_up_is_not_behind_and_takes_its_time() -> None:
 def test_a_loop_that_cannot_keep_up_counts_each_late_block_and_skips_none() -> None:
     fleet, parts = fleet_blocks(20)
     seconds = iter(np.arange(1000.0))
-    progress, _, told = run(iter(parts), fleet, threading.Event(), clock=lambda: float(next(seconds)))
+    progress, _, reported = run(iter(parts), fleet, threading.Event(), clock=lambda: float(next(seconds)))
     assert progress.blocks == 20
     assert progress.behind >= 19
     assert progress.lag_s > 10
-    assert len(told) > 2
+    assert len(reported) > 2
 
 
 def test_the_loop_ends_when_told_and_closes_the_open_visits() -> None:

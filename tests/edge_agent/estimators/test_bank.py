@@ -30,23 +30,23 @@ def run(name: str, t: FloatArray, signals: FloatArray, vehicle: object, closes: 
 @pytest.mark.parametrize("name", ["aco-fckf", "fckf", "ckf"])
 def test_a_drive_that_excites_finds_its_friction_and_its_velocity(name: str) -> None:
     t, signals, vehicle = drive("j-turn", 0.5)
-    said = run(name, t, signals, vehicle)
-    assert said.mu_lower[-1, 0] < 0.5 < said.mu_upper[-1, 0]
-    assert said.mu_upper[-1, 0] - said.mu_lower[-1, 0] < 0.4
-    assert said.mu_utilised[-1, 0] > 0.35
+    reported = run(name, t, signals, vehicle)
+    assert reported.mu_lower[-1, 0] < 0.5 < reported.mu_upper[-1, 0]
+    assert reported.mu_upper[-1, 0] - reported.mu_lower[-1, 0] < 0.4
+    assert reported.mu_utilised[-1, 0] > 0.35
 
 
 def test_straight_on_at_constant_speed_the_interval_stays_as_wide_as_the_prior() -> None:
     t, signals, vehicle = drive("straight", 0.85)
-    said = run("fckf", t, signals, vehicle)
-    assert (said.mu_upper - said.mu_lower)[-1, 0] >= 0.8 * PRIOR_WIDTH
+    reported = run("fckf", t, signals, vehicle)
+    assert (reported.mu_upper - reported.mu_lower)[-1, 0] >= 0.8 * PRIOR_WIDTH
 
 
 def test_what_was_learned_is_forgotten_over_the_metres_driven_without_excitation() -> None:
     turn, straight = drive("j-turn", 0.5), drive("straight", 0.5, seconds=40.0)
     t, signals = joined(turn, straight)
-    said = run("fckf", t, signals, turn[2])
-    width = (said.mu_upper - said.mu_lower)[:, 0]
+    reported = run("fckf", t, signals, turn[2])
+    width = (reported.mu_upper - reported.mu_lower)[:, 0]
     assert width[len(turn[0]) - 1] < 0.4
     assert width[-1] >= 0.8 * PRIOR_WIDTH
 
@@ -87,7 +87,7 @@ def test_closing_visits_does_not_change_the_estimates() -> None:
 
 def test_two_beliefs_that_enter_a_cell_send_the_same_evidence_within_half_a_nat() -> None:
     visit = drive("slalom", 0.3, seconds=8.0)
-    said = []
+    reported = []
     for before in (0.3, 0.85):
         lead = drive("j-turn", before)
         t, signals = joined(lead, visit)
@@ -95,18 +95,18 @@ def test_two_beliefs_that_enter_a_cell_send_the_same_evidence_within_half_a_nat(
         closes[[len(lead[0]) + 300, -1]] = True
         estimates = run("fckf", t, signals, visit[2], closes)
         assert estimates.evidence is not None
-        said.append(estimates.evidence[-1, 0])
-    told = np.maximum(said[0], said[1]) > -3.0
-    assert np.abs(said[0] - said[1])[told].max() < 0.5
+        reported.append(estimates.evidence[-1, 0])
+    output = np.maximum(reported[0], reported[1]) > -3.0
+    assert np.abs(reported[0] - reported[1])[output].max() < 0.5
 
 
 def test_a_visit_straight_on_is_flat() -> None:
     t, signals, vehicle = drive("straight", 0.85)
     closes = np.zeros(len(t), bool)
     closes[[300, 500]] = True
-    said = run("fckf", t, signals, vehicle, closes)
-    assert said.evidence is not None
-    assert np.ptp(said.evidence[500, 0]) < 0.2
+    reported = run("fckf", t, signals, vehicle, closes)
+    assert reported.evidence is not None
+    assert np.ptp(reported.evidence[500, 0]) < 0.2
 
 
 def test_a_gently_braking_visit_excludes_less_than_the_grip_used_and_hardly_anything_above() -> None:
@@ -114,12 +114,12 @@ def test_a_gently_braking_visit_excludes_less_than_the_grip_used_and_hardly_anyt
     closes = np.zeros(len(t), bool)
     end = int(np.searchsorted(t, 4.0))
     closes[[50, end]] = True
-    said = run("fckf", t, signals, vehicle, closes)
-    assert said.evidence is not None
-    used = float(said.mu_utilised[:end].max())
-    told = said.evidence[end, 0]
-    assert np.ptp(told[1.5 * used < CENTRES]) < 2.0
-    assert told[0.7 * used > CENTRES].max() < -4.0
+    reported = run("fckf", t, signals, vehicle, closes)
+    assert reported.evidence is not None
+    used = float(reported.mu_utilised[:end].max())
+    output = reported.evidence[end, 0]
+    assert np.ptp(output[1.5 * used < CENTRES]) < 2.0
+    assert output[0.7 * used > CENTRES].max() < -4.0
 
 
 def _without(*channels: int) -> Callable[[FloatArray, FloatArray], None]:
@@ -169,12 +169,12 @@ def test_no_fault_makes_a_nan_and_health_says_what_happened(fault: str) -> None:
     t, signals = t.copy(), signals.copy()
     harm, flag = FAULTS[fault]
     harm(t, signals)
-    said = run("fckf", t, signals, vehicle)
+    reported = run("fckf", t, signals, vehicle)
     for name in COLUMNS:
-        assert np.isfinite(getattr(said, name)).all(), name
-    assert (said.health & int(flag)).any()
-    assert (said.mu_lower <= said.mu).all()
-    assert (said.mu <= said.mu_upper).all()
+        assert np.isfinite(getattr(reported, name)).all(), name
+    assert (reported.health & int(flag)).any()
+    assert (reported.mu_lower <= reported.mu).all()
+    assert (reported.mu <= reported.mu_upper).all()
 
 
 @pytest.mark.parametrize("fault", ["no torque", "no steering", "no accelerometers"])
@@ -182,8 +182,8 @@ def test_with_less_to_go_by_the_interval_is_wider_or_still_right(fault: str) -> 
     t, signals, vehicle = drive("slalom", 0.3)
     broken = signals.copy()
     FAULTS[fault][0](t, broken)
-    said = run("fckf", t, broken, vehicle)
-    right = (said.mu_lower[200:, 0] <= 0.3) & (said.mu_upper[200:, 0] >= 0.3)
+    reported = run("fckf", t, broken, vehicle)
+    right = (reported.mu_lower[200:, 0] <= 0.3) & (reported.mu_upper[200:, 0] >= 0.3)
     assert right.mean() > 0.8
 
 
@@ -191,9 +191,9 @@ def test_a_time_that_is_not_a_number_at_first_is_waited_out() -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=2.0)
     late = t.copy()
     late[:10] = np.nan
-    said = run("fckf", late, signals, vehicle)
-    assert np.isfinite(said.mu).all()
-    assert (said.health[:10] & int(Health.TIME_GAP)).all()
+    reported = run("fckf", late, signals, vehicle)
+    assert np.isfinite(reported.mu).all()
+    assert (reported.health[:10] & int(Health.TIME_GAP)).all()
 
 
 def test_the_adaptation_is_what_tells_the_estimators_apart() -> None:
@@ -227,21 +227,21 @@ def test_a_bank_of_no_vehicles_is_refused() -> None:
 
 def test_on_a_split_road_the_sides_are_told_apart() -> None:
     t, signals, vehicle = drive("split-braking", None)
-    said = run("fckf", t, signals, vehicle)
-    assert said.mu_wheel is not None
+    reported = run("fckf", t, signals, vehicle)
+    assert reported.mu_wheel is not None
     braking = (t > 2.0) & (t < 4.0)
-    left, right = said.mu_wheel[braking, 0, 0], said.mu_wheel[braking, 0, 1]
+    left, right = reported.mu_wheel[braking, 0, 0], reported.mu_wheel[braking, 0, 1]
     assert ((left[:, 1] <= 0.8) & (left[:, 2] >= 0.8)).mean() > 0.85
     assert np.abs(right[:, 0] - 0.3).mean() < 0.12
     assert (right[:, 2] < left[:, 1]).all()
-    assert (said.mu_wheel[:, 0, 0] == said.mu_wheel[:, 0, 2]).all()
+    assert (reported.mu_wheel[:, 0, 0] == reported.mu_wheel[:, 0, 2]).all()
 
 
 def test_on_a_road_of_one_friction_the_wheels_have_it() -> None:
     t, signals, vehicle = drive("slalom", 0.3)
-    said = run("fckf", t, signals, vehicle)
-    assert said.mu_wheel is not None
-    assert np.abs(said.mu_wheel[..., 0] - said.mu[..., None]).mean() < 0.02
+    reported = run("fckf", t, signals, vehicle)
+    assert reported.mu_wheel is not None
+    assert np.abs(reported.mu_wheel[..., 0] - reported.mu[..., None]).mean() < 0.02
 
 
 @pytest.mark.parametrize("name", ["gaining-lane-changes", "gaining-slalom"])
@@ -249,8 +249,8 @@ def test_gaining_speed_gently_tells_no_ice(name: str) -> None:
     """Four wheels that slide a little would explain the slip as well, with a stiffness or an offset to match."""
     for seed in range(3):
         t, signals, vehicle = drive(name, 0.9, seed)
-        said = bank_of("aco-fckf", [vehicle]).advance(t[:, None], signals[:, None])
-        assert said.mu_upper.min() > 0.85
+        reported = bank_of("aco-fckf", [vehicle]).advance(t[:, None], signals[:, None])
+        assert reported.mu_upper.min() > 0.85
 
 
 @pytest.mark.parametrize("size", [60.0, 5.0])
@@ -258,11 +258,11 @@ def test_a_single_false_acceleration_is_told_refused_and_bridged(size: float) ->
     t, signals, vehicle = drive("slalom", 0.3)
     broken = signals.copy()
     broken[200::10, [S.AX, S.AY]] += size
-    plain, said = run("fckf", t, signals, vehicle), run("fckf", t, broken, vehicle)
-    assert (said.health[200::10] & Health.OUTLIER).all()
-    assert not (said.health[201::10] & Health.OUTLIER).any()
-    assert np.abs(said.vy - plain.vy).max() < 0.05
-    assert (said.vy_std < 1.5 * plain.vy_std).all()
+    plain, reported = run("fckf", t, signals, vehicle), run("fckf", t, broken, vehicle)
+    assert (reported.health[200::10] & Health.OUTLIER).all()
+    assert not (reported.health[201::10] & Health.OUTLIER).any()
+    assert np.abs(reported.vy - plain.vy).max() < 0.05
+    assert (reported.vy_std < 1.5 * plain.vy_std).all()
 
 
 def test_an_acceleration_that_jumps_and_stays_is_believed_at_the_second_reading() -> None:
@@ -275,15 +275,15 @@ def test_an_acceleration_that_jumps_and_stays_is_believed_at_the_second_reading(
 
 def test_creeping_after_a_hard_stop_tells_no_ice() -> None:
     t, signals, vehicle = drive("braking", 0.85)
-    said = run("fckf", t, signals, vehicle)
-    assert said.vx[-1, 0] < 2.0
-    assert (said.mu_upper[t > 2.0] > 0.7).all()
+    reported = run("fckf", t, signals, vehicle)
+    assert reported.vx[-1, 0] < 2.0
+    assert (reported.mu_upper[t > 2.0] > 0.7).all()
 
 
 def test_wheels_that_spin_beyond_belief_tell_nothing_false() -> None:
     t, signals, vehicle = drive("acceleration", 0.3)
     broken = signals.copy()
     broken[300:, S.OMEGA : S.OMEGA + 4] = 600.0
-    said = run("fckf", t, broken, vehicle)
-    assert (said.mu_lower[300:] <= 0.3).mean() > 0.85
-    assert (said.mu_upper[300:] >= 0.3).mean() > 0.85
+    reported = run("fckf", t, broken, vehicle)
+    assert (reported.mu_lower[300:] <= 0.3).mean() > 0.85
+    assert (reported.mu_upper[300:] >= 0.3).mean() > 0.85

@@ -35,12 +35,12 @@ def run(name: str, t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> Esti
 @pytest.mark.parametrize("name", PAPERS)
 def test_on_a_slalom_the_motion_is_found(name: str) -> None:
     t, signals, vehicle = drive("slalom", 0.8, seconds=6.0)
-    said = run(name, t, signals, vehicle)
-    assert abs(said.vx[-1, 0] - 30 / 3.6) < 0.15
-    assert np.corrcoef(said.yaw_rate[:, 0], signals[:, S.YAW_RATE])[0, 1] > 0.99
-    assert (said.mu_lower <= said.mu).all()
-    assert (said.mu <= said.mu_upper).all()
-    assert said.evidence is None
+    reported = run(name, t, signals, vehicle)
+    assert abs(reported.vx[-1, 0] - 30 / 3.6) < 0.15
+    assert np.corrcoef(reported.yaw_rate[:, 0], signals[:, S.YAW_RATE])[0, 1] > 0.99
+    assert (reported.mu_lower <= reported.mu).all()
+    assert (reported.mu <= reported.mu_upper).all()
+    assert reported.evidence is None
 
 
 @pytest.mark.parametrize("name", PAPERS)
@@ -73,20 +73,20 @@ def test_no_fault_makes_a_nan_and_health_says_what_happened(name: str, fault: st
     t, signals = t.copy(), signals.copy()
     harm, flag = FAULTS[fault]
     harm(t, signals)
-    said = run(name, t, signals, vehicle)
+    reported = run(name, t, signals, vehicle)
     for array in COLUMNS:
-        assert np.isfinite(getattr(said, array)).all(), array
-    assert said.mu_wheel is None or np.isfinite(said.mu_wheel).all()
-    assert (said.health & int(flag)).any()
+        assert np.isfinite(getattr(reported, array)).all(), array
+    assert reported.mu_wheel is None or np.isfinite(reported.mu_wheel).all()
+    assert (reported.health & int(flag)).any()
 
 
 @pytest.mark.parametrize("name", PAPERS)
 @pytest.mark.parametrize("rate", [10, 1])
 def test_slow_sampling_and_standing_still_are_survived(name: str, rate: int) -> None:
     t, signals, vehicle = drive("braking", 0.8, seconds=8.0)
-    said = run(name, t[:: 100 // rate], signals[:: 100 // rate], vehicle)
-    assert all(np.isfinite(getattr(said, array)).all() for array in COLUMNS)
-    assert np.abs(said.vx).max() < 40.0
+    reported = run(name, t[:: 100 // rate], signals[:: 100 // rate], vehicle)
+    assert all(np.isfinite(getattr(reported, array)).all() for array in COLUMNS)
+    assert np.abs(reported.vx).max() < 40.0
 
 
 @pytest.mark.parametrize("name", PAPERS)
@@ -94,19 +94,19 @@ def test_without_evidence_the_observer_tells_friction_with_its_interval(name: st
     t, signals, vehicle = drive("slalom", 0.8, seconds=6.0)
     t, signals = t[:, None], signals[:, None]
     _, located = locate(new_tracks(1), t, signals)
-    said = bank_of(name, [vehicle]).advance(t, signals, located.closes)
-    _, told, _ = observe(OpenVisits.start(1), (t * 1e9).astype(np.int64), located, said, AgentConfig())
-    assert len(told.vehicle) > 0
-    assert told.columns["log_likelihood"].shape == (len(told.vehicle), 0)
-    assert (told.columns["mu_lower"] < told.columns["mu_upper"]).all()
+    reported = bank_of(name, [vehicle]).advance(t, signals, located.closes)
+    _, output, _ = observe(OpenVisits.start(1), (t * 1e9).astype(np.int64), located, reported, AgentConfig())
+    assert len(output.vehicle) > 0
+    assert output.columns["log_likelihood"].shape == (len(output.vehicle), 0)
+    assert (output.columns["mu_lower"] < output.columns["mu_upper"]).all()
 
 
 @pytest.mark.parametrize("name", SET_BY_HAND)
 def test_friction_that_is_set_and_not_estimated_is_told_as_the_prior(name: str) -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=2.0)
-    said = run(name, t, signals, vehicle)
-    assert np.ptp(said.mu) == 0.0
-    assert (said.mu_upper - said.mu_lower)[-1, 0] == pytest.approx(PRIOR_WIDTH)
+    reported = run(name, t, signals, vehicle)
+    assert np.ptp(reported.mu) == 0.0
+    assert (reported.mu_upper - reported.mu_lower)[-1, 0] == pytest.approx(PRIOR_WIDTH)
 
 
 @pytest.mark.parametrize("name", SET_BY_HAND)
@@ -120,21 +120,21 @@ def test_the_friction_that_is_set_matters_where_tyres_bend(name: str) -> None:
 @pytest.mark.parametrize("name", BY_WHEEL)
 def test_straight_on_at_constant_speed_every_wheel_is_as_unknown_as_before(name: str) -> None:
     t, signals, vehicle = drive("straight", 0.85, seconds=10.0)
-    said = run(name, t, signals, vehicle)
-    assert said.mu_wheel is not None
-    assert (said.mu_wheel[-1, 0, :, 2] - said.mu_wheel[-1, 0, :, 1] >= 0.8 * PRIOR_WIDTH).all()
+    reported = run(name, t, signals, vehicle)
+    assert reported.mu_wheel is not None
+    assert (reported.mu_wheel[-1, 0, :, 2] - reported.mu_wheel[-1, 0, :, 1] >= 0.8 * PRIOR_WIDTH).all()
 
 
 def test_with_wheel_torque_the_unscented_filter_finds_the_friction_of_a_slalom_on_snow() -> None:
     t, signals, vehicle = drive("slalom", 0.3)
-    said = run("sr-ukf", t, signals, vehicle)
-    assert said.mu_lower[-1, 0] < 0.3 < said.mu_upper[-1, 0]
-    assert abs(said.mu[-1, 0] - 0.3) < 0.1
+    reported = run("sr-ukf", t, signals, vehicle)
+    assert reported.mu_lower[-1, 0] < 0.3 < reported.mu_upper[-1, 0]
+    assert abs(reported.mu[-1, 0] - 0.3) < 0.1
     broken = signals.copy()
     broken[:, S.TORQUE : S.TORQUE + 4] = np.nan
     less = run("sr-ukf", t, broken, vehicle)
     assert (less.health & int(Health.NO_TORQUE)).all()
-    assert (less.mu_upper - less.mu_lower)[300:].mean() > (said.mu_upper - said.mu_lower)[300:].mean()
+    assert (less.mu_upper - less.mu_lower)[300:].mean() > (reported.mu_upper - reported.mu_lower)[300:].mean()
 
 
 @pytest.mark.parametrize(
@@ -160,8 +160,8 @@ def test_every_setting_of_the_papers_filter_matters(change: dict[str, object]) -
 def test_the_fuzzy_sets_matter_to_the_papers_filter_and_are_refused_where_there_are_none() -> None:
     t, signals, vehicle = drive("slalom", 0.3, seconds=1.5)
     still = Memberships(outputs=(0.0, 0.0, 0.0, 0.0, 0.0))
-    said = create("paper-aco-fckf", [vehicle], memberships=still).advance(t[:, None], signals[:, None])
-    assert (said.adaptation == 1.0).all()
+    reported = create("paper-aco-fckf", [vehicle], memberships=still).advance(t[:, None], signals[:, None])
+    assert (reported.adaptation == 1.0).all()
     assert (run("paper-aco-fckf", t, signals, vehicle).adaptation != 1.0).any()
     with pytest.raises(InputError, match="memberships"):
         create("sr-ukf", [vehicle], memberships=still)

@@ -23,8 +23,8 @@ def joined(records: list[RecordBlock]) -> dict[str, np.ndarray]:
 
 
 def test_one_observation_for_each_finished_visit() -> None:
-    block, told = wanderers(400, 5), estimates(400, 5)
-    located, observations, _ = Watch.of(5).step(block, told)
+    block, reported = wanderers(400, 5), estimates(400, 5)
+    located, observations, _ = Watch.of(5).step(block, reported)
     visits = 0
     for n in range(5):
         cells = located.cell[np.flatnonzero(located.closes[:, n]), n]
@@ -35,12 +35,12 @@ def test_one_observation_for_each_finished_visit() -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_any_split_of_the_samples_gives_the_same_records(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    block, told = wanderers(300, 4, seed), estimates(300, 4, seed)
-    _, *whole = Watch.of(4).step(block, told)
+    block, reported = wanderers(300, 4, seed), estimates(300, 4, seed)
+    _, *whole = Watch.of(4).step(block, reported)
     cuts = [0, *np.sort(rng.choice(np.arange(1, 300), 12, replace=False)).tolist(), 300]
     watch = Watch.of(4)
     rows = [slice(a, b) for a, b in pairwise(cuts)]
-    pieces = [watch.step(part(block, r), told.part(r))[1:] for r in rows]
+    pieces = [watch.step(part(block, r), reported.part(r))[1:] for r in rows]
     for kind in (0, 1):
         expected, found = joined([whole[kind]]), joined([piece[kind] for piece in pieces])
         for name, column in expected.items():
@@ -51,18 +51,18 @@ def test_an_observation_tells_its_visit() -> None:
     """East through three cells at 10 m/s: times, pose, speed and the friction at the end of the second visit."""
     samples = 25
     east = np.arange(samples)[:, None] * 1.0
-    block, told = ground(east, np.zeros_like(east), np.zeros_like(east)), estimates(samples, 1)
-    located, observations, _ = Watch.of(1).step(block, told)
+    block, reported = ground(east, np.zeros_like(east), np.zeros_like(east)), estimates(samples, 1)
+    located, observations, _ = Watch.of(1).step(block, reported)
     first, second = np.flatnonzero(located.closes[:, 0])[1:3]
     columns = observations.columns
     assert columns["enter_time"][1] == START_NS + first * 100_000_000
     assert columns["leave_time"][1] == START_NS + (second - 1) * 100_000_000
-    assert columns["mu"][1] == np.float32(told.mu[second - 1, 0])
-    assert columns["mu_upper"][1] == np.float32(told.mu_upper[second - 1, 0])
-    assert columns["speed"][1] == pytest.approx(np.hypot(told.vx, told.vy)[first:second].mean(), rel=1e-6)
-    assert columns["health"][1] == np.bitwise_or.reduce(told.health[first:second, 0])
-    assert told.evidence is not None
-    assert np.array_equal(columns["log_likelihood"][1], mugrid.encode_log_likelihood(told.evidence[second, 0]))
+    assert columns["mu"][1] == np.float32(reported.mu[second - 1, 0])
+    assert columns["mu_upper"][1] == np.float32(reported.mu_upper[second - 1, 0])
+    assert columns["speed"][1] == pytest.approx(np.hypot(reported.vx, reported.vy)[first:second].mean(), rel=1e-6)
+    assert columns["health"][1] == np.bitwise_or.reduce(reported.health[first:second, 0])
+    assert reported.evidence is not None
+    assert np.array_equal(columns["log_likelihood"][1], mugrid.encode_log_likelihood(reported.evidence[second, 0]))
     assert columns["sector"].tolist() == [0] * len(columns["sector"])
 
 
@@ -80,15 +80,15 @@ def test_columns_have_the_types_of_the_wire() -> None:
 
 
 def test_a_bank_without_evidence_sends_no_likelihood() -> None:
-    block, told = wanderers(100, 2), estimates(100, 2)
-    bare = type(told)(**{**vars(told), "evidence": None})
+    block, reported = wanderers(100, 2), estimates(100, 2)
+    bare = type(reported)(**{**vars(reported), "evidence": None})
     _, observations, _ = Watch.of(2).step(block, bare)
     assert observations.columns["log_likelihood"].shape == (len(observations.vehicle), 0)
 
 
 def test_a_visit_that_the_bank_could_not_follow_is_flat() -> None:
-    block, told = wanderers(100, 2), estimates(100, 2)
-    unknown = type(told)(**{**vars(told), "evidence": np.full_like(told.evidence, np.nan)})
+    block, reported = wanderers(100, 2), estimates(100, 2)
+    unknown = type(reported)(**{**vars(reported), "evidence": np.full_like(reported.evidence, np.nan)})
     _, observations, _ = Watch.of(2).step(block, unknown)
     assert not observations.columns["log_likelihood"].any()
     assert observations.columns["log_likelihood"].shape[1] == mugrid.BINS
@@ -110,12 +110,12 @@ def test_grip_used_in_the_cell_before_is_not_told_again() -> None:
     """Braking ends just before the border; the estimator's window still shows it for a second."""
     samples = 60
     east = np.arange(samples)[:, None] * 0.5
-    block, told = ground(east, np.zeros_like(east), np.zeros_like(east)), estimates(samples, 1, mu=0.9)
+    block, reported = ground(east, np.zeros_like(east), np.zeros_like(east)), estimates(samples, 1, mu=0.9)
     used = np.full((samples, 1), 0.1)
-    located, *_ = Watch.of(1).step(block, told)
+    located, *_ = Watch.of(1).step(block, reported)
     border = np.flatnonzero(located.closes[:, 0])[1]
     used[border - 5 : border + 9] = 0.7
-    _, observations, _ = Watch.of(1).step(block, type(told)(**{**vars(told), "mu_utilised": used}))
+    _, observations, _ = Watch.of(1).step(block, type(reported)(**{**vars(reported), "mu_utilised": used}))
     assert observations.columns["mu_utilised"][:2].tolist() == pytest.approx([0.7, 0.1])
 
 

@@ -29,9 +29,9 @@ def test_what_the_vehicles_write_is_joined_with_their_truth(tmp_path: Path) -> N
     assert figures["fusion.whole_way.hills.false_ice"] <= figures["fusion.whole_way.hills.alerts"]
     columns = end_to_end.read(tmp_path / "whole_way.hills" / end_to_end.OBSERVATIONS)
     truth = pq.read_table(tmp_path / "whole_way.hills" / end_to_end.TRUTH)
-    told = set(zip(columns["cell"].tolist(), columns["sector"].tolist(), strict=True))
+    reported = set(zip(columns["cell"].tolist(), columns["sector"].tolist(), strict=True))
     true = set(zip(truth["cell"].to_pylist(), truth["sector"].to_pylist(), strict=True))
-    assert len(told & true) > 0.5 * len(told)
+    assert len(reported & true) > 0.5 * len(reported)
     fusion = Fusion(120.0)
     fusion.update(end_to_end.observations_in(columns))
     slots, mu = end_to_end.joined(fusion, truth)
@@ -81,7 +81,7 @@ def test_an_alert_is_false_where_nothing_near_was_slippery_before_it() -> None:
 
 def test_alerts_are_those_of_a_service_that_hears_second_by_second() -> None:
     fusion = Fusion(120.0)
-    raised = end_to_end.told(fusion, observations(list(range(1, 9)), [1, 2] * 4, value([0.15] * 8)))
+    raised = end_to_end.raised_alerts(fusion, observations(list(range(1, 9)), [1, 2] * 4, value([0.15] * 8)))
     assert [alert.cell for alert in raised] == [CELL]
 
 

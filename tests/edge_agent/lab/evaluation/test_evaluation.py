@@ -50,14 +50,14 @@ ASKED = {
 
 def fake(mu: float, lower: float, upper: float, like: DriveSet) -> Estimates:
     """Estimates that tell the same friction all the time, and the true motion."""
-    told, truth = np.zeros((*like.t.shape, ONE_FRICTION)), like.truth
-    told[..., Column.VX], told[..., Column.VY], told[..., Column.YAW_RATE] = (
+    output, truth = np.zeros((*like.t.shape, ONE_FRICTION)), like.truth
+    output[..., Column.VX], output[..., Column.VY], output[..., Column.YAW_RATE] = (
         truth[f"true_{name}"] for name in ("vx", "vy", "yaw_rate")
     )
-    told[..., Column.SIDESLIP] = np.arctan2(truth["true_vy"], truth["true_vx"])
-    told[..., Column.MU], told[..., Column.MU_LOWER], told[..., Column.MU_UPPER] = mu, lower, upper
-    told[..., Column.VX_STD : Column.MU], told[..., Column.INNOVATION_NIS] = 1.0, 1.0
-    return Estimates(told)
+    output[..., Column.SIDESLIP] = np.arctan2(truth["true_vy"], truth["true_vx"])
+    output[..., Column.MU], output[..., Column.MU_LOWER], output[..., Column.MU_UPPER] = mu, lower, upper
+    output[..., Column.VX_STD : Column.MU], output[..., Column.INNOVATION_NIS] = 1.0, 1.0
+    return Estimates(output)
 
 
 @pytest.fixture(scope="module")
@@ -104,12 +104,12 @@ def test_arrival_is_counted_from_the_change_and_what_never_arrives_counts_to_the
 
 
 def test_a_false_change_is_an_interval_that_stays_beside_the_truth(jumping: DriveSet) -> None:
-    said = fake(0.85, 0.1, 1.0, jumping)
-    assert measures.false_changes(jumping, said).tolist() == [0.0, 0.0]
-    said.mu_upper[20:30] = 0.3
-    assert measures.false_changes(jumping, said).tolist() == [0.0, 0.0]
-    said.mu_upper[50:90, 1] = 0.3
-    assert measures.false_changes(jumping, said).tolist() == [0.0, 1.0]
+    reported = fake(0.85, 0.1, 1.0, jumping)
+    assert measures.false_changes(jumping, reported).tolist() == [0.0, 0.0]
+    reported.mu_upper[20:30] = 0.3
+    assert measures.false_changes(jumping, reported).tolist() == [0.0, 0.0]
+    reported.mu_upper[50:90, 1] = 0.3
+    assert measures.false_changes(jumping, reported).tolist() == [0.0, 1.0]
 
 
 def test_sides_are_told_apart() -> None:
@@ -163,8 +163,8 @@ def test_misuse_is_one_line_and_exit_code_two(
 
 def test_the_quick_campaign_writes_figures_report_and_plots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", "--out", str(tmp_path), "--quick"]) in (0, 1)
-    told = capsys.readouterr()
-    assert "double lane change" in told.err
+    output = capsys.readouterr()
+    assert "double lane change" in output.err
     header, *rows = json.loads((tmp_path / "figures.json").read_text())
     assert header["campaign"] == "edge-agent evaluate --quick"
     assert header["seeds"] == [FIGURES, FIGURES + 1]

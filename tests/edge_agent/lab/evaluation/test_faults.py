@@ -37,7 +37,7 @@ def test_no_fault_loses_an_estimate_and_health_tells_every_one_that_can_be_told(
     found = faults.campaign(range(1), [estimator], ("slalom", "braking"))
     for (case, _), measured in found.items():
         assert (measured["finite"] == 1.0).all(), case
-        assert (measured["told"] == float(CASES[case].says != Health.OK)).all(), case
+        assert (measured["told"] == float(CASES[case].flag != Health.OK)).all(), case
 
 
 def test_under_a_fault_the_interval_of_the_default_stays_honest() -> None:

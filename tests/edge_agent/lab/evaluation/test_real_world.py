@@ -26,17 +26,21 @@ def driven() -> tuple[DriveSet, FloatArray]:
 
 def saying(batch: DriveSet, lower: float, upper: float) -> Estimates:
     """Estimates that know the motion and always say the same of friction."""
-    told = np.zeros((*batch.t.shape, ONE_FRICTION))
+    output = np.zeros((*batch.t.shape, ONE_FRICTION))
     for column, name in ((Column.VX, "vx"), (Column.VY, "vy"), (Column.YAW_RATE, "yaw_rate")):
-        told[..., column] = batch.truth[f"true_{name}"]
-    told[..., Column.MU], told[..., Column.MU_LOWER], told[..., Column.MU_UPPER] = (lower + upper) / 2, lower, upper
-    told[..., Column.VX_STD : Column.MU] = 1.0
-    return Estimates(told)
+        output[..., column] = batch.truth[f"true_{name}"]
+    output[..., Column.MU], output[..., Column.MU_LOWER], output[..., Column.MU_UPPER] = (
+        (lower + upper) / 2,
+        lower,
+        upper,
+    )
+    output[..., Column.VX_STD : Column.MU] = 1.0
+    return Estimates(output)
 
 
-def figures(driven: tuple[DriveSet, FloatArray], said: Estimates) -> dict[str, float]:
+def figures(driven: tuple[DriveSet, FloatArray], reported: Estimates) -> dict[str, float]:
     tally = Tally()
-    real_world.count(tally, driven[0], said, driven[1])
+    real_world.count(tally, driven[0], reported, driven[1])
     return tally.means()
 
 

@@ -34,9 +34,9 @@ def test_an_overconfident_answer_is_seen_at_both_ends() -> None:
     rng = np.random.default_rng(1)
     mean = np.full(20_000, 0.6)
     truth = mean + 0.1 * rng.normal(size=mean.shape)
-    told = shares(between_quantiles(truth, mean - 1.6449 * 0.05, mean, mean + 1.6449 * 0.05))
-    assert told[0] > 0.15
-    assert told[-1] < 0.85
+    output = shares(between_quantiles(truth, mean - 1.6449 * 0.05, mean, mean + 1.6449 * 0.05))
+    assert output[0] > 0.15
+    assert output[-1] < 0.85
 
 
 def test_the_prior_is_uniform_and_a_posterior_on_the_grid_is_its_own_distribution() -> None:
@@ -57,17 +57,17 @@ def test_an_end_that_the_range_cuts_off_does_not_narrow_the_gaussian() -> None:
 @pytest.mark.parametrize("estimator", ["aco-fckf", "sr-ukf"])
 def test_watching_a_drive_changes_nothing_that_is_said_of_it(estimator: str, turning: DriveSet) -> None:
     plain = estimates(bank_of(estimator, turning.vehicles), turning)
-    said, ranks = watched(bank_of(estimator, turning.vehicles), turning)
-    assert np.array_equal(plain.values, said.values)
+    reported, ranks = watched(bank_of(estimator, turning.vehicles), turning)
+    assert np.array_equal(plain.values, reported.values)
     assert ranks.shape == (3, 3)
     assert ((ranks >= 0.0) & (ranks <= 1.0)).all()
 
 
 def test_the_whole_posterior_of_the_default_has_the_quantiles_that_it_tells_within_a_bin(turning: DriveSet) -> None:
-    said, _ = watched(bank_of("aco-fckf", turning.vehicles), turning)
-    for level, told in ((0.05, said.mu_lower), (0.5, said.mu), (0.95, said.mu_upper)):
+    reported, _ = watched(bank_of("aco-fckf", turning.vehicles), turning)
+    for level, output in ((0.05, reported.mu_lower), (0.5, reported.mu), (0.95, reported.mu_upper)):
         for side in (-1.0, 1.0):
-            beside = told + side * 1.15 / BINS
+            beside = output + side * 1.15 / BINS
             moved = replace(turning, truth={f"true_mu_{w}": beside for w in ("fl", "fr", "rl", "rr")})
             _, ranks = watched(bank_of("aco-fckf", turning.vehicles), moved)
             assert (side * (ranks - level) > 0.0).all()
@@ -76,17 +76,17 @@ def test_the_whole_posterior_of_the_default_has_the_quantiles_that_it_tells_with
 def test_consistency_is_full_where_the_spread_is_right_and_none_where_it_is_ten_times_too_small(
     turning: DriveSet,
 ) -> None:
-    said = fake(0.35, 0.3, 0.4, turning)
+    reported = fake(0.35, 0.3, 0.4, turning)
     rng = np.random.default_rng(2)
-    right, wrong = Estimates(said.values.copy()), Estimates(said.values.copy())
+    right, wrong = Estimates(reported.values.copy()), Estimates(reported.values.copy())
     for one in (right, wrong):
-        one.vx[:] += rng.normal(size=said.vx.shape)
-        one.vy[:] += rng.normal(size=said.vy.shape)
-        one.innovation_nis[:] = rng.chisquare(3, said.vx.shape) / 3.0
+        one.vx[:] += rng.normal(size=reported.vx.shape)
+        one.vy[:] += rng.normal(size=reported.vy.shape)
+        one.innovation_nis[:] = rng.chisquare(3, reported.vx.shape) / 3.0
     found = consistency(turning, right)
     assert found["nees_within"][0] == pytest.approx(0.95, abs=0.03)
     assert found["nis_within"][0] == pytest.approx(0.95, abs=0.03)
-    wrong.vx_std[:], wrong.vy_std[:] = 0.1 * said.vx_std, 0.1 * said.vy_std
+    wrong.vx_std[:], wrong.vy_std[:] = 0.1 * reported.vx_std, 0.1 * reported.vy_std
     assert consistency(turning, wrong)["nees_within"][0] < 0.05
 
 

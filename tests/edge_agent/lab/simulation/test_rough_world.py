@@ -225,14 +225,14 @@ ONLY = {
 def two(manoeuvre: str, mounted: Misalignment) -> tuple[dict[str, FloatArray], dict[str, FloatArray], FloatArray]:
     """Channels of a drive with ideal sensors, of the same drive with misaligned ones, and their row."""
     exact, _ = simulate_manoeuvre(manoeuvre, sensors="ideal")
-    told, _ = simulate_manoeuvre(manoeuvre, sensors=Sensors(mounted=mounted), seed=5)
-    named = [{name: column(log, name) for name in CHANNELS} for log in (exact, told)]
+    reported, _ = simulate_manoeuvre(manoeuvre, sensors=Sensors(mounted=mounted), seed=5)
+    named = [{name: column(log, name) for name in CHANNELS} for log in (exact, reported)]
     return named[0], named[1], misalignment_row(mounted, 5, 0)
 
 
 @pytest.mark.parametrize("name", ONLY)
 def test_a_misalignment_is_exactly_what_its_row_says_and_touches_nothing_else(name: str) -> None:
-    exact, told, row = two("sine", ONLY[name])
+    exact, reported, row = two("sine", ONLY[name])
     wanted = {key: value.copy() for key, value in exact.items()}
     t = np.arange(len(exact["ax"])) / 100.0
     if name == "tilt":
@@ -254,8 +254,8 @@ def test_a_misalignment_is_exactly_what_its_row_says_and_touches_nothing_else(na
             wanted[channel] = np.interp(t - row[Misaligned.LAG + DEVICE_OF[c]], t, exact[channel])
         assert np.ptp(row[Misaligned.LAG : Misaligned.LAG + DEVICES]) > 0.005
     for channel in CHANNELS[: S.LATITUDE]:
-        np.testing.assert_allclose(told[channel], wanted[channel], rtol=1e-9, atol=1e-9, err_msg=channel)
-    assert any(not np.array_equal(told[c], exact[c], equal_nan=True) for c in CHANNELS)
+        np.testing.assert_allclose(reported[channel], wanted[channel], rtol=1e-9, atol=1e-9, err_msg=channel)
+    assert any(not np.array_equal(reported[c], exact[c], equal_nan=True) for c in CHANNELS)
 
 
 def test_one_misalignment_does_not_move_another_and_sizes_are_those_of_the_table() -> None:
@@ -286,9 +286,9 @@ def test_a_wheel_that_stands_reads_zero_and_one_that_turns_reads_steps() -> None
 def test_half_a_fleet_is_rough_and_the_other_half_drives_as_it_always_did() -> None:
     plain, mixed = SimulatedFleet("demo", 6, 5, 50.0), SimulatedFleet("demo", 6, 5, 50.0, rough=0.5)
     assert mixed.rough.tolist() == [False, True, False, True, False, True]
-    (_, usual), (_, told) = plain.step(2000), mixed.step(2000)
-    np.testing.assert_array_equal(usual[:, ::2], told[:, ::2])
-    assert not np.array_equal(usual[:, 1], told[:, 1], equal_nan=True)
+    (_, usual), (_, reported) = plain.step(2000), mixed.step(2000)
+    np.testing.assert_array_equal(usual[:, ::2], reported[:, ::2])
+    assert not np.array_equal(usual[:, 1], reported[:, 1], equal_nan=True)
     assert (mixed.truth.vx[:, 1::2] == 0.0).any()  # their drivers stop now and then
     assert (mixed.truth.vx[:, ::2] > 0.0).all()
 

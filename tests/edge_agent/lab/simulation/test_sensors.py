@@ -95,9 +95,9 @@ def test_a_rolling_body_lets_gravity_into_the_accelerometer() -> None:
 
 def test_vehicle_files_are_wrong_by_a_few_per_cent_and_only_where_it_is_said() -> None:
     truth = PRESETS["sedan"].vehicle
-    told = [simulate_manoeuvre("straight", duration_s=0.1, seed=seed)[1] for seed in range(200)]
+    reported = [simulate_manoeuvre("straight", duration_s=0.1, seed=seed)[1] for seed in range(200)]
     for name in type(truth).model_fields:
-        values = [getattr(vehicle, name) for vehicle in told]
+        values = [getattr(vehicle, name) for vehicle in reported]
         if name in KNOWN:
             assert np.std(np.array(values) / getattr(truth, name)) == pytest.approx(KNOWN[name], rel=0.2)
         else:

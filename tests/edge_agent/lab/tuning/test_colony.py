@@ -117,12 +117,12 @@ def test_same_seed_gives_the_same_result_and_another_seed_another_way() -> None:
 
 @pytest.mark.parametrize("search", [colony, random_search])
 def test_progress_tells_every_iteration_and_the_best_never_falls(search: object) -> None:
-    told: list[Iteration] = []
-    result = run(search, bowl(2), 6, progress=told.append)
-    assert tuple(told) == result.history
-    assert [line.iteration for line in told] == list(range(1, ITERATIONS + 1))
-    assert np.all(np.diff([line.best for line in told]) >= 0)
-    assert all(line.mean <= line.best for line in told)
+    reported: list[Iteration] = []
+    result = run(search, bowl(2), 6, progress=reported.append)
+    assert tuple(reported) == result.history
+    assert [line.iteration for line in reported] == list(range(1, ITERATIONS + 1))
+    assert np.all(np.diff([line.best for line in reported]) >= 0)
+    assert all(line.mean <= line.best for line in reported)
     assert result.value == bowl(2)(result.best)
 
 

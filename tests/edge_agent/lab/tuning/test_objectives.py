@@ -126,10 +126,10 @@ def test_quick_tuning_writes_a_valid_file_and_says_what_it_does(
 ) -> None:
     out = tmp_path / "tuned.json"
     assert tune.run(arguments("--quick", "--seed", "4", "--objective", objective, "--out", str(out))) == 0
-    told = capsys.readouterr().out
-    assert told.count("elapsed") == 2 * tune.QUICK_ITERATIONS
+    reported = capsys.readouterr().out
+    assert reported.count("elapsed") == 2 * tune.QUICK_ITERATIONS
     for way in WAYS:
-        assert f"\n{way} " in told
+        assert f"\n{way} " in reported
     tuned = load(out)
     scores, provenance = tuned.document.scores, tuned.document.provenance
     for way in ("random", "colony"):

@@ -74,8 +74,8 @@ def test_the_quick_study_writes_figures_table_plot_and_a_tuned_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["tune", "--study", str(tmp_path), "--quick", "--ants", "2"]) == 0
-    told = capsys.readouterr().out
-    assert told.count("elapsed") == 2 * 2 * 2
+    reported = capsys.readouterr().out
+    assert reported.count("elapsed") == 2 * 2 * 2
     header, *rows = json.loads((tmp_path / "figures.json").read_text())
     assert header["seeds"] == [0, 1]
     listed = [Figure(row["name"], row["value"], row["unit"]) for row in rows]
