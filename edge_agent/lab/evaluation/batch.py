@@ -22,7 +22,7 @@ FINE_HZ = 500.0  # steering is held over a sample of the simulator; a slow senso
 
 
 @dataclass(frozen=True)
-class TestDrive:
+class DriveSpec:
     """A manoeuvre of a paper, or of the default estimator's bars: vehicle, speed [m/s], friction, rate, length.
 
     road, slope: relief by name and a lasting slope upon it; torque: whether it is recorded.
@@ -64,18 +64,18 @@ class DriveSet:
         return slice(int(np.searchsorted(self.t[:, 0], self.t[-1, 0] - seconds)), None)
 
 
-def realistic(scenario: TestDrive, seeds: Sequence[int], sensors: str | Sensors = USUAL) -> DriveSet:
+def realistic(scenario: DriveSpec, seeds: Sequence[int], sensors: str | Sensors = USUAL) -> DriveSet:
     """One drive per seed with ordinary sensors, of a vehicle known to a few per cent."""
     return joined([_drive(scenario, seed, sensors, 1) for seed in seeds])
 
 
-def ideal(scenario: TestDrive) -> DriveSet:
+def ideal(scenario: DriveSpec) -> DriveSet:
     """One drive with sensors without error, of a vehicle known exactly; simulated finely, sampled at the rate."""
     step = max(1, round(FINE_HZ / scenario.rate_hz))
     return joined([_drive(replace(scenario, rate_hz=scenario.rate_hz * step), 0, "ideal", step)])
 
 
-def _drive(scenario: TestDrive, seed: int, sensors: str | Sensors, step: int) -> tuple[pa.Table, Vehicle]:
+def _drive(scenario: DriveSpec, seed: int, sensors: str | Sensors, step: int) -> tuple[pa.Table, Vehicle]:
     log, vehicle = simulate_manoeuvre(
         scenario.manoeuvre, mu=scenario.mu, speed=scenario.speed, seed=seed, rate_hz=scenario.rate_hz,
         duration_s=scenario.duration_s, vehicle=scenario.vehicle, sensors=sensors, road=scenario.road,

@@ -13,7 +13,7 @@ import numpy as np
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates
-from edge_agent.lab.evaluation.batch import DriveSet, TestDrive, estimates, realistic
+from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, estimates, realistic
 from edge_agent.lab.evaluation.measures import covered, errors
 from edge_agent.lab.evaluation.scenarios import SEDAN
 from edge_agent.lab.simulation import Fault
@@ -24,9 +24,9 @@ from schemas.signals import Health
 
 BEGINS, ENDS = 2.0, 5.0  # [s]
 DRIVES: Final = {
-    "slalom": TestDrive("slalom", SEDAN, 0.30, kmh(30), duration_s=8.0),
-    "lane change": TestDrive("double-lane-change", SEDAN, 0.85, kmh(80), duration_s=8.0),
-    "braking": TestDrive("moderate-braking", SEDAN, jump(0.85, 0.50, 60.0), kmh(80), duration_s=6.0),
+    "slalom": DriveSpec("slalom", SEDAN, 0.30, kmh(30), duration_s=8.0),
+    "lane change": DriveSpec("double-lane-change", SEDAN, 0.85, kmh(80), duration_s=8.0),
+    "braking": DriveSpec("moderate-braking", SEDAN, jump(0.85, 0.50, 60.0), kmh(80), duration_s=6.0),
 }
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates
-from edge_agent.lab.evaluation.batch import USUAL, DriveSet, TestDrive, estimates, realistic
+from edge_agent.lab.evaluation.batch import USUAL, DriveSet, DriveSpec, estimates, realistic
 from edge_agent.lab.evaluation.measures import covered, errors
 from edge_agent.lab.simulation import PRESETS, SimulatedFleet
 from edge_agent.lab.simulation.scenarios import drawn
@@ -132,7 +132,7 @@ def standing(slope: float, seeds: Sequence[int], seconds: float) -> list[DriveSe
     batches = []
     for sensors in (USUAL, "rough"):
         for k, preset in enumerate(PRESETS.values()):
-            drive = TestDrive("standing", preset, duration_s=seconds, slope=slope, torque=sensors == USUAL)
+            drive = DriveSpec("standing", preset, duration_s=seconds, slope=slope, torque=sensors == USUAL)
             batches.append(realistic(drive, seeds[k :: len(PRESETS)] or seeds[:1], sensors))
     return batches
 

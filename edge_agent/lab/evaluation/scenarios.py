@@ -10,7 +10,7 @@ import math
 from dataclasses import replace
 from typing import Final
 
-from edge_agent.lab.evaluation.batch import TestDrive
+from edge_agent.lab.evaluation.batch import DriveSpec
 from edge_agent.lab.simulation.manoeuvres import jump, kmh, split
 from edge_agent.lab.simulation.presets import PRESETS, TrueVehicle, car, matched
 
@@ -59,42 +59,42 @@ LOADED: Final = replace(
 )  # fmt: skip
 
 PAPERS: Final = {
-    "004.dlc": TestDrive("double-lane-change", SEDAN, 0.85, kmh(80), 50.0, about="double lane change, 80 km/h"),
-    "000.jump": TestDrive("two-lane-changes", steered_behind(kmh(30)), about="lane changes at 30 km/h, .5 to .3"),
-    "001.dlc": TestDrive(
+    "004.dlc": DriveSpec("double-lane-change", SEDAN, 0.85, kmh(80), 50.0, about="double lane change, 80 km/h"),
+    "000.jump": DriveSpec("two-lane-changes", steered_behind(kmh(30)), about="lane changes at 30 km/h, .5 to .3"),
+    "001.dlc": DriveSpec(
         "double-lane-change", steered_behind(kmh(40)), 0.85, kmh(40), 50.0, 14.0, "double lane change, 40 km/h"
     ),
-    "001.sine": TestDrive("sine", steered_behind(kmh(70)), 0.50, kmh(70), 50.0, about="sine steering, 70 km/h"),
-    "001.slalom": TestDrive("slalom", steered_behind(kmh(30)), 0.30, kmh(30), 50.0, about="slalom, 30 km/h"),
-    "001.gaining.dlc": TestDrive("gaining-lane-changes", LIGHT, 0.90, rate_hz=50.0, about="lane changes, 4 to 40 km/h"),
-    "001.gaining.slalom": TestDrive("gaining-slalom", LIGHT, 0.90, rate_hz=50.0, about="slalom, 5 to 30 km/h"),
-    "002.sine": TestDrive("accelerating-sine", SMALL, 0.70, 20.0, about="sine steering, 20 to 25 m/s"),
-    "002.jturn": TestDrive("j-turn", SMALL, 1.00, 15.0, about="J-turn, 15 m/s"),
-    "002.serpentine": TestDrive("slalom", SMALL, 0.85, about="serpentine of the road test, speed not given"),
-    "003.accel": TestDrive("firm-acceleration", STRONG, 0.85, about="acceleration of .6 g"),
-    "003.turn": TestDrive("low-turn", SEDAN, 0.35, about="turn on snow, 40 km/h"),
-    "003.split": TestDrive("firm-acceleration", STRONG, split(0.30, 0.85), about="acceleration on split friction"),
-    "003.straight.split": TestDrive(
+    "001.sine": DriveSpec("sine", steered_behind(kmh(70)), 0.50, kmh(70), 50.0, about="sine steering, 70 km/h"),
+    "001.slalom": DriveSpec("slalom", steered_behind(kmh(30)), 0.30, kmh(30), 50.0, about="slalom, 30 km/h"),
+    "001.gaining.dlc": DriveSpec("gaining-lane-changes", LIGHT, 0.90, rate_hz=50.0, about="lane changes, 4 to 40 km/h"),
+    "001.gaining.slalom": DriveSpec("gaining-slalom", LIGHT, 0.90, rate_hz=50.0, about="slalom, 5 to 30 km/h"),
+    "002.sine": DriveSpec("accelerating-sine", SMALL, 0.70, 20.0, about="sine steering, 20 to 25 m/s"),
+    "002.jturn": DriveSpec("j-turn", SMALL, 1.00, 15.0, about="J-turn, 15 m/s"),
+    "002.serpentine": DriveSpec("slalom", SMALL, 0.85, about="serpentine of the road test, speed not given"),
+    "003.accel": DriveSpec("firm-acceleration", STRONG, 0.85, about="acceleration of .6 g"),
+    "003.turn": DriveSpec("low-turn", SEDAN, 0.35, about="turn on snow, 40 km/h"),
+    "003.split": DriveSpec("firm-acceleration", STRONG, split(0.30, 0.85), about="acceleration on split friction"),
+    "003.straight.split": DriveSpec(
         "straight", SEDAN, split(0.30, 0.85), kmh(40), duration_s=10.0, about="split friction, constant speed"
     ),
-    "003.straight.low": TestDrive("straight", SEDAN, 0.30, kmh(40), duration_s=10.0, about="snow, constant speed"),
-    "003.jump": TestDrive("brisk-acceleration", STRONG, jump(0.85, 0.50, 30.0), about="acceleration, .85 to .5"),
+    "003.straight.low": DriveSpec("straight", SEDAN, 0.30, kmh(40), duration_s=10.0, about="snow, constant speed"),
+    "003.jump": DriveSpec("brisk-acceleration", STRONG, jump(0.85, 0.50, 30.0), about="acceleration, .85 to .5"),
 }
 
 OTHERS: Final = {
-    "default.dlc": TestDrive("double-lane-change", SEDAN, 0.85, kmh(80), about="as 004, realistic"),
-    "default.jump.accel": TestDrive("brisk-acceleration", STRONG, jump(0.85, 0.50, 30.0), about=".85 to .5 at .45 g"),
-    "default.jump.brake": TestDrive("moderate-braking", SEDAN, jump(0.85, 0.30, 60.0), about=".85 to .3 at .28 g"),
-    "default.steady": TestDrive("pulses", SEDAN, 0.60, duration_s=90.0, about="town traffic, one road"),
-    "default.straight": TestDrive("straight", SEDAN, 0.85, kmh(60), duration_s=20.0, about="19 s at constant speed"),
-    "default.abs.dry": TestDrive("braking", SEDAN, 0.85, about="anti-lock stop, dry"),
-    "default.abs.snow": TestDrive("braking", SEDAN, 0.30, about="anti-lock stop, snow"),
-    "default.spin": TestDrive("firm-acceleration", LOOSE, 0.35, about="spinning wheels on snow"),
+    "default.dlc": DriveSpec("double-lane-change", SEDAN, 0.85, kmh(80), about="as 004, realistic"),
+    "default.jump.accel": DriveSpec("brisk-acceleration", STRONG, jump(0.85, 0.50, 30.0), about=".85 to .5 at .45 g"),
+    "default.jump.brake": DriveSpec("moderate-braking", SEDAN, jump(0.85, 0.30, 60.0), about=".85 to .3 at .28 g"),
+    "default.steady": DriveSpec("pulses", SEDAN, 0.60, duration_s=90.0, about="town traffic, one road"),
+    "default.straight": DriveSpec("straight", SEDAN, 0.85, kmh(60), duration_s=20.0, about="19 s at constant speed"),
+    "default.abs.dry": DriveSpec("braking", SEDAN, 0.85, about="anti-lock stop, dry"),
+    "default.abs.snow": DriveSpec("braking", SEDAN, 0.30, about="anti-lock stop, snow"),
+    "default.spin": DriveSpec("firm-acceleration", LOOSE, 0.35, about="spinning wheels on snow"),
 }
 
 # the default on other vehicles: shown, without bars
 VEHICLES: Final = {
-    f"default.{name}.{drive}": TestDrive(manoeuvre, vehicle, friction, about=f"{about}, {name}")
+    f"default.{name}.{drive}": DriveSpec(manoeuvre, vehicle, friction, about=f"{about}, {name}")
     for name, vehicle in (("hatchback", HATCHBACK), ("van", VAN), ("loaded", LOADED))
     for drive, manoeuvre, friction, about in (
         ("abs", "braking", 0.80, "anti-lock stop"),
@@ -115,6 +115,6 @@ FOREIGN: Final = {
 }
 
 
-def foreign(scenario: TestDrive, kind: str) -> TestDrive:
+def foreign(scenario: DriveSpec, kind: str) -> DriveSpec:
     """The scenario with tyres of a kind of FOREIGN."""
     return replace(scenario, vehicle=replace(scenario.vehicle, **FOREIGN[kind]))  # type: ignore[arg-type]

@@ -80,7 +80,7 @@ def simulate_manoeuvre(
     _check(speed=speed, rate_hz=rate_hz, duration_s=duration_s)
     speed = manoeuvre.speed if speed is None else speed
     duration = manoeuvre.duration if duration_s is None else duration_s
-    world = TestTrack(_friction(manoeuvre.friction if mu is None else mu), road_named(road, seed, slope).table)
+    world = ProvingGround(_friction(manoeuvre.friction if mu is None else mu), road_named(road, seed, slope).table)
     records = _drive(manoeuvre, truth, world, speed, rate_hz, max(1, round(duration * rate_hz)))
     signals = _sensed(records, chosen, origin, seed, rate_hz)
     t = np.arange(len(records)) / rate_hz
@@ -109,7 +109,7 @@ def _friction(mu: Friction) -> Callable[[float, float], float]:
     return lambda _x, _y: mu
 
 
-class TestTrack(NamedTuple):
+class ProvingGround(NamedTuple):
     """The test track: friction at (x, y) [m], and the table of its relief."""
 
     friction: Callable[[float, float], float]
@@ -117,7 +117,7 @@ class TestTrack(NamedTuple):
 
 
 def _drive(
-    manoeuvre: Manoeuvre, truth: TrueVehicle, world: TestTrack, speed: float, rate_hz: float, samples: int
+    manoeuvre: Manoeuvre, truth: TrueVehicle, world: ProvingGround, speed: float, rate_hz: float, samples: int
 ) -> FloatArray:
     """True records (T, 32) of the drive; the driver gives as much more gas as a slope takes."""
     p, x, u, w = truth.row(), np.zeros(STATES), np.zeros((len(Control), 4)), np.zeros((len(Wheel), 4))

@@ -14,7 +14,7 @@ from edge_agent.estimators import ESTIMATORS, Estimates
 from edge_agent.estimators.estimates import ONE_FRICTION, Column
 from edge_agent.lab.evaluation import measures
 from edge_agent.lab.evaluation.bars import BARS, figures
-from edge_agent.lab.evaluation.batch import DriveSet, TestDrive, ideal, realistic, repeated
+from edge_agent.lab.evaluation.batch import DriveSet, DriveSpec, ideal, realistic, repeated
 from edge_agent.lab.evaluation.campaign import DEFAULT, Results
 from edge_agent.lab.evaluation.faults import CASES
 from edge_agent.lab.evaluation.paper_004 import noisy, variances
@@ -133,7 +133,7 @@ def test_the_noise_of_paper_004_is_on_three_signals_and_follows_its_schedule() -
 
 @pytest.mark.parametrize("kind", FOREIGN)
 def test_foreign_tyres_make_another_drive(kind: str) -> None:
-    usual = TestDrive("j-turn", SEDAN, 0.4, duration_s=2.0)
+    usual = DriveSpec("j-turn", SEDAN, 0.4, duration_s=2.0)
     own, other = ideal(usual), ideal(foreign(usual, kind))
     assert np.abs(own.truth["true_vy"] - other.truth["true_vy"]).max() > 1e-3
 
