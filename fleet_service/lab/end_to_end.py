@@ -151,7 +151,7 @@ def observations_in(columns: dict[str, Any]) -> Observations:
     with_likelihood = np.full(n, columns["log_likelihood"].shape[1] > 0)
     identity = {
         "boot": columns["vehicle"] + 1, "region": grid.region_of(columns["cell"]), "seq": np.arange(1, n + 1),
-        "row": np.zeros(n, np.int32), "with_likelihood": told,
+        "row": np.zeros(n, np.int32), "with_likelihood": with_likelihood,
     }  # fmt: skip
     return observations_of(columns | identity, columns["vehicle"])
 
