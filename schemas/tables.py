@@ -112,7 +112,7 @@ WEATHER: Final = (
     Field("precipitation", F32, "mm/h", "as water; NaN where unknown"),
     Field("prior", pa.list_(F32), "-", "probabilities of the 32 bins of the friction grid; null where there is none"),
     Field("received_at", NS, "ns since 1970, UTC", "clock of the service"),
-    Field("acts_from", NS, "ns since 1970, UTC", "from when the map used it: nothing younger had been folded"),
+    Field("acts_from", NS, "ns since 1970, UTC", "from when the map used it: nothing younger had been fused"),
 )
 
 MAP_CELL: Final = (

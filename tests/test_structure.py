@@ -63,16 +63,13 @@ PURE = (
     "edge_agent/inputs/block.py",
     "fleet_service/fusion",
     "fleet_service/ingest/dedup.py",
-    "fleet_service/serve/alerts.py",
+    *(f"fleet_service/serve/{name}.py" for name in ("alerts", "map_state", "neighbour_fill", "view")),
 )
 # Beside it, what turns one thing in memory into another: tables and messages too, but no input or output either.
 SANS_IO = (
     "edge_agent/publish/batching.py",
     *(f"fleet_service/ingest/{name}.py" for name in ("acks", "validation")),
-    *(
-        f"fleet_service/serve/{name}.py"
-        for name in ("encode", "map_state", "neighbour_fill", "query", "tile_cache", "view")
-    ),
+    *(f"fleet_service/serve/{name}.py" for name in ("encode", "query", "tile_cache")),
 )
 IMPURE = {
     "asyncio", "datetime", "duckdb", "http", "logging", "multiprocessing", "os", "pathlib", "pyarrow", "random",

@@ -277,7 +277,7 @@ class Engine:
         try:
             past.update_weather(archived(self._root, received_until=at))
             for _ in replay(self._root, past, Since(until=at, box=_box(query))):
-                pass  # folding is what counts; the alerts of then are history
+                pass  # the map is what counts; the alerts of then are history
         except OSError as error:
             raise InputError("at", f"the archive cannot be read ({error.strerror})", "ask again later") from error
         return answer(TileCache(MapState(past), nullcontext(), least), query, wanted, at, only)

@@ -1,4 +1,4 @@
-"""Visits through the service's own path: rows as the archive has them → `observations` → `Fusion.fold` → alerts.
+"""Visits through the service's own path: rows as the archive has them → `observations_of` → `Fusion.update` → alerts.
 
 Deliveries are as in life: a few rows come late (some beyond the lateness), and some twice; `SequenceTrackers` drops
 the second ones, as in the service.

@@ -52,7 +52,7 @@ def _numbers(pseudonyms: NDArray[np.str_]) -> IntArray:
 
 
 class Since(NamedTuple):
-    """Which rows a replay folds: received after `received` and until `until` [ns], near `box` [deg].
+    """Which rows a replay takes: received after `received` and until `until` [ns], near `box` [deg].
 
     Cells do not depend on each other once weights are known, so that those well inside a box come out as in a whole
     replay.

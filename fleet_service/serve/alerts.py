@@ -8,10 +8,11 @@ from typing import Final
 import numpy as np
 
 from fleet_service.fusion import Fusion
-from fleet_service.fusion.belief import SLIPPERY_SHARE, common_kernel
+from fleet_service.fusion.belief import SLIPPERY_SHARE, common_kernel, quantiles
 from fleet_service.fusion.store.records import GRIP, ICE, SOURCES
-from schemas import grid, mugrid
-from schemas.numeric import BoolArray, FloatArray, IntArray
+from fleet_service.serve.view import LOWER, UPPER
+from schemas import grid
+from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import NS, SLIPPERY_MU
 from schemas.wire import Alert
 
@@ -60,7 +61,7 @@ class Alerts:
         out = []
         for k in np.flatnonzero((slippery > RAISE_ABOVE) & ~standing).tolist():
             slot, when = int(slots[k]), int(time[k])
-            if self._corroborated(slots[k : k + 1], ICE, GRIP, when)[0]:
+            if self._corroborated(slot, ICE, when):
                 self._standing[slot] = self._alert(
                     slot, when, True, f"P(mu < {SLIPPERY_MU}) = {slippery[k]:.2f} > {RAISE_ABOVE}"
                 )
@@ -69,7 +70,7 @@ class Alerts:
         return out + [
             self._clear(int(slots[k]), int(time[k]), "later visits found grip")
             for k in gripping
-            if self._corroborated(slots[k : k + 1], GRIP, ICE, int(time[k]))[0]
+            if self._corroborated(int(slots[k]), GRIP, int(time[k]))
         ]
 
     def _slippery(self, slots: IntArray) -> FloatArray:
@@ -77,15 +78,15 @@ class Alerts:
         slippery, whole = (self._fusion.live.belief[slots].astype(np.float64) @ _SLIPPERY_AND_WHOLE).T
         return np.asarray(slippery / whole)
 
-    def _corroborated(self, slots: IntArray, side: int, other: int, time: int) -> BoolArray:
+    def _corroborated(self, slot: int, side: int, time: int) -> bool:
         """Whether one side has enough corroborating sources: as many as the other within the hour, within limits.
 
         Grip must have been found after the last ice.
         """
-        hour = time - SOURCE_NS
-        against, last = self._fusion.sources(slots, other, hour)
+        slots, hour = np.array([slot]), time - SOURCE_NS
+        against, last = self._fusion.sources(slots, GRIP if side == ICE else ICE, hour)
         found, _ = self._fusion.sources(slots, side, np.maximum(last, hour) if side == GRIP else hour)
-        return found >= np.clip(against, LEAST_SOURCES, SOURCES)
+        return bool(found[0] >= np.clip(against[0], LEAST_SOURCES, SOURCES))
 
     def faded(self, now: int) -> list[Alert]:
         """Alerts that time alone cleared until `now` [ns]: less likely than not, and no source within the hour."""
@@ -102,10 +103,11 @@ class Alerts:
     def _alert(self, slot: int, time: int, raised: bool, reason: str) -> Alert:
         fusion = self._fusion
         cell, sector = divmod(int(fusion.live.key[slot]), grid.SECTORS)
-        belief = fusion.beliefs(np.array([slot]), time)[0]
+        belief = fusion.beliefs(np.array([slot]), time)
         latitude, longitude = grid.centre(cell)
-        mu, lower, upper = (float(mugrid.quantiles(belief, q)) for q in (0.5, 0.05, 0.95))
+        lower, mu, upper = quantiles(belief, (LOWER, 0.5, UPPER))[:, 0].tolist()
         return Alert(
-            cell, sector, raised, time, mu, lower, upper, float(belief @ SLIPPERY_SHARE),
-            int(fusion.live.vehicles[slot]), float(latitude), float(longitude), reason,
+            cell=cell, sector=sector, raised=raised, time=time, mu=mu, mu_lower=lower, mu_upper=upper,
+            p_slippery=float(belief[0] @ SLIPPERY_SHARE), vehicles=int(fusion.live.vehicles[slot]),
+            latitude=float(latitude), longitude=float(longitude), reason=reason,
         )  # fmt: skip

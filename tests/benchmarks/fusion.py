@@ -1,4 +1,4 @@
-"""What the fusion costs per observation: folding, settling and reputation included. Processor time of one thread."""
+"""What the fusion costs per observation: updates, commits and reputation included. Processor time of one thread."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def fusion() -> list[Figure]:
     command = [sys.executable, "-c", RESIDENT]
     megabytes, _ = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
     return [
-        Figure("bench.fusion.per_s", 1.0 / many, "observations/s, settling included", 1_000_000, "more"),
+        Figure("bench.fusion.per_s", 1.0 / many, "observations/s, commits included", 1_000_000, "more"),
         Figure("bench.fusion.table_vs_dict", table_vs_dict(), "times the look-up of a typed dictionary", 1.5, "more"),
         Figure("bench.growth.cells_ratio", many / few, "cost in 10^6 cells over that in 10^4", 1.3),
         Figure("bench.state.resident_mb", float(megabytes), "MB, a service's process with 10^6 cells", 400),
