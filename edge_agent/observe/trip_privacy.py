@@ -31,7 +31,7 @@ class TripEnds:
         self._times: list[IntArray] = []
         self._odometers: list[FloatArray] = []
         self._began: IntArray | None = None
-        self._held: dict[Kind, RecordBlock] = {}
+        self._waiting: dict[Kind, RecordBlock] = {}
 
     @property
     def _off(self) -> bool:
@@ -56,19 +56,19 @@ class TripEnds:
         """Those of the records, and of the earlier ones that waited, that may be published now."""
         if self._off or self._began is None:
             return records
-        held = self._held.get(records.kind)
-        both = records if held is None else _joined(held, records)
+        waiting = self._waiting.get(records.kind)
+        both = records if waiting is None else _joined(waiting, records)
         time: IntArray = both.columns[_TIME[records.kind]]
-        there = self._odometer(time, both.vehicle)
+        driven = self._odometer(time, both.vehicle)
         now = self._times[-1][-1][both.vehicle]
-        begun = (there >= self._metres) & (time - self._began[both.vehicle] >= self._ns)
-        gone = (self._driven[both.vehicle] - there >= self._metres) & (now - time >= self._ns)
-        self._held[records.kind] = _taken(both, begun & ~gone)
-        return _taken(both, begun & gone)
+        begun = (driven >= self._metres) & (time - self._began[both.vehicle] >= self._ns)
+        passed = (self._driven[both.vehicle] - driven >= self._metres) & (now - time >= self._ns)
+        self._waiting[records.kind] = _selected(both, begun & ~passed)
+        return _selected(both, begun & passed)
 
     def _forget(self) -> None:
         """Drop the way before the oldest record that waits."""
-        waiting = [r.columns[_TIME[kind]].min() for kind, r in self._held.items() if len(r.vehicle)]
+        waiting = [r.columns[_TIME[kind]].min() for kind, r in self._waiting.items() if len(r.vehicle)]
         oldest = min(waiting, default=self._times[-1].min())
         while len(self._times) > 2 and self._times[1].max() <= oldest:
             del self._times[0], self._odometers[0]
@@ -84,7 +84,7 @@ class TripEnds:
         return out
 
 
-def _taken(records: RecordBlock, rows: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> RecordBlock:
+def _selected(records: RecordBlock, rows: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> RecordBlock:
     columns = {name: column[rows] for name, column in records.columns.items()}
     return RecordBlock(records.kind, columns, records.vehicle[rows], records.urgent[rows])
 

@@ -28,7 +28,7 @@ from fleet_service.fusion import Fusion, observations_of
 from fleet_service.fusion.weather import Reports
 from fleet_service.ingest.acks import Acks
 from fleet_service.ingest.dedup import BatchId, SequenceTrackers
-from fleet_service.ingest.inbox import Admitted, Intake, Message
+from fleet_service.ingest.inbox import AcceptedBatches, BatchIntake, Message
 from fleet_service.ingest.validation import Clock
 from fleet_service.ingest.weather import WeatherInbox, archived
 from fleet_service.replay import checkpoints
@@ -89,7 +89,7 @@ class Engine:
         self._tiles = TileCache(self.map, self._guard, config.public_vehicles)
         self._acks = Acks()
         streams = SequenceTrackers()
-        self._intake = Intake(streams, Pseudonyms(root / "keys"), self.counts, self._acks)
+        self._intake = BatchIntake(streams, Pseudonyms(root / "keys"), self.counts, self._acks)
         self._log: SegmentLog[BatchId] = SegmentLog(root, config.name)
         self.weather = WeatherInbox(root, config.name, self.fusion, self.counts)
         self._last_received = since or 0  # when the last report of any kind came [ns]
@@ -169,15 +169,15 @@ class Engine:
         clock = Clock(now, int(self._config.clock_ahead_s * NS) + slack, int(self._config.oldest_s * NS))
         out: list[Alert] = []
         self._last_received = max(self._last_received, now)
-        for kind, admitted in self._intake.admit(messages, clock).items():
+        for kind, accepted in self._intake.accept(messages, clock).items():
             if kind is Kind.OBSERVATION:
-                out += self._fuse(admitted)
-            self.counts[kind] += len(admitted.rows["row"])
-            self._log.add(kind, admitted.rows, admitted.batches)
+                out += self._fuse(accepted)
+            self.counts[kind] += len(accepted.rows["row"])
+            self._log.add(kind, accepted.rows, accepted.batches)
         return out
 
-    def _fuse(self, admitted: Admitted) -> list[Alert]:
-        rows = admitted.rows
+    def _fuse(self, accepted: AcceptedBatches) -> list[Alert]:
+        rows = accepted.rows
         self.report_lag_s = float((rows["received_at"] - rows["leave_time"]).min()) * 1e-9
         with self._guard:
             updated = self.fusion.update(observations_of(rows, rows["vehicle_number"]))

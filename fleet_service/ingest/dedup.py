@@ -1,7 +1,7 @@
-"""Which batches were admitted: a watermark and the seqs above it, per (vehicle, boot, kind, region). Pure.
+"""Which batches were accepted: a watermark and the seqs above it, per (vehicle, boot, kind, region). Pure.
 
-Bounded by what was admitted: every seq above a watermark is a batch in the archive, there are at most MAX_GAPS of them,
-and a stream whose newest record is older than the service lets in is forgotten.
+Bounded by what was accepted: every seq above a watermark is a batch in the archive, there are at most MAX_GAPS of them,
+and a stream whose newest record is older than the service accepts is forgotten.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ StreamKey = tuple[int, int, Kind, int]  # number of the vehicle's pseudonym, boo
 
 
 class SequenceTracker:
-    """Which batches of one stream were admitted.
+    """Which batches of one stream were accepted.
 
     Attributes:
         key: its name.
         vehicle: enrolled name of the sender; empty until it is heard.
         low: every seq up to here is settled, or will never come.
-        seen: the admitted ones above.
-        newest: time of the newest admitted batch's first record [ns].
+        seen: the accepted ones above.
+        newest: time of the newest accepted batch's first record [ns].
     """
 
     __slots__ = ("key", "low", "newest", "seen", "vehicle")
@@ -38,11 +38,11 @@ class SequenceTracker:
         self.low, self.newest = 0, 0
         self.seen: set[int] | frozenset[int] = _NONE
 
-    def admitted(self, seq: int) -> bool:
-        """Whether this seq was admitted before."""
+    def accepted(self, seq: int) -> bool:
+        """Whether this seq was accepted before."""
         return seq <= self.low or seq in self.seen
 
-    def admit(self, seq: int, time: int = 0) -> bool:
+    def accept(self, seq: int, time: int = 0) -> bool:
         """Note a seq and the time of its first record [ns]; False if too many are missing before it (not noted)."""
         if seq == self.low + 1:
             self.low = seq
@@ -118,4 +118,4 @@ class SequenceTrackers:
             stream.raise_to(int(first_held[start:stop].max()))
             newest = int(time[start:stop].max())
             for one in np.unique(seq[start:stop]).tolist():
-                stream.admit(one, newest)
+                stream.accept(one, newest)

@@ -1,4 +1,4 @@
-"""Messages in: a bounded queue behind the Zenoh subscribers, and the way from bytes to admitted rows.
+"""Messages in: a bounded queue behind the Zenoh subscribers, and the way from bytes to accepted rows.
 
 The subscriber's callback only copies bytes into the queue. When the queue is full the message is dropped and counted;
 it is not acknowledged, so that its sender keeps it and sends it again: that is the back-pressure.
@@ -31,11 +31,11 @@ from schemas.wire import Kind
 from schemas.wire.batches import Decoded, Head, Heads
 
 FIRST_TIME: Final = {Kind.OBSERVATION: "enter_time", Kind.STATE: "time"}  # by which a batch is too old
-# Of a turn of the worker, so that a flood does not delay alerts, answers and segments by more than a moment. Most of
+# Of a step of the worker, so that a flood does not delay alerts, answers and segments by more than a moment. Most of
 # the work is by the record, of which 160 bytes are one.
-TURN_MESSAGES: Final = 4096
-TURN_BYTES: Final = 768 * 1024
-# A turn costs as much as a hundred records even if it brings one. So what comes within a moment of the first message is
+STEP_MESSAGES: Final = 4096
+STEP_BYTES: Final = 768 * 1024
+# A step costs as much as a hundred records even if it brings one. So what comes within a moment of the first message is
 # taken with it, unless enough waits already: at 2 000 messages a second that is a fifth of the processor time, and the
 # interpreter is free for answers.
 GATHER_S: Final = 0.01
@@ -84,7 +84,7 @@ class Inbox:
             self._counts["overload"] += 1
 
     def drain(self, wait_s: float) -> list[Message]:
-        """What is there, as much as a turn takes; waits up to `wait_s` for the first, and then a moment for more."""
+        """What is there, as much as a step takes; waits up to `wait_s` for the first, and then a moment for more."""
         out: list[Message] = []
         size = 0
         try:
@@ -92,7 +92,7 @@ class Inbox:
                 out.append(self._queue.get(timeout=wait_s))
                 if self._queue.qsize() < GATHERED:
                     sleep(GATHER_S)
-            while len(out) < TURN_MESSAGES and size < TURN_BYTES:
+            while len(out) < STEP_MESSAGES and size < STEP_BYTES:
                 out.append(self._queue.get_nowait())
                 size += len(out[-1].payload)
         except queue.Empty:
@@ -103,18 +103,18 @@ class Inbox:
         return self._queue.qsize()
 
 
-class Admitted(NamedTuple):
-    """Batches of one kind that were let in, and their rows as the archive wants them (without `late` and `weight`)."""
+class AcceptedBatches(NamedTuple):
+    """Accepted batches of one kind, and their rows as the archive wants them (without `late` and `weight`)."""
 
     batches: list[BatchId]
     rows: Rows
 
 
-class Intake:
-    """Decodes, asks the questions of `admit`, counts and settles refusals. Python is touched per message, not per row.
+class BatchIntake:
+    """Decodes, validates, counts and settles refusals. Python is touched per message, not per row.
 
     Args:
-        streams: what was admitted before; is brought up to date.
+        streams: what was accepted before; is brought up to date.
         pseudonyms: of the vehicles.
         counts: refusals by rule, under `refused.RULE`, and duplicates.
         acks: takes the refusals and what is durable already.
@@ -122,11 +122,11 @@ class Intake:
 
     def __init__(self, streams: SequenceTrackers, pseudonyms: Pseudonyms, counts: Counter[str], acks: Acks) -> None:
         self._streams, self._pseudonyms, self._counts, self._acks = streams, pseudonyms, counts, acks
-        self._pending: set[BatchId] = set()  # admitted, not yet on disk
+        self._pending: set[BatchId] = set()  # accepted, not yet on disk
         self._known: dict[Kind, dict[tuple[str, int, int, int], SequenceTracker]] = {kind: {} for kind in Kind}
         self._forgot = 0
 
-    def admit(self, messages: Sequence[Message], clock: Clock) -> dict[Kind, Admitted]:
+    def accept(self, messages: Sequence[Message], clock: Clock) -> dict[Kind, AcceptedBatches]:
         """Rows of the good and new batches, by kind."""
         if clock.now - self._forgot > FORGET_NS:
             self._forgot = clock.now
@@ -136,8 +136,8 @@ class Intake:
         out = {}
         for kind in Kind:
             ours = [m for m in messages if m.kind is kind]
-            if ours and (admitted := self._admit(kind, ours, clock)).batches:
-                out[kind] = admitted
+            if ours and (accepted := self._accept(kind, ours, clock)).batches:
+                out[kind] = accepted
         return out
 
     def settled(self, batches: Sequence[BatchId]) -> None:
@@ -145,7 +145,7 @@ class Intake:
         self._pending.difference_update(batches)
         self._acks.durable(batches)
 
-    def _admit(self, kind: Kind, messages: list[Message], clock: Clock) -> Admitted:
+    def _accept(self, kind: Kind, messages: list[Message], clock: Clock) -> AcceptedBatches:
         found_owners = [validation.owner_of(message.key) for message in messages]
         if None in found_owners:
             self._count("key", found_owners.count(None))
@@ -160,10 +160,10 @@ class Intake:
         for place in np.flatnonzero(broken >= 0).tolist():
             self._refuse(str(owners[place].who), found.heads.at(place), rules[broken[place]])
         new = self._new(kind, found.heads, time, broken < 0)
-        return self._rows(kind, new, time, found, clock) if new else Admitted([], {})
+        return self._rows(kind, new, time, found, clock) if new else AcceptedBatches([], {})
 
     def _new(self, kind: Kind, heads: Heads, time: IntArray, good: BoolArray) -> dict[BatchId, int]:
-        """Those of the good batches that were not admitted before, each once, and their places."""
+        """Those of the good batches that were not accepted before, each once, and their places."""
         out: dict[BatchId, int] = {}
         numbers = (heads.boot, heads.region, time // DAY_NS, heads.seq, heads.first_held)
         batches = zip(range(len(good)), heads.vehicle, *(column.tolist() for column in numbers), strict=True)
@@ -175,7 +175,7 @@ class Intake:
                 continue
             stream.raise_to(first_held)
             batch = stream, seq
-            if stream.admitted(seq):
+            if stream.accepted(seq):
                 again += 1
                 if batch not in pending:
                     self._acks.durable([batch])
@@ -200,7 +200,9 @@ class Intake:
         stream.vehicle = vehicle
         return stream
 
-    def _rows(self, kind: Kind, new: dict[BatchId, int], time: IntArray, found: Decoded, clock: Clock) -> Admitted:
+    def _rows(
+        self, kind: Kind, new: dict[BatchId, int], time: IntArray, found: Decoded, clock: Clock
+    ) -> AcceptedBatches:
         batches, (rows, heads, sizes) = list(new), _chosen(found, list(new.values()))
         rows["region"] = np.repeat(heads.region, sizes)
         broken, rules = validation.check_rows(kind, rows, rows["region"], clock)
@@ -217,14 +219,14 @@ class Intake:
         first = time[list(new.values())].tolist()
         for place, at in compress(enumerate(first), good.tolist()):
             stream, seq = batches[place]
-            if not stream.admit(seq, at):  # no room to remember it: older ones must come first, it is no rejection
+            if not stream.accept(seq, at):  # no room to remember it: older ones must come first, it is no rejection
                 self._counts["too_many_gaps"] += 1
                 good[place] = False
         if not good.all():
             rows = {name: column[good[owner]] for name, column in rows.items()}
             batches, heads, sizes = list(compress(batches, good)), heads.take(good), sizes[good]
         self._pending.update(batches)
-        return Admitted(batches, _named(kind, batches, heads, rows, sizes, clock))
+        return AcceptedBatches(batches, _named(kind, batches, heads, rows, sizes, clock))
 
     def _refuse(self, vehicle: str, head: Head, refusal: Refusal) -> None:
         if refusal.rule != "vehicle":  # else the name in the batch is not the sender's, and nor is the stream

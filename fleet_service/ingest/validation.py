@@ -1,8 +1,8 @@
-"""Who and what is let in. Pure: the time and the batches are arguments.
+"""Who and what is accepted. Pure: the time and the batches are arguments.
 
 Three questions, in this order, the cheap ones first:
-    identity   is the key the sender's own, and does the batch say the same place and name?      per message
-    novelty    was this (vehicle, boot, kind, region, seq) admitted before?                      per message
+    identity   is the key the sender's own, and has the batch the same place and name?           per message
+    novelty    was this (vehicle, boot, kind, region, seq) accepted before?                      per message
     rows       is every value finite, in range, at its place and in its time?                    all rows at once
 
 A batch with one bad row is refused whole, with row and reason; the refusal settles it. Rules are tables: the reason
@@ -80,13 +80,13 @@ def check_heads(
         (k,) index of the first broken rule into the second value, -1 for a good one; and the rules.
     """
     topic, held = _TOPIC[kind], heads.first_held
-    strange = [o.who != name or o.topic.name != topic for o, name in zip(owners, heads.vehicle, strict=True)]
-    elsewhere = np.array([owner.place for owner in owners], np.int64) != heads.region
-    nameless = {name for name in set(heads.estimator) if name and not _is_estimator(name)}
-    unnamed = [name in nameless for name in heads.estimator] if nameless else np.zeros(len(owners), bool)
+    wrong_owner = [o.who != name or o.topic.name != topic for o, name in zip(owners, heads.vehicle, strict=True)]
+    wrong_region = np.array([owner.place for owner in owners], np.int64) != heads.region
+    bad_names = {name for name in set(heads.estimator) if name and not _is_estimator(name)}
+    bad_name = [name in bad_names for name in heads.estimator] if bad_names else np.zeros(len(owners), bool)
     broken = (
-        np.array(strange, bool), elsewhere, (heads.boot < 0) | (held < 1) | (held > heads.seq),
-        np.array(unnamed, bool), _untimely(time, time, clock),
+        np.array(wrong_owner, bool), wrong_region, (heads.boot < 0) | (held < 1) | (held > heads.seq),
+        np.array(bad_name, bool), _untimely(time, time, clock),
     )  # fmt: skip
     return _first(broken), _HEAD_RULES
 
@@ -162,10 +162,10 @@ def _cell_of(columns: Columns) -> IntArray:
 def _broken_observation(columns: Columns, clock: Clock) -> list[tuple[NDArray[np.bool_], str, str]]:
     enter, leave, cell = columns["enter_time"], columns["leave_time"], columns["cell"]
     at = _cell_of(columns)
-    elsewhere = at != cell
-    beside = np.flatnonzero(elsewhere)
+    wrong_cell = at != cell
+    beside = np.flatnonzero(wrong_cell)
     if len(beside):
-        elsewhere[beside] = ~(grid.neighbours(at[beside]) == cell[beside, None]).any(axis=1)
+        wrong_cell[beside] = ~(grid.neighbours(at[beside]) == cell[beside, None]).any(axis=1)
     with np.errstate(invalid="ignore"):  # an infinite yaw is out of range anyway
         turned = np.cos(columns["yaw"] - columns["sector"] * (np.pi / 2)) < np.cos(YAW_TOLERANCE)
     mu, lower, upper = columns["mu"], columns["mu_lower"], columns["mu_upper"]
@@ -173,7 +173,7 @@ def _broken_observation(columns: Columns, clock: Clock) -> list[tuple[NDArray[np
     return [
         (_untimely(enter, leave, clock), "time", "leave_time: too old or in the future; set the clock"),
         ((leave < enter) | (leave - enter > MAX_VISIT_NS), "time", "leave_time: before or long after enter_time; mend"),
-        (elsewhere, "cell", "cell: is not at the pose; use the z21 quadint of latitude and longitude"),
+        (wrong_cell, "cell", "cell: is not at the pose; use the z21 quadint of latitude and longitude"),
         (turned, "sector", "sector: is not the yaw's; 0 east, 1 north, 2 west, 3 south"),
         (no_peak, "log_likelihood", "log_likelihood: has no maximum; give steps below it, so that it reads 0"),
         ((lower > mu) | (mu > upper) | (lower > upper), "mu", "mu: not mu_lower <= mu <= mu_upper; correct it"),

@@ -64,8 +64,8 @@ def novel(rows: dict[str, Any], vehicle: IntArray, which: IntArray) -> IntArray:
     region, boot, seq = rows["region"].tolist(), rows["boot"].tolist(), rows["seq"].tolist()
     for k, row in enumerate(which.tolist()):
         stream = streams[int(vehicle[row]), boot[row], Kind.OBSERVATION, region[row]]
-        if not stream.admitted(seq[row]):
-            stream.admit(seq[row])
+        if not stream.accepted(seq[row]):
+            stream.accept(seq[row])
             kept.append(k)
     return np.array(kept, np.int64)
 

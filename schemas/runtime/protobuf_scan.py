@@ -197,13 +197,13 @@ def _field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) -> int:
 
 
 @refcount_free
-def _copy(data: ByteArray, begins: IntArray, lengths: IntArray, rooms: IntArray, into: ByteArray) -> None:
+def _copy(data: ByteArray, begins: IntArray, lengths: IntArray, lengths_out: IntArray, into: ByteArray) -> None:
     to = 0
     for k in range(len(begins)):
-        sent, room = data[begins[k] : begins[k] + lengths[k]], into[to : to + lengths[k]]
-        for place in range(len(room)):  # of slices, so that many bytes are copied at once
-            room[place] = sent[place]
-        to += rooms[k]
+        sent, written = data[begins[k] : begins[k] + lengths[k]], into[to : to + lengths[k]]
+        for place in range(len(written)):  # of slices, so that many bytes are copied at once
+            written[place] = sent[place]
+        to += lengths_out[k]
 
 
 @refcount_free

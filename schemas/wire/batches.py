@@ -179,8 +179,8 @@ def complete(found: Decoded, sent: PresentColumns) -> Decoded:
             refuse(outside, WireError(name, f"does not fit {dtype}", "use the values that the .proto names"))
             columns[name] = np.where(outside, 0, columns[name]).astype(dtype)
     placed = sent.records("cell") if kind is Kind.OBSERVATION else np.zeros(len(owner), bool)
-    homeless = np.repeat(found.heads.region == 0, found.sizes)
-    needs_place = ~placed & (homeless | (kind is Kind.OBSERVATION))
+    region_missing = np.repeat(found.heads.region == 0, found.sizes)
+    needs_place = ~placed & (region_missing | (kind is Kind.OBSERVATION))
     for name in ("latitude", "longitude"):
         nowhere = ~(np.abs(columns[name]) <= 180.0) & needs_place
         refuse(nowhere, WireError(name, "is not a position", "send finite degrees"))
@@ -207,24 +207,24 @@ def _derive(columns: Columns, sent: PresentColumns, unplaced: BoolArray) -> None
         at = np.flatnonzero(unplaced)
         columns["cell"] = columns["cell"].copy()
         columns["cell"][at] = grid.cell_of(columns["latitude"][at], columns["longitude"][at])
-    unsaid = ~sent.columns["sector"]
-    if unsaid.any():
+    sector_missing = ~sent.columns["sector"]
+    if sector_missing.any():
         starts = np.cumsum(sent.sizes) - sent.sizes
-        headed = np.logical_and.reduceat(np.isfinite(columns["yaw"]), starts)
-        rows = np.repeat(unsaid & headed, sent.sizes)
+        with_yaw = np.logical_and.reduceat(np.isfinite(columns["yaw"]), starts)
+        rows = np.repeat(sector_missing & with_yaw, sent.sizes)
         columns["sector"][rows] = grid.sector_of(columns["yaw"][rows])
 
 
 def _with_regions(found: Decoded, columns: Columns) -> Heads:
     """Heads, with the region of the first record where the sender did not name it."""
-    heads, homeless = found.heads, found.heads.region == 0
-    if not homeless.any():
+    heads, region_missing = found.heads, found.heads.region == 0
+    if not region_missing.any():
         return heads
-    rows = (np.cumsum(found.sizes) - found.sizes)[homeless]
+    rows = (np.cumsum(found.sizes) - found.sizes)[region_missing]
     if "cell" in columns:
         cell = columns["cell"][rows]
     else:
         cell = grid.cell_of(*(np.nan_to_num(columns[name][rows]) for name in ("latitude", "longitude")))
     region = heads.region.copy()
-    region[homeless] = grid.region_of(cell)
+    region[region_missing] = grid.region_of(cell)
     return heads._replace(region=region)

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.app.engine import Engine
-from fleet_service.ingest.inbox import TURN_BYTES, TURN_MESSAGES, Message
+from fleet_service.ingest.inbox import STEP_BYTES, STEP_MESSAGES, Message
 from schemas import grid, keys, mugrid, wire
 from schemas.config import ServiceConfig
 from schemas.runtime.batch_decoder import decode_many
@@ -77,7 +77,7 @@ def _decoding_s(sent: list[Message], decode: Callable[[list[Message]], object]) 
 
 def turn_of(sent: list[Message]) -> int:
     """Messages that the service takes at once."""
-    return min(TURN_BYTES // len(sent[0].payload), TURN_MESSAGES)
+    return min(STEP_BYTES // len(sent[0].payload), STEP_MESSAGES)
 
 
 def _bare(sent: list[Message]) -> list[NDArray[Any]]:

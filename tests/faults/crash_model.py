@@ -124,10 +124,10 @@ class History:
     def _let_in(self, log: SegmentLog[Batch], streams: SequenceTrackers, batches: list[Batch]) -> None:
         for kind in Kind:
             stream = streams[VEHICLE, 1, kind, 1]
-            new = [b for b in dict.fromkeys(batches) if b.kind is kind and not stream.admitted(b.seq)]
+            new = [b for b in dict.fromkeys(batches) if b.kind is kind and not stream.accepted(b.seq)]
             if new:
                 for batch in new:
-                    stream.admit(batch.seq)
+                    stream.accept(batch.seq)
                 log.add(kind, rows_of(new), new)
 
     def _problems(self, root: Path, last: bool) -> list[str]:
@@ -147,7 +147,7 @@ class History:
             found += [f"{kind} {seq} is lost" for seq in sorted(owed) for row in range(ROWS) if not rows[seq, row]]
             stream = streams[VEHICLE, 1, kind, 1]
             found += [f"{kind} {b.seq} only counts as held" for b in self.sent
-                      if b.kind is kind and stream.admitted(b.seq) and b.seq not in held]  # fmt: skip
+                      if b.kind is kind and stream.accepted(b.seq) and b.seq not in held]  # fmt: skip
         return found
 
 

@@ -97,7 +97,7 @@ def _lost(root: Path, batches: Sequence[Batch]) -> int:
     restore_streams(root, streams)
     vehicle = number(Pseudonyms(root / "keys").of("sim-001", int(batches[0].columns["enter_time"][0])))
     stream = streams[vehicle, batches[0].boot, Kind.OBSERVATION, batches[0].region]
-    owed = [b for place, b in enumerate(batches) if place < len(batches) - BATCHES or stream.admitted(b.seq)]
+    owed = [b for place, b in enumerate(batches) if place < len(batches) - BATCHES or stream.accepted(b.seq)]
     return len(_expected(owed) - held) + len(held - _expected(batches))
 
 

@@ -17,31 +17,31 @@ STEPS = st.lists(st.tuples(st.integers(1, 60), st.integers(1, 60)), max_size=80)
 
 @given(STEPS)
 def test_a_stream_knows_exactly_what_was_admitted_or_never_comes(steps: list[tuple[int, int]]) -> None:
-    stream, admitted, floor = SequenceTracker(KEY), set(), 0
+    stream, accepted, floor = SequenceTracker(KEY), set(), 0
     for seq, held in steps:
         floor = max(floor, min(held, seq) - 1)
         stream.raise_to(min(held, seq))
-        assert stream.admitted(seq) == (seq <= floor or seq in admitted)
-        stream.admit(seq)
-        admitted.add(seq)
+        assert stream.accepted(seq) == (seq <= floor or seq in accepted)
+        stream.accept(seq)
+        accepted.add(seq)
     for seq in range(1, 62):
-        assert stream.admitted(seq) == (seq <= floor or seq in admitted)
+        assert stream.accepted(seq) == (seq <= floor or seq in accepted)
     assert all(seq > stream.low + 1 for seq in stream.seen)
 
 
 def test_a_stream_without_gaps_is_one_number() -> None:
     stream = SequenceTracker(KEY)
     for seq in range(1, 5001):
-        assert stream.admit(seq)
+        assert stream.accept(seq)
     assert (stream.low, len(stream.seen)) == (5000, 0)
 
 
 def test_no_seq_however_far_ahead_takes_more_room_than_one_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dedup, "MAX_GAPS", 3)
     stream = SequenceTracker(KEY)
-    assert [stream.admit(2**62 - k) for k in range(4)] == [True, True, True, False]
-    assert not stream.admitted(2**62 - 3)
-    assert stream.admit(1)
+    assert [stream.accept(2**62 - k) for k in range(4)] == [True, True, True, False]
+    assert not stream.accepted(2**62 - 3)
+    assert stream.accept(1)
     assert stream.low == 1
 
 
@@ -51,7 +51,7 @@ def test_rows_of_an_archive_restore_the_streams_that_wrote_them(rows: list[tuple
     for vehicle, seq, held in rows:
         stream = before[vehicle, 5, Kind.STATE, 7]
         stream.raise_to(min(seq, held))
-        stream.admit(seq, 100 + seq)
+        stream.accept(seq, 100 + seq)
     columns = np.array(rows, np.int64).reshape(-1, 3).T
     fixed = np.ones_like(columns[0])
     held = np.minimum(columns[1], columns[2])
@@ -64,9 +64,9 @@ def test_rows_of_an_archive_restore_the_streams_that_wrote_them(rows: list[tuple
 
 def test_streams_too_old_to_be_let_in_again_are_forgotten() -> None:
     both = SequenceTrackers()
-    both[1, 1, Kind.STATE, 1].admit(1, 100)
-    both[2, 1, Kind.STATE, 1].admit(1, 50)
-    both[2, 1, Kind.STATE, 1].admit(2, 150)
+    both[1, 1, Kind.STATE, 1].accept(1, 100)
+    both[2, 1, Kind.STATE, 1].accept(1, 50)
+    both[2, 1, Kind.STATE, 1].accept(2, 150)
     both.forget(101)
     assert len(both) == 1
-    assert both[2, 1, Kind.STATE, 1].admitted(2)
+    assert both[2, 1, Kind.STATE, 1].accepted(2)

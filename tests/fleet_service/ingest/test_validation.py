@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from fleet_service.archive.pseudonyms import Pseudonyms
 from fleet_service.ingest.acks import Acks, ranges
 from fleet_service.ingest.dedup import SequenceTrackers
-from fleet_service.ingest.inbox import Inbox, Intake, Message
+from fleet_service.ingest.inbox import BatchIntake, Inbox, Message
 from fleet_service.ingest.rate_limit import RateLimiter
 from fleet_service.ingest.validation import Clock
 from schemas import grid, wire
@@ -40,11 +40,11 @@ class Desk:
     def __init__(self, folder: Path) -> None:
         self.counts: Counter[str] = Counter()
         self.acks = Acks()
-        self.intake = Intake(SequenceTrackers(), Pseudonyms(folder), self.counts, self.acks)
+        self.intake = BatchIntake(SequenceTrackers(), Pseudonyms(folder), self.counts, self.acks)
 
     def take(self, *messages: Message) -> int:
         """Number of rows admitted."""
-        return sum(len(admitted.rows["row"]) for admitted in self.intake.admit(messages, CLOCK).values())
+        return sum(len(accepted.rows["row"]) for accepted in self.intake.accept(messages, CLOCK).values())
 
     def rejected(self) -> list[tuple[int, int, str]]:
         return [r for _, ack in self.acks.messages() for s in wire.decode_ack(ack)[1] for r in s.rejected]
@@ -159,8 +159,8 @@ def test_no_mutation_of_a_batch_stops_the_intake_or_lets_nonsense_in(desk: Desk,
         place = data.draw(st.integers(0, len(payload) - 1))
         payload[place] = data.draw(st.integers(0, 255))
     cut = data.draw(st.integers(0, len(payload)))
-    admitted = desk.intake.admit([message(good(), bytes(payload[cut:] if cut % 3 == 0 else payload))], CLOCK)
-    for found in admitted.values():
+    accepted = desk.intake.accept([message(good(), bytes(payload[cut:] if cut % 3 == 0 else payload))], CLOCK)
+    for found in accepted.values():
         rows = found.rows
         assert np.isfinite(rows["latitude"]).all()
         assert (rows["leave_time"] <= NOW + CLOCK.ahead).all()
