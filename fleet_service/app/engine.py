@@ -12,7 +12,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
 
@@ -24,16 +23,15 @@ from fleet_service.archive.files import lock
 from fleet_service.archive.load import count_set_aside, set_aside
 from fleet_service.archive.log import SegmentLog
 from fleet_service.archive.pseudonyms import Pseudonyms
-from fleet_service.fusion import Fusion, observations_of
+from fleet_service.fusion import observations_of
 from fleet_service.fusion.weather import Reports
 from fleet_service.ingest.acks import Acks
 from fleet_service.ingest.dedup import BatchId, SequenceTrackers
 from fleet_service.ingest.inbox import AcceptedBatches, BatchIntake, Message
 from fleet_service.ingest.validation import Clock
 from fleet_service.ingest.weather import WeatherInbox, archived
-from fleet_service.replay import checkpoints
-from fleet_service.replay.checkpoint_tables import fusion_from, tables_of
-from fleet_service.replay.rebuild import Since, replay, restore_streams
+from fleet_service.replay.rebuild import Since, past, replay, restore_streams
+from fleet_service.replay.restart import image_of, restart
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.encode import cell_table
 from fleet_service.serve.map_state import MapState
@@ -50,7 +48,6 @@ from schemas.wire import Alert, Kind
 
 # Rows that wait for the disk at the most; beyond, nothing is taken from the queue until a segment is written.
 WAITING_ROWS = 1_000_000
-ALERTS = "alerts"  # table of a checkpoint
 CHECKPOINT_WAIT_S = 0.2  # between two looks whether the service stops
 SNAPSHOT_SLOTS = 20_000  # at once: the lock is held for 40 ms, and little memory is needed
 
@@ -81,10 +78,12 @@ class Engine:
         self.counts: Counter[str] = Counter()
         self.report_lag_s = 0.0  # between the end of the newest visit and its arrival
         self.failing = False  # the last segment could not be written
-        self.fusion, standing, since = self._restored()
+        begin = restart(root, config.lateness_s)
+        self.fusion, since = begin.fusion, begin.received
+        self.counts["checkpoints_refused"] += begin.refused
         self.map = MapState(self.fusion)
         self._alerts = Alerts(self.fusion)
-        self._alerts.resume(standing)
+        self._alerts.resume(begin.standing)
         self._guard = threading.Lock()
         self._tiles = TileCache(self.map, self._guard, config.public_vehicles)
         self._acks = Acks()
@@ -108,17 +107,6 @@ class Engine:
             self._use(self.weather.begin(config.weather, used, time.time_ns()))
         warm_up()
         pa.default_memory_pool().release_unused()  # the archive went through it
-
-    def _restored(self) -> tuple[Fusion, list[Alert], int | None]:
-        """Fusion and alerts of the newest checkpoint that can be read, and until when all is in it; or a new one."""
-        for path in checkpoints.newest(self._root):
-            try:
-                tables, received = checkpoints.load(path)
-                standing = [Alert(**row) for row in tables.pop(ALERTS).to_pylist()]
-                return fusion_from(tables, self._config.lateness_s), standing, received
-            except (OSError, pa.ArrowInvalid, InputError, KeyError, TypeError):
-                self.counts["checkpoints_refused"] += 1
-        return Fusion(self._config.lateness_s), [], None
 
     def checkpoint(self, stop: threading.Event) -> tuple[dict[str, pa.Table], int] | None:
         """What the fusion knows, and until when everything received is in it [ns]; None if stopped meanwhile.
@@ -209,8 +197,7 @@ class Engine:
         if not self.failing and self._checkpoint_wanted.is_set():
             self._checkpoint_wanted.clear()
             with self._guard:
-                alerts = pa.Table.from_pylist([asdict(alert) for alert in self._alerts.standing])
-                self._checkpoints.put((tables_of(self.fusion) | {ALERTS: alerts}, self._last_received))
+                self._checkpoints.put((image_of(self.fusion, self._alerts.standing), self._last_received))
         return acks
 
     def begin_flush(self) -> list[tuple[str, bytes]]:
@@ -273,14 +260,11 @@ class Engine:
         at = nanoseconds(query.at)
         if at > now:
             raise InputError("at", "lies in the future", "give a time that has been")
-        past = Fusion(self._config.lateness_s)
         try:
-            past.update_weather(archived(self._root, received_until=at))
-            for _ in replay(self._root, past, Since(until=at, box=_box(query))):
-                pass  # the map is what counts; the alerts of then are history
+            then = past(self._root, self._config.lateness_s, at, _box(query))
         except OSError as error:
             raise InputError("at", f"the archive cannot be read ({error.strerror})", "ask again later") from error
-        return answer(TileCache(MapState(past), nullcontext(), least), query, wanted, at, only)
+        return answer(TileCache(MapState(then), nullcontext(), least), query, wanted, at, only)
 
 
 def _box(query: MapQuery) -> tuple[float, float, float, float] | None:

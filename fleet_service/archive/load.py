@@ -25,7 +25,7 @@ BAD: Final = ".bad"
 # Without them a row is none, whatever version wrote it.
 NEEDED: Final = frozenset(
     {"leave_time", "time", "cell", "sector", "latitude", "longitude", "vehicle", "boot", "region", "seq", "row"}
-    | {"received_at", "hour", "acts_from"}
+    | {"received_at", "hour", "acts_from", "enter_time", "first_held", "late", "weight"}
 )
 
 Damaged = Callable[[Path, str], None]

@@ -1,4 +1,4 @@
-"""From segments back to what a running service knows: which batches it holds, and what it believes."""
+"""From the archive back to what a service knows, or knew: which batches it holds, and what it believes."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from fleet_service.archive.pseudonyms import number
 from fleet_service.fusion import Fusion, Updated, observations_of
 from fleet_service.fusion.constants import EPOCH_NS
 from fleet_service.ingest.dedup import SequenceTrackers
+from fleet_service.ingest.weather import archived
 from schemas.numeric import IntArray
 from schemas.tables import US, US_STEP
 from schemas.wire import Kind
@@ -29,6 +30,7 @@ COLUMNS: Final = [
     *("leave_time", "cell", "sector", "latitude", "longitude", "position_std", "yaw", "mu", "mu_lower", "mu_upper"),
     *("mu_utilised", "log_likelihood", *IDENTITY, "row", "received_at", "late", "weight"),
 ]  # of what the fusion takes
+Box = tuple[float, float, float, float]  # west, south, east, north [deg]
 MARGIN_DEG: Final = 0.002  # around a box: over 100 m, more than a visit's position error moves what it tells
 
 
@@ -60,7 +62,7 @@ class Since(NamedTuple):
 
     received: int | None = None
     until: int | None = None
-    box: tuple[float, float, float, float] | None = None
+    box: Box | None = None
 
     def where(self) -> pc.Expression | None:
         """The rows as a filter, or None for all."""
@@ -79,6 +81,19 @@ class Since(NamedTuple):
 
 def _time(ns: int) -> pa.Scalar[Any]:
     return pa.scalar(ns // US_STEP, pa.int64()).cast(US)
+
+
+def past(root: Path, lateness_s: float, until: int, box: Box | None = None) -> Fusion:
+    """The fusion of a service that had received everything until a moment [ns], near a box [deg].
+
+    Raises:
+        OSError: the archive cannot be read.
+    """
+    fusion = Fusion(lateness_s)
+    fusion.update_weather(archived(root, received_until=until))
+    for _ in replay(root, fusion, Since(until=until, box=box)):
+        pass  # the alerts of then are history
+    return fusion
 
 
 def replay(

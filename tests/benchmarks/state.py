@@ -15,13 +15,11 @@ from contextlib import closing
 from pathlib import Path
 from typing import Final
 
-import pyarrow as pa
-
 from deploy.router import open_router
-from fleet_service.app.engine import ALERTS, Engine
+from fleet_service.app.engine import Engine
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay import checkpoints
-from fleet_service.replay.checkpoint_tables import tables_of
+from fleet_service.replay.restart import image_of
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
 from tests.benchmarks.fusion import CELLS, START, filled
@@ -42,7 +40,7 @@ def state() -> list[Figure]:
         folder = Path(name)
         root = folder / "archive"
         fusion, _ = filled(CELLS, 3, SPAN_S)
-        checkpoints.save(root, tables_of(fusion) | {ALERTS: pa.table({})}, now)
+        checkpoints.save(root, image_of(fusion, []), now)
         del fusion
         with closing(Engine(ServiceConfig(), root)) as engine:
             took, held = checkpoint_s(engine, root, messages(SINCE, 10, now), now)
