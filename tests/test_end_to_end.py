@@ -68,7 +68,7 @@ class System:
         ]
         assert edge_agent(words) == 0
         words = ["replay", str(log), "--vehicle", str(file), "--out", str(out), "--publish", "--name", vehicle]
-        assert edge_agent([*words, "--config", str(self.agent)]) == 0
+        assert edge_agent([*words, "--trust", "--config", str(self.agent)]) == 0
 
     def ask(self, parameters: str = "format=json") -> list[dict[str, object]]:
         """The map's cells as a client without our code gets them."""

@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from edge_agent.app.live_loop import Progress
+    from edge_agent.inputs.signal_log import SignalLog
     from edge_agent.publish.publisher import Publisher
+    from schemas.vehicle import Vehicle
 
 
 def checked_name(name: str) -> str:
@@ -51,6 +53,21 @@ def publisher_of(names: Sequence[str], config: AgentConfig, estimator: str) -> P
     publisher = Publisher(names, outbox, config, estimator)
     publisher.start()
     return publisher
+
+
+def insist_on_sound(log: SignalLog, vehicle: Vehicle) -> None:
+    """Let only a log pass whose signals agree with each other.
+
+    Raises:
+        InputError: the signal doctor finds a fault, or cannot tell.
+    """
+    from edge_agent.inputs.doctor.findings import diagnose
+    from edge_agent.inputs.doctor.report import advice, lines
+
+    said = diagnose(log.t, log.signals, vehicle, log.ground)
+    if not said.passed:
+        print("\n".join(line for line in lines(said) if not line.startswith("sound")), file=sys.stderr)
+        raise InputError("log", "is not fit to be published", f"{advice(said)}; --trust publishes it as it is")
 
 
 @contextmanager

@@ -13,6 +13,8 @@ from schemas.errors import InputError
 
 LEAST_SEEDS: Final = 20  # of a campaign whose bars count
 QUICK_SEEDS: Final = 2
+ONLY: Final = ("inputs",)
+CARS: Final = 5  # smooth ones, and as many rough ones, of the inputs' campaign
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -20,6 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder for figures.json, report.md and the plots")
     parser.add_argument("--quick", action="store_true", help="three scenarios, two estimators, two seeds: does it run?")
     parser.add_argument("--seeds", type=int, help=f"how many drives per scenario (default {LEAST_SEEDS})")
+    parser.add_argument("--only", choices=ONLY, help="a campaign of its own: inputs, the signal doctor's")
     parser.add_argument("--no-plots", action="store_true", help="figures and table only; needs no matplotlib")
 
 
@@ -38,12 +41,14 @@ def run(args: argparse.Namespace) -> int:
     count = args.seeds if args.seeds is not None else QUICK_SEEDS if args.quick else LEAST_SEEDS
     if count < 2:
         raise InputError("seeds", f"{count} drives have no spread", "give at least 2")
-    if not args.no_plots and importlib.util.find_spec("matplotlib") is None:
+    if not args.no_plots and not args.only and importlib.util.find_spec("matplotlib") is None:
         raise InputError("plots", "matplotlib is not installed", "install gripmap[demo], or give --no-plots")
     try:
         args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError("out", f"cannot make {args.out} ({error.strerror})", "name another folder") from error
+    if args.only:
+        return _inputs(args)
     began, seeds = time.monotonic(), range(FIGURES, FIGURES + count)
     results = campaign(
         seeds, quick=args.quick,
@@ -59,4 +64,17 @@ def run(args: argparse.Namespace) -> int:
 
         draw(results, figures, args.out)
     print(text.partition("## The papers' figures")[0].rstrip())
+    return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
+
+
+def _inputs(args: argparse.Namespace) -> int:
+    from edge_agent.lab.evaluation.planted import figures as figures_of
+    from edge_agent.lab.seeds import FIGURES
+    from schemas.runtime.figures import markdown, write
+
+    figures = figures_of(1 if args.quick else CARS, FIGURES)
+    write(args.out / "figures.json", "edge-agent evaluate --only inputs", [FIGURES, FIGURES + 1], figures)
+    text = f"# Inputs\n\n{markdown(figures)}\n"
+    (args.out / "report.md").write_text(text, encoding="utf-8")
+    print(text)
     return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1

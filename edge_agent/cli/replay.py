@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,8 +13,8 @@ from schemas.thresholds import NS
 
 if TYPE_CHECKING:
     from edge_agent.app.backfill import Outcome
-    from edge_agent.app.estimates_file import EstimatesFile
-    from edge_agent.estimators import EstimatorBank
+    from edge_agent.estimators import Estimates, EstimatorBank
+    from edge_agent.inputs.block import Block
     from edge_agent.inputs.signal_log import SignalLog
     from schemas.config import AgentConfig
 
@@ -32,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--jobs", type=int, default=1, help="logs at a time (default 1)")
     parser.add_argument("--publish", action="store_true", help="send observations and states, wait for acknowledgement")
+    parser.add_argument("--trust", action="store_true", help="publish although the signal doctor did not pass the log")
     parser.add_argument("--config", type=Path, help="agent configuration (JSON), for --publish")
     parser.add_argument("--name", help="name to publish under (default: the vehicle file's)")
     parser.add_argument(
@@ -40,10 +41,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay; 0 when everything was written, and acknowledged if it was to be published, else 1."""
+    """Replay; 0 when all was written and acknowledged, 1 when something was left, 3 when it is not plausible."""
     from edge_agent.app.backfill import backfill, beside, tasks_of
     from edge_agent.app.estimates_file import EstimatesFile
     from edge_agent.app.estimator_factory import bank_of
+    from edge_agent.app.plausible import IMPLAUSIBLE, Plausibility
+    from edge_agent.cli.common import insist_on_sound
     from edge_agent.inputs.signal_log import read_log
     from schemas.config import AgentConfig, load
     from schemas.errors import InputError
@@ -63,12 +66,23 @@ def run(args: argparse.Namespace) -> int:
     bank = bank_of(estimator, [vehicle])
     log = read_log(path)
     start_ns = _start(args.start, log)
+    plausibility = Plausibility(vehicle.wheel_radius)
+    if args.publish and not args.trust:
+        insist_on_sound(log, vehicle)
     with EstimatesFile(args.out) as file:
+        code = 0
+
+        def keep(block: Block, estimates: Estimates) -> None:
+            plausibility.add(block.t, block.signals, estimates)
+            file.write(block.t, estimates)
+
         if args.publish:
-            return _published(args.name or vehicle.name, log, start_ns, bank, estimator, config, file)
-        for block in log.blocks(start_ns):
-            file.write(block.t, bank.advance(block.t, block.signals))
-    return 0
+            code = _published(args.name or vehicle.name, log, start_ns, bank, estimator, config, keep)
+        else:
+            for block in log.blocks(start_ns):
+                keep(block, bank.advance(block.t, block.signals))
+    print(plausibility.line(), file=sys.stderr)
+    return code or (IMPLAUSIBLE if plausibility.troubles() else 0)
 
 
 def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:
@@ -93,7 +107,7 @@ def _published(
     bank: EstimatorBank,
     estimator: str,
     config: AgentConfig,
-    file: EstimatesFile,
+    keep: Callable[[Block, Estimates], None],
 ) -> int:
     from edge_agent.app.live_loop import Progress
     from edge_agent.cli.common import checked_name, leave, publisher_of
@@ -105,7 +119,7 @@ def _published(
     try:
         for block in log.blocks(start_ns):
             estimates, *records = pipeline.step(block)
-            file.write(block.t, estimates)
+            keep(block, estimates)
             publisher.offer(*records)
             progress.blocks += 1
         if (last := pipeline.finish()) is not None:

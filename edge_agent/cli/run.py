@@ -19,6 +19,7 @@ LIVE_ROWS = 10  # of a replayed log per block: a tenth of a second at 100 Hz
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--source", default=SIMULATED, help="'simulated' (default) or a signal log (Parquet)")
+    parser.add_argument("--trust", action="store_true", help="publish a log that the signal doctor did not pass")
     parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON); needed with a log")
     parser.add_argument("--estimator", help="estimator by name (default: the configuration's)")
     parser.add_argument("--name", help="name to publish under (default: the vehicle's)")
@@ -49,6 +50,7 @@ def _simulated(args: argparse.Namespace) -> tuple[Vehicle, str, Iterator[Block]]
 
 
 def _logged(args: argparse.Namespace) -> tuple[Vehicle, str, Iterator[Block]]:
+    from edge_agent.cli.common import insist_on_sound
     from edge_agent.inputs.signal_log import read_log
     from schemas.errors import InputError
     from schemas.thresholds import NS
@@ -58,5 +60,7 @@ def _logged(args: argparse.Namespace) -> tuple[Vehicle, str, Iterator[Block]]:
         raise InputError("vehicle", "is not given", "name the vehicle file of the log with --vehicle")
     vehicle = load_vehicle(args.vehicle)
     log = read_log(Path(args.source))
+    if not args.trust:
+        insist_on_sound(log, vehicle)
     first_ns = time.time_ns() - round(float(log.t[0]) * NS)
     return vehicle, args.name or vehicle.name, log.blocks(first_ns, LIVE_ROWS)

@@ -12,11 +12,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from edge_agent.inputs.merge import Merged
-from edge_agent.inputs.profile import Profile
+from edge_agent.inputs.profile import FOLDER, Channel, Profile
 from edge_agent.inputs.readers import can_log, gnss, mdf, rosbag, tabular
 from edge_agent.inputs.readers.dbc import Database, read_dbc
 from edge_agent.inputs.recording import Recording, foreign
 from schemas.errors import InputError
+from schemas.signals import CHANNELS
 from schemas.thresholds import NS
 
 PROVENANCE = b"gripmap.import"
@@ -68,7 +69,23 @@ def database_of(profile: Profile | None, folder: Path, given: Path | None) -> Da
     """The CAN database that is named on the command line, else the profile's."""
     if given is not None:
         return read_dbc(given)
-    return read_dbc(folder / profile.dbc) if profile is not None and profile.dbc is not None else None
+    if profile is None or profile.dbc is None:
+        return None
+    beside = folder / profile.dbc
+    return read_dbc(beside if beside.exists() or not (FOLDER / profile.dbc).exists() else FOLDER / profile.dbc)
+
+
+def profile_of(log: Path) -> Profile:
+    """The profile that a log was imported with; of another log, one that takes its columns as they are.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    with foreign(log, "Parquet"):
+        schema = pq.ParquetFile(log).schema_arrow
+        if (told := (schema.metadata or {}).get(PROVENANCE)) is not None:
+            return Profile.model_validate(json.loads(told)["profile"])
+        return Profile(name=log.stem[:64], channels={n: Channel(signal=n) for n in CHANNELS if n in schema.names})
 
 
 def write_log(path: Path, merged: Merged, profile: Profile, sources: Sequence[str]) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 
 from edge_agent.inputs.profile import Channel, Profile
 from edge_agent.inputs.recording import Recording, Series
+from edge_agent.inputs.signal_log import GROUND
 from edge_agent.inputs.units import QUANTITY, to_si, understood
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
@@ -27,8 +28,7 @@ GNSS: Final = {  # channels that a receiver's recording fills by itself
     "latitude": Channel(signal="latitude"), "longitude": Channel(signal="longitude"),
     "yaw": Channel(signal="course", unit="deg", course=True),
 }  # fmt: skip
-EXTRA_SPEED: Final = "gnss_speed"  # column [m/s] beside the channels: what the doctor holds against the wheels
-SPARSE: Final = ("latitude", "longitude", "yaw", EXTRA_SPEED)
+SPARSE: Final = ("latitude", "longitude", "yaw", GROUND)
 COURSE_SPEED: Final = 3.0  # [m/s] below it a receiver's course is noise
 RATES: Final = (10.0, 20.0, 25.0, 50.0, 100.0)
 FEWEST: Final = 20  # readings from which on a period means something
@@ -108,8 +108,8 @@ class _MissingError(Exception):
 def _found(recordings: Sequence[Recording], profile: Profile) -> dict[str, int]:
     """Channel -> the recording that has its signals."""
     found: dict[str, int] = {}
-    wanted = {name: GNSS[name] for name in GNSS} | {EXTRA_SPEED: Channel(signal="speed")} | profile.channels
-    for name in (*CHANNELS, EXTRA_SPEED):
+    wanted = {name: GNSS[name] for name in GNSS} | {GROUND: Channel(signal="speed")} | profile.channels
+    for name in (*CHANNELS, GROUND):
         if name not in wanted:
             continue
         for place, recording in enumerate(recordings):
@@ -179,7 +179,7 @@ def _made(
     if channel.wrap is not None:
         values = np.mod(values, channel.wrap)
     factor = 1.0
-    if name != EXTRA_SPEED:
+    if name != GROUND:
         unit = channel.unit or understood(name, first.unit) or next(iter(QUANTITY[name]))
         made = to_si(name, unit, radius)
         if made is None:
@@ -242,8 +242,8 @@ def steady(t: FloatArray) -> tuple[FloatArray, float]:
 
 def _still_courses(series: dict[str, Series]) -> None:
     """A receiver's course at walking speed is none."""
-    if "yaw" in series and EXTRA_SPEED in series and len(series["yaw"].t) == len(series[EXTRA_SPEED].t):
-        yaw, speed = series["yaw"], series[EXTRA_SPEED].values
+    if "yaw" in series and GROUND in series and len(series["yaw"].t) == len(series[GROUND].t):
+        yaw, speed = series["yaw"], series[GROUND].values
         series["yaw"] = Series(yaw.t, np.where(speed > COURSE_SPEED, yaw.values, np.nan))
 
 

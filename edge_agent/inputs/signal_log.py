@@ -25,6 +25,7 @@ from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S, per_wheel
 from schemas.thresholds import NS
 
+GROUND: Final = "gnss_speed"  # beside the channels; only the signal doctor reads it
 NEEDED: Final = ("ax", "ay", "yaw_rate", *per_wheel("omega"))
 FRONT_STEERING: Final = per_wheel("delta")[:2]
 REAR_STEERING: Final = per_wheel("delta")[2:]
@@ -38,6 +39,7 @@ class SignalLog:
     t: FloatArray
     signals: FloatArray
     start_ns: int | None
+    ground: FloatArray | None = None  # speed over ground (T,) [m/s], where a receiver's was imported
 
     def blocks(self, start_ns: int, rows: int = BLOCK_ROWS) -> Iterator[Block]:
         """The log in order, in blocks of at most `rows` samples; t = 0 is at `start_ns`."""
@@ -64,14 +66,15 @@ def read_log(path: Path) -> SignalLog:
     signals[np.isinf(signals)] = np.nan
     _check(table, signals)
     _steering(table, signals)
-    return SignalLog(t, signals, start_ns)
+    ground = _numbers(table, GROUND) if GROUND in table.column_names else None
+    return SignalLog(t, signals, start_ns, ground)
 
 
 def _table(path: Path) -> pa.Table:
     try:
         with pq.ParquetFile(path) as file:
             present = set(file.schema_arrow.names)
-            return file.read(columns=[name for name in ("t", "timestamp", *CHANNELS) if name in present])
+            return file.read(columns=[name for name in ("t", "timestamp", GROUND, *CHANNELS) if name in present])
     except FileNotFoundError as error:
         raise InputError("log", f"{path} does not exist", "give the path of a signal log") from error
     except (OSError, pa.ArrowException) as error:

@@ -101,14 +101,14 @@ def test_the_estimates_of_half_a_log_are_bit_for_bit_those_of_the_whole(drive: P
 
 def test_publishing_changes_no_estimate(drive: Path, tmp_path: Path, router: Router, service: Service) -> None:
     assert main(replay(drive, tmp_path / "plain.out")) == 0
-    assert main(replay(drive, tmp_path / "sent.out", "--publish", *config(tmp_path, router))) == 0
+    assert main(replay(drive, tmp_path / "sent.out", "--publish", "--trust", *config(tmp_path, router))) == 0
     assert pq.read_table(tmp_path / "plain.out").equals(pq.read_table(tmp_path / "sent.out"))
 
 
 def test_replay_publishes_observations_and_states_at_the_time_of_the_drive_and_waits(
     drive: Path, tmp_path: Path, router: Router, service: Service, capsys: Output
 ) -> None:
-    more = ["--publish", *config(tmp_path, router), "--name", "car-one", "--start", "2026-01-31T07:00:00Z"]
+    more = ["--publish", "--trust", *config(tmp_path, router), "--name", "car-one", "--start", "2026-01-31T07:00:00Z"]
     assert main(replay(drive, tmp_path / "out", *more)) == 0
     reported = counts(capsys)
     assert reported["unsettled"] == 0
@@ -134,7 +134,7 @@ def test_replay_with_a_session_that_hangs_keeps_its_estimates_and_says_that_noth
         settings = {"zenoh": {"connect": [router.line_with("router: ").split()[1]]}}
         router.send(signal.SIGSTOP)
         (tmp_path / "agent.json").write_text(json.dumps(settings | {"spool": str(tmp_path / "spool.sqlite")}))
-        words = replay(drive, tmp_path / "out", "--publish", "--config", str(tmp_path / "agent.json"))
+        words = replay(drive, tmp_path / "out", "--publish", "--trust", "--config", str(tmp_path / "agent.json"))
         code = (
             IMPATIENT if well else f"from edge_agent.observe.pipeline import Pipeline as P; P.finish = 0; {IMPATIENT}"
         )
@@ -156,7 +156,7 @@ def test_run_drives_a_log_in_real_time_and_publishes_it(
     drive: Path, tmp_path: Path, router: Router, service: Service, capsys: Output
 ) -> None:
     source = ["--source", str(drive / "log.parquet"), "--vehicle", str(drive / "vehicle.json"), "--name", "car-two"]
-    assert main(["run", *source, "--estimator", "ckf", "--duration", "1", *config(tmp_path, router)]) == 0
+    assert main(["run", *source, "--estimator", "ckf", "--duration", "1", "--trust", *config(tmp_path, router)]) == 0
     reported = counts(capsys)
     assert reported["acknowledged"] == reported["published"] == sum(b.rows for b in service.batches) >= 3
     assert {b.estimator for b in service.batches} == {"ckf"}
@@ -214,7 +214,10 @@ BAD_ARGUMENTS = {
     "no vehicle file": (["--vehicle", "nowhere.json"], "^error: vehicle: cannot read nowhere.json"),
     "broken start": (["--start", "yesterday"], "^error: start: 'yesterday' is no time; write it like 2026"),
     "no configuration": (["--config", "nowhere.json"], "^error: config: cannot read nowhere.json"),
-    "name for no key": (["--publish", "--name", "My Car/**"], "^error: name: 'My Car/\\*\\*' is no vehicle name; give"),
+    "name for no key": (
+        ["--publish", "--trust", "--name", "My Car/**"],
+        "^error: name: 'My Car/\\*\\*' is no vehicle name; give",
+    ),
     "folder that is none": (["--out", "/dev/null/out"], "^error: out: cannot write /dev/null/out"),
 }
 
@@ -284,7 +287,7 @@ def _one_error(capsys: Output, message: str) -> None:
 
 def test_a_setting_that_zenoh_refuses_is_named(drive: Path, tmp_path: Path, capsys: Output) -> None:
     (tmp_path / "agent.json").write_text('{"zenoh": {"config": {"connect/retri": 1}}}')
-    options = ["--publish", "--config", str(tmp_path / "agent.json"), "--name", "car-one"]
+    options = ["--publish", "--trust", "--config", str(tmp_path / "agent.json"), "--name", "car-one"]
     assert main(replay(drive, tmp_path / "out", *options)) == 2
     _one_error(capsys, "^error: zenoh.config.connect/retri: ")
 
@@ -292,7 +295,7 @@ def test_a_setting_that_zenoh_refuses_is_named(drive: Path, tmp_path: Path, caps
 def test_an_outbox_in_use_is_refused(drive: Path, tmp_path: Path, router: Router, capsys: Output) -> None:
     from edge_agent.publish.outbox import Outbox
 
-    options = ["--publish", *config(tmp_path, router), "--name", "car-one"]
+    options = ["--publish", "--trust", *config(tmp_path, router), "--name", "car-one"]
     outbox = Outbox(tmp_path / "spool.sqlite")
     assert main(replay(drive, tmp_path / "out", *options)) == 2
     outbox.close()

@@ -45,9 +45,9 @@ SIMULATE = {
 USUAL = {
     "run": ["run"], "fleet": ["fleet", "--vehicles", "3"], "tune": ["tune", "--quick"],
 }  # fmt: skip
-LOGGED = ["--source", "{0}.parquet", "--vehicle", "{0}.json"]
+LOGGED = ["--source", "{0}.parquet", "--vehicle", "{0}.json", "--trust"]
 CHANGED: dict[tuple[str, str], list[str]] = {
-    ("run", "--source"): LOGGED, ("run", "--vehicle"): [*LOGGED[:2], "--vehicle", "{1}.json"],
+    ("run", "--source"): LOGGED, ("run", "--vehicle"): [*LOGGED[:2], "--vehicle", "{1}.json", "--trust"],
     **{(command, option): [option, value] for command in ("run", "fleet") for option, value in (
         ("--estimator", "ckf"), ("--config", "{0}.agent"), ("--scenario", "hills"), ("--rate", "50"), ("--seed", "1"),
         ("--duration", "7"),
@@ -64,21 +64,25 @@ SENT_BY_REPLAY = "test_replay_publishes_observations_and_states_at_the_time_of_t
 REAL = "test_the_real_minute_becomes_a_log_in_si_with_its_provenance"
 CAMPAIGN = "test_the_quick_campaign_writes_figures_report_and_plots"
 SEEDS = "test_more_seeds_are_driven_and_no_plots_drawn_where_so_asked"
+UNFIT = "test_what_has_not_passed_is_not_published_unless_it_is_trusted"
+FIX = "test_a_fix_makes_the_drive_pass"
 ELSEWHERE = {
     "simulate": {"--list": "test_simulate_lists_the_manoeuvres",
                  "--out": "test_simulate_writes_a_log_with_truth_and_the_vehicle_file",
                  "--vehicle-out": "test_simulate_writes_a_log_with_truth_and_the_vehicle_file"},
     "import": {"source": REAL, "--profile": REAL, "--vehicle": REAL, "--out": REAL,
-               "--list": "test_the_shipped_profiles",
-               "--dbc": "test_another_database", "--draft": "test_another_database",
-               "--clock": "test_clocks_that_do_not_meet"},
+               "--list": "test_the_shipped_profiles_are_listed",
+               "--dbc": "test_another_database_and_a_named_draft", "--draft": "test_another_database_and_a_named_draft",
+               "--clock": "test_clocks_that_do_not_meet_are_an_error_with_its_remedy"},
     "replay": {"log": REPLAYED, "--vehicle": REPLAYED, "--estimator": REPLAYED, "--out": REPLAYED, "--config": REPLAYED,
-               "--publish": SENT_BY_REPLAY, "--name": SENT_BY_REPLAY, "--start": SENT_BY_REPLAY,
+               "--publish": SENT_BY_REPLAY, "--trust": UNFIT, "--name": SENT_BY_REPLAY, "--start": SENT_BY_REPLAY,
                "--jobs": "test_two_jobs_write_what_one_writes_and_what_a_single_replay_writes"},
-    "run": {}, "fleet": {},
+    "check": {"log": FIX, "--vehicle": FIX, "--out": FIX, "--fix": FIX},
+    "run": {"--trust": UNFIT}, "fleet": {},
     "tune": {"--quick": "test_quick_tuning_writes_a_valid_file_and_says_what_it_does",
              "--study": "test_the_quick_study_writes_figures_table_plot_and_a_tuned_file"},
-    "evaluate": {"--out": CAMPAIGN, "--quick": CAMPAIGN, "--seeds": SEEDS, "--no-plots": SEEDS},
+    "evaluate": {"--out": CAMPAIGN, "--quick": CAMPAIGN, "--seeds": SEEDS, "--no-plots": SEEDS,
+                 "--only": "test_only_the_inputs_are_evaluated_where_so_asked"},
 }  # fmt: skip
 # agent configuration: setting -> another value; those of sending are shown where things are sent
 OBSERVED = {

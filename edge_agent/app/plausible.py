@@ -1,0 +1,90 @@
+"""Whether a replay's estimates are believable on the face of them: one honest line, and an exit code of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from schemas.numeric import FloatArray
+from schemas.signals import Health, S
+from schemas.thresholds import EXCITED_SHARE
+
+if TYPE_CHECKING:
+    from edge_agent.estimators import Estimates
+
+IMPLAUSIBLE: Final = 3  # exit code
+# bounds that no sound drive of ours passes: hard stops with locked wheels slide half of the time and no longer
+FURTHEST_SPEED: Final = 0.15  # median of |v_x − wheels| over the wheels' speed
+LEAST_SPEED: Final = 3.0  # [m/s] below which speeds are not compared
+MOST_SLIDING: Final = 0.6
+MOST_VIOLATION: Final = 0.05  # share of samples whose upper bound lies below the grip in use
+SLACK: Final = 0.02  # of that comparison
+MOST_RESETS_PER_S: Final = 0.2
+
+
+@dataclass
+class Plausibility:
+    """Counts over the blocks of one replay."""
+
+    radius: float
+    first: float = np.inf
+    last: float = -np.inf
+    samples: int = 0
+    sliding: int = 0
+    resets: int = 0
+    violations: int = 0
+    excited: int = 0
+    away: list[FloatArray] = field(default_factory=list)
+
+    def add(self, t: FloatArray, signals: FloatArray, estimates: Estimates) -> None:
+        """The next block: t (T, 1), signals (T, 1, 18) and what was said of them."""
+        wheels = signals[:, 0, S.OMEGA : S.OMEGA + 4]
+        some = np.isfinite(wheels).any(axis=1)
+        speed = np.full(len(wheels), np.nan)
+        speed[some] = np.nanmedian(wheels[some], axis=1) * self.radius
+        fast = speed > LEAST_SPEED
+        self.away.append(np.abs(estimates.vx[fast, 0] - speed[fast]) / speed[fast])
+        health = np.asarray(estimates.health[:, 0], dtype=np.int64)
+        self.sliding += int(np.sum(health & Health.SLIDING != 0))
+        self.resets += int(np.sum(health & Health.RESET != 0))
+        upper, used, mu = estimates.mu_upper[:, 0], estimates.mu_utilised[:, 0], estimates.mu[:, 0]
+        self.violations += int(np.sum(upper < used - SLACK))
+        self.excited += int(np.sum(used > EXCITED_SHARE * mu))
+        self.samples += len(health)
+        self.first = min(self.first, float(t[0, 0]))
+        self.last = float(t[-1, 0])
+
+    @property
+    def seconds(self) -> float:
+        """Length of the drive."""
+        return max(self.last - self.first, 0.0)
+
+    @property
+    def off(self) -> float:
+        """Median of |v_x − wheels| over the wheels' speed; 0 of a car that stood."""
+        away = np.concatenate(self.away) if self.away else np.zeros(0)
+        return float(np.median(away)) if len(away) else 0.0
+
+    def troubles(self) -> list[str]:
+        """What is not believable."""
+        n = max(self.samples, 1)
+        found = {
+            "speed far off the wheels": self.off > FURTHEST_SPEED,
+            "sliding most of the time": self.sliding / n > MOST_SLIDING,
+            "an upper bound below the grip in use": self.violations / n > MOST_VIOLATION,
+            "started anew again and again": self.resets > 1 + MOST_RESETS_PER_S * self.seconds,
+        }
+        return [words for words, bad in found.items() if bad]
+
+    def line(self) -> str:
+        """All of it in a line."""
+        n = max(self.samples, 1)
+        told = (
+            f"{self.samples} samples, {self.seconds:.1f} s; speed {self.off:.1%} off the wheels, "
+            f"excited {self.excited / n:.0%}, sliding {self.sliding / n:.0%}, "
+            f"violations {self.violations / n:.1%}, resets {self.resets}"
+        )
+        bad = self.troubles()
+        return f"{told}; NOT PLAUSIBLE: {', '.join(bad)}; run edge-agent check" if bad else told

@@ -1,0 +1,49 @@
+"""`edge-agent check`: the signal doctor; what of a log is sound, what is wrong with the rest, and its correction."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+NOT_PASSED = 1
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("log", type=Path, help="signal log (Parquet)")
+    parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON) (default: LOG.json beside LOG.parquet)")
+    parser.add_argument("--out", type=Path, help="page with the evidence and its plots (HTML)")
+    parser.add_argument(
+        "--fix",
+        type=Path,
+        metavar="PROFILE",
+        help="write the corrected profile here, and the radius to the vehicle file",
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Check; 0 when the log has passed, 1 when something is wrong or unknown."""
+    from edge_agent.app.backfill import beside
+    from edge_agent.app.estimates_file import writable
+    from edge_agent.inputs.bring_in import profile_of
+    from edge_agent.inputs.doctor.findings import diagnose
+    from edge_agent.inputs.doctor.fix import fixed
+    from edge_agent.inputs.doctor.report import advice, lines, page
+    from edge_agent.inputs.signal_log import read_log
+    from schemas.vehicle import load_vehicle
+
+    file = args.vehicle or beside(args.log)
+    vehicle, log = load_vehicle(file), read_log(args.log)
+    said = diagnose(log.t, log.signals, vehicle, log.ground)
+    print("\n".join([*lines(said), f"{args.log}: {advice(said)}"]))
+    if args.out is not None:
+        writable("out", args.out).write_text(page(said, f"{args.log.name}, {vehicle.name}"), encoding="utf-8")
+    if args.fix is not None and said.findings:
+        profile, corrected, left = fixed(said.findings, profile_of(args.log), vehicle)
+        writable("fix", args.fix).write_text(profile.text(), encoding="utf-8")
+        if corrected != vehicle:
+            writable("vehicle", file).write_text(corrected.model_dump_json(indent=1, exclude_none=True) + "\n")
+        for finding in left:
+            print(f"not mended: {finding.channel} {finding.kind}: its recording must be decoded otherwise")
+        print(f"{args.fix}: the corrected profile; import the recording again with it")
+    return 0 if said.passed else NOT_PASSED

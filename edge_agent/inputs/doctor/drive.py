@@ -1,0 +1,142 @@
+"""A drive made ready for its examination: even time, smoothed, with what the wheels alone say of the motion.
+
+Legend
+    v    speed of the car from its wheels [m/s]: R times the median of the four, R of the vehicle file
+    r    yaw rate [rad/s];  r_w the same from the wheels: (right − left) / track, mean of both axles
+    v_g  speed over ground from fixes [m/s]; course likewise, counter-clockwise from east [rad]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from schemas.numeric import FloatArray
+from schemas.signals import CHANNELS, S
+from schemas.thresholds import EARTH_RADIUS_M
+from schemas.vehicle import Vehicle
+
+RATE_HZ: Final = 50.0
+SMOOTH_S: Final = 0.5  # of a running mean, taken twice: motion of cars lies below 1 Hz
+JOINED_S: Final = 1.5  # readings further apart are not joined
+FIX_S: Final = 1.0  # over which speed and course are taken from fixes
+LONGEST_S: Final = 1800.0  # of a drive that is looked at; the rest tells no more
+CREEP: Final = 0.15  # of the drive's fast speed; slower is standing, whatever the unit
+
+
+@dataclass(frozen=True)
+class EvenDrive:
+    """Smoothed signals on even times (n,); NaN where nothing was read. `wheels` (n, 4) are speeds at the rim [m/s]."""
+
+    t: FloatArray
+    ax: FloatArray
+    ay: FloatArray
+    r: FloatArray
+    delta: FloatArray
+    wheels: FloatArray
+    v: FloatArray
+    r_wheels: FloatArray
+    v_ground: FloatArray
+    course: FloatArray
+    course_yaw: FloatArray  # the log's own yaw at the same times, not smoothed
+    moving: FloatArray  # 1 where the car moves, else 0
+    wheelbase: float
+
+    @property
+    def v_dot(self) -> FloatArray:
+        """Acceleration from the wheels [m/s²]."""
+        return np.asarray(np.gradient(self.v, self.t))
+
+
+def smooth(x: FloatArray, seconds: float = SMOOTH_S) -> FloatArray:
+    """A running mean over `seconds`, taken twice, of what is not NaN; NaN where half of it is."""
+    width = min(max(1, round(seconds * RATE_HZ)), len(x))
+    for _ in range(2):
+        good = np.isfinite(x)
+        total = np.convolve(np.where(good, x, 0.0), np.ones(width), "same")
+        count = np.convolve(good.astype(float), np.ones(width), "same")
+        x = np.where(good & (count > 0.4 * width), total / np.maximum(count, 1.0), np.nan)
+    return x
+
+
+def even(t: FloatArray, x: FloatArray, at: FloatArray) -> FloatArray:
+    """Readings at other times, linear where they are near enough, else NaN."""
+    good = np.isfinite(x)
+    if good.sum() < 2:
+        return np.full(len(at), np.nan)
+    known, values = t[good], x[good]
+    place = np.clip(np.searchsorted(known, at), 1, len(known) - 1)
+    near = (known[place] - known[place - 1] <= JOINED_S) & (at >= known[0]) & (at <= known[-1])
+    return np.where(near, np.interp(at, known, values), np.nan)
+
+
+def over_ground(
+    t: FloatArray, latitude: FloatArray, longitude: FloatArray, at: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Speed [m/s] and course [rad] at times, from fixes half of FIX_S before and behind."""
+    north = even(t, np.radians(latitude) * EARTH_RADIUS_M, at)
+    east = even(t, np.radians(longitude) * EARTH_RADIUS_M, at) * np.cos(np.radians(np.nanmean(latitude)))
+    half = round(0.5 * FIX_S * RATE_HZ)
+    speed, course = np.full(len(at), np.nan), np.full(len(at), np.nan)
+    if len(at) > 2 * half:
+        d_east, d_north = east[2 * half :] - east[: -2 * half], north[2 * half :] - north[: -2 * half]
+        speed[half:-half] = np.hypot(d_east, d_north) / FIX_S
+        course[half:-half] = np.arctan2(d_north, d_east)
+    return speed, course
+
+
+def prepare(t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: FloatArray | None = None) -> EvenDrive:
+    """Signals (T, 18) at times t (T,) [s] as a drive.
+
+    Args:
+        t: times.
+        signals: the channels; readings of a wheel far off the median of the four are left out.
+        vehicle: its radius, tracks and wheelbase.
+        ground: the receiver's own speed (T,) [m/s], where it was recorded; it is better than that of the fixes.
+    """
+    last = min(t[-1], t[0] + LONGEST_S)
+    at = np.arange(t[0], last, 1.0 / RATE_HZ)
+
+    def column(index: int) -> FloatArray:
+        return smooth(even(t, signals[:, index], at))
+
+    wheels = np.stack([even(t, signals[:, S.OMEGA + i], at) for i in range(4)], axis=1) * vehicle.wheel_radius
+    some = np.isfinite(wheels).any(axis=1)
+    middle = np.full(len(at), np.nan)
+    middle[some] = np.nanmedian(wheels[some], axis=1)
+    wheels = np.where(np.abs(wheels - middle[:, None]) > 0.25 * np.abs(middle[:, None]) + 1.0, np.nan, wheels)
+    rims = np.stack([smooth(wheels[:, i]) for i in range(4)], axis=1)
+    v = smooth(np.where(np.isfinite(middle), middle, np.nan))
+    tracks = vehicle.track_front, vehicle.track_rear
+    axles = [(rims[:, 2 * k + 1] - rims[:, 2 * k]) / tracks[k] for k in range(2)]
+    r_wheels = np.where(np.isfinite(axles[1]), axles[1], axles[0])
+    place = signals[:, S.LATITUDE], signals[:, S.LONGITUDE]
+    located = np.isfinite(place[0]).sum() > 5
+    nothing = np.full(len(at), np.nan)
+    v_ground, course = over_ground(t, *place, at) if located else (nothing, nothing)
+    if ground is not None and np.isfinite(ground).sum() > 5:
+        v_ground = smooth(even(t, ground, at))
+    yaw = signals[:, S.YAW]
+    yaw_at = even(t, np.unwrap(yaw), at) if np.isfinite(yaw).all() else _yaw(t, yaw, at)
+    fast = np.nanpercentile(np.abs(v), 95) if np.isfinite(v).any() else 0.0
+    delta = signals[:, S.DELTA]
+    return EvenDrive(
+        t=at, ax=column(S.AX), ay=column(S.AY), r=column(S.YAW_RATE),
+        delta=smooth(even(t, np.where(np.isfinite(delta), delta, signals[:, S.DELTA + 1]), at)), wheels=rims, v=v,
+        r_wheels=r_wheels, v_ground=v_ground, course=course, course_yaw=yaw_at,
+        moving=(np.abs(v) > CREEP * fast).astype(float), wheelbase=vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle,
+    )  # fmt: skip
+
+
+def _yaw(t: FloatArray, yaw: FloatArray, at: FloatArray) -> FloatArray:
+    """The nearest reading of a sparse angle, which must not be averaged across its end."""
+    good = np.flatnonzero(np.isfinite(yaw))
+    if len(good) < 2:
+        return np.full(len(at), np.nan)
+    near = good[np.clip(np.searchsorted(t[good], at), 0, len(good) - 1)]
+    return np.where(np.abs(t[near] - at) < JOINED_S, yaw[near], np.nan)
+
+
+assert len(CHANNELS) == S.YAW + 1

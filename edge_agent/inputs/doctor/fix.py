@@ -1,0 +1,67 @@
+"""Findings to corrections: the profile and the vehicle file as they should have been."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from edge_agent.inputs.doctor.findings import Finding
+from edge_agent.inputs.profile import Channel, Profile
+from schemas.signals import per_wheel
+from schemas.vehicle import Vehicle
+
+OF_DEVICE: Final = {
+    "imu": ("ax", "ay", "yaw_rate"), "steering": per_wheel("delta"), "wheels": per_wheel("omega"),
+    "receiver": ("latitude", "longitude", "yaw"),
+    "delta": per_wheel("delta"), "omega": per_wheel("omega"),
+}  # fmt: skip
+LEFT_RIGHT: Final = (("omega_fl", "omega_fr"), ("omega_rl", "omega_rr"))
+FRONT_REAR: Final = (("omega_fl", "omega_rl"), ("omega_fr", "omega_rr"))
+EXCHANGED: Final = {
+    "exchanged with ay": (("ax", "ay"),), "exchanged with longitude": (("latitude", "longitude"),),
+    "left and right exchanged": LEFT_RIGHT, "front and rear exchanged": FRONT_REAR,
+}  # fmt: skip
+
+
+def fixed(findings: Sequence[Finding], profile: Profile, vehicle: Vehicle) -> tuple[Profile, Vehicle, list[Finding]]:
+    """Profile and vehicle with what the findings say, and the findings that nobody can mend from here."""
+    channels, left = dict(profile.channels), list[Finding]()
+    update: dict[str, object] = {}
+    for finding in findings:
+        if finding.kind in EXCHANGED:
+            for one, other in EXCHANGED[finding.kind]:
+                if one in channels and other in channels:
+                    channels[one], channels[other] = channels[other], channels[one]
+        elif finding.channel == "t" and finding.kind in ("ms", "us", "ns"):
+            update["time_unit"] = finding.kind
+        elif (finding.channel, finding.kind) == ("omega", "radius"):
+            vehicle = vehicle.model_copy(update={"wheel_radius": vehicle.wheel_radius * finding.scale})
+        elif finding.channel == "yaw":
+            channels["yaw"] = _yaw(channels["yaw"], finding.kind)
+        elif finding.scale != 1.0 or finding.offset or finding.delay_s:
+            for name in OF_DEVICE.get(finding.channel, (finding.channel,)):
+                if name in channels:
+                    channels[name] = _corrected(channels[name], finding)
+        else:
+            left.append(finding)
+    if vehicle.wheel_radius != profile.wheel_radius and profile.wheel_radius is not None:
+        update["wheel_radius"] = vehicle.wheel_radius
+    return profile.model_copy(update=update | {"channels": channels}), vehicle, left
+
+
+def _corrected(channel: Channel, finding: Finding) -> Channel:
+    return channel.model_copy(update={
+        "scale": channel.scale * finding.scale, "offset": channel.offset * finding.scale + finding.offset,
+        "delay_s": channel.delay_s + finding.delay_s,
+    })  # fmt: skip
+
+
+def _yaw(channel: Channel, kind: str) -> Channel:
+    update: dict[str, object] = {}
+    if "deg" in kind:
+        update["unit"] = "deg"
+    if "compass" in kind:
+        update["course"] = not channel.course
+    if kind == "sign":
+        update["scale"] = -channel.scale
+    return channel.model_copy(update=update)

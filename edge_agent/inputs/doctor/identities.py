@@ -1,0 +1,206 @@
+"""What must be equal by physics, held against each other: gain, offset, lag and how sure.
+
+identity        left        right       tells
+lateral         a_y         v · r       unit and sign of a_y, v, r
+longitudinal    a_x         dv/dt       unit and sign of a_x, v
+steering        δ · v       L · r       unit and sign of δ, v, r (with understeer · v² r beside it)
+axle            r_w         r           which wheel is left, v, r
+ground          v_g         v           unit of v: the wheels' radius
+turning         d course    r           sign and unit of r
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, smooth
+from schemas.numeric import FloatArray
+
+LONGEST_LAG_S: Final = 1.0
+FEWEST_S: Final = 8.0  # of excitation, below which nothing is said
+SLOW_SHARE: Final = 0.3  # of the regressor's 95 % size, from which on a moment counts as excited
+LEAST_LIKE: Final = 0.5  # correlation from which on a lag is believed
+CORRELATED_S: Final = 1.0  # that far apart two moments tell different things
+
+
+@dataclass(frozen=True)
+class Fit:
+    """left = gain · right + offset (+ what is beside): `error` of ln |gain| (std), correlation, lag of left [s]."""
+
+    gain: float
+    offset: float
+    correlation: float
+    error: float
+    excited_s: float
+    lag_s: float
+    lag_error_s: float
+    left: FloatArray
+    right: FloatArray
+
+    @property
+    def known(self) -> bool:
+        """Whether it tells anything."""
+        return self.excited_s >= FEWEST_S and self.error < 0.3 and abs(self.correlation) > 0.45
+
+
+NOTHING: Final = Fit(np.nan, np.nan, 0.0, np.inf, 0.0, 0.0, np.inf, np.zeros(0), np.zeros(0))
+
+
+class Relation(NamedTuple):
+    """Left and right (n,), what else the left holds, and what the offset goes with, where it is not constant."""
+
+    left: FloatArray
+    right: FloatArray
+    beside: tuple[FloatArray, ...] = ()
+    per: FloatArray | None = None
+
+
+def _lateral(d: EvenDrive) -> Relation:
+    return Relation(d.ay, d.v * d.r)
+
+
+def _longitudinal(d: EvenDrive) -> Relation:
+    # slope, offset and drift lie below .1 Hz; what is left of both sides is braking and accelerating
+    return Relation(d.ax - smooth(d.ax, 10.0), d.v_dot - smooth(d.v_dot, 10.0))
+
+
+def _steering(d: EvenDrive) -> Relation:
+    # times v: turns at walking speed, where the angle is large and its map bent, would else outweigh all others
+    fast = np.nanpercentile(np.abs(d.v), 95) if np.isfinite(d.v).any() else 1.0
+    v = np.where(np.abs(d.v) > 0.25 * fast, d.v, np.nan)
+    return Relation(d.delta * v, d.wheelbase * d.r, (v * v * d.r,), v)
+
+
+def _axle(d: EvenDrive) -> Relation:
+    return Relation(d.r_wheels, d.r, (d.v,))
+
+
+def _ground(d: EvenDrive) -> Relation:
+    return Relation(d.v_ground, smooth(d.v))
+
+
+def _turning(d: EvenDrive) -> Relation:
+    fast = np.nanpercentile(d.v_ground, 95) if np.isfinite(d.v_ground).any() else 0.0
+    known = np.isfinite(d.course) & (d.v_ground > 0.3 * fast)
+    course = np.where(known, d.course, 0.0)
+    rate = np.angle(np.exp(1j * np.diff(course, prepend=course[:1]))) * RATE_HZ
+    rate = np.where(known & np.roll(known, 1), rate, np.nan)
+    return Relation(smooth(rate, 1.0), smooth(smooth(d.r, 1.0)))
+
+
+IDENTITIES: Final[dict[str, Callable[[EvenDrive], Relation]]] = {
+    "lateral": _lateral, "longitudinal": _longitudinal, "steering": _steering, "axle": _axle, "ground": _ground,
+    "turning": _turning,
+}  # fmt: skip
+
+
+def fits(drive: EvenDrive) -> dict[str, Fit]:
+    """Every identity of a drive."""
+    return {name: fit(sides(drive), drive.moving, level=name == "ground") for name, sides in IDENTITIES.items()}
+
+
+def fit(sides: Relation, moving: FloatArray, *, level: bool) -> Fit:
+    """left = gain · right + offset + Σ k · beside, over the moving part, after the lag is taken out.
+
+    The gain is the geometric mean of both regressions, so that noise on either side does not bend it.
+
+    Args:
+        sides: what is held against each other.
+        moving: (n,) bool.
+        level: no offset, and every moving moment is excited: a quantity that is itself large.
+    """
+    left, right, beside, per = sides
+    if level:  # what is large all along has no edge of its own: its change has
+        lag, lag_error = lag_of(np.gradient(smooth(left, 1.0)), np.gradient(smooth(right, 1.0)), moving)
+    else:
+        lag, lag_error = lag_of(left, right, moving)
+    if np.isfinite(lag_error) and abs(lag) > 1.0 / RATE_HZ:
+        left = shifted(left, -lag)
+    good = np.isfinite(left) & np.isfinite(right) & moving.astype(bool)
+    for other in beside:
+        good &= np.isfinite(other)
+    if good.sum() < FEWEST_S * RATE_HZ:
+        return NOTHING
+    x, y = right[good], left[good]
+    size = np.percentile(np.abs(x - (0.0 if level else np.median(x))), 95)
+    excited = np.ones(len(x), bool) if level else np.abs(x - np.median(x)) > SLOW_SHARE * size
+    excited_s = excited.sum() / RATE_HZ
+    others = [] if level else [np.ones(len(x)) if per is None else per[good]]
+    table = np.stack([x, *others, *(other[good] for other in beside)], axis=1)
+    solution = robust(table, y)
+    rest = y - table[:, 1:] @ solution[1:]
+    if level:
+        gain = _ratio(x, y)
+        correlation = float(np.corrcoef(x, y)[0, 1]) if x.std() > 0 and y.std() > 0 else 0.0
+        spread = float(np.std(y - gain * x)) / max(abs(gain) * float(np.sqrt(np.mean(x * x))), 1e-12)
+        error = spread / np.sqrt(max(excited_s / CORRELATED_S, 1.0)) + 0.003
+        return Fit(gain, 0.0, max(correlation, 1.0 - spread), error, excited_s, lag, lag_error, y, x)
+    correlation = float(np.corrcoef(x, rest)[0, 1]) if x.std() > 0 and rest.std() > 0 else 0.0
+    slope = float(np.sign(correlation)) * float(rest.std() / max(x.std(), 1e-12))
+    gain = float(np.sign(solution[0])) * float(np.sqrt(abs(solution[0] * slope))) if correlation else 0.0
+    count = max(excited_s / CORRELATED_S, 1.0)
+    error = float(np.sqrt(max(1.0 - correlation**2, 1e-6) / max(correlation**2, 1e-6) / count))
+    return Fit(gain, float(solution[1]), correlation, error, excited_s, lag, lag_error, y, x)
+
+
+def _ratio(x: FloatArray, y: FloatArray) -> float:
+    big = np.abs(x) > 0.3 * np.percentile(np.abs(x), 95)
+    return float(np.median(y[big] / x[big])) if big.any() else 0.0
+
+
+def robust(table: FloatArray, y: FloatArray) -> FloatArray:
+    """Least squares, twice, the second time without what lies three robust spreads off."""
+    solution = np.linalg.lstsq(table, y, rcond=None)[0]
+    off = np.abs(y - table @ solution)
+    near = off <= 3.0 * 1.4826 * np.median(off) + 1e-12
+    if near.sum() > 10 * table.shape[1]:
+        solution = np.linalg.lstsq(table[near], y[near], rcond=None)[0]
+    return np.asarray(solution)
+
+
+def shifted(x: FloatArray, seconds: float) -> FloatArray:
+    """x at times later by `seconds`: positive moves it back to where it belongs when it is early."""
+    n = np.arange(len(x))
+    good = np.isfinite(x)
+    if good.sum() < 2:
+        return x
+    at = n - seconds * RATE_HZ
+    moved = np.interp(at, n[good], x[good])
+    return np.where(np.interp(at, n, good.astype(float), left=0.0, right=0.0) > 0.5, moved, np.nan)
+
+
+def lag_of(left: FloatArray, right: FloatArray, moving: FloatArray) -> tuple[float, float]:
+    """Seconds that `left` is behind `right`, by the peak of |correlation|, and its error; infinite where unknown.
+
+    The two halves of the drive are asked as well: what they differ by is an error too.
+    """
+    lag, sharp = _peak(left, right, moving)
+    if not sharp:
+        return 0.0, np.inf
+    half = len(left) // 2
+    parts = [_peak(left[p], right[p], moving[p]) for p in (slice(None, half), slice(half, None))]
+    apart = [abs(part[0] - lag) for part in parts if part[1]]
+    return lag, 0.02 + (0.7 * float(np.mean(apart)) if apart else 0.1)
+
+
+def _peak(left: FloatArray, right: FloatArray, moving: FloatArray) -> tuple[float, bool]:
+    good = np.isfinite(left) & np.isfinite(right) & moving.astype(bool)
+    if good.sum() < FEWEST_S * RATE_HZ:
+        return 0.0, False
+    x, y = (np.where(good, side - np.mean(side[good]), 0.0) for side in (right, left))
+    most, size = round(LONGEST_LAG_S * RATE_HZ), len(x) + round(LONGEST_LAG_S * RATE_HZ)
+    spectrum = np.fft.irfft(np.fft.rfft(y, size) * np.conj(np.fft.rfft(x, size)), size)
+    across = np.abs(np.concatenate([spectrum[-most:], spectrum[: most + 1]]))
+    scale = np.sqrt(float(np.sum(x * x)) * float(np.sum(y * y)))
+    top = int(np.argmax(across))
+    if scale == 0.0 or across[top] < LEAST_LIKE * scale or top in (0, 2 * most):
+        return 0.0, False
+    before, here, after = across[top - 1 : top + 2]
+    bend = before - 2.0 * here + after
+    lag = (top - most + (0.5 * (before - after) / bend if bend < 0.0 else 0.0)) / RATE_HZ
+    sharp = across[max(top - 15, 0)] < 0.985 * here or across[min(top + 15, 2 * most)] < 0.985 * here
+    return float(lag), bool(sharp)

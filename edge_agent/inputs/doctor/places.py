@@ -1,0 +1,72 @@
+"""Where the receiver says the car is, and where it points: latitude and longitude exchanged, a compass for yaw."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from edge_agent.inputs.doctor.drive import EvenDrive, over_ground
+from schemas.numeric import FloatArray
+from schemas.signals import S
+
+if TYPE_CHECKING:
+    from edge_agent.inputs.doctor.findings import Finding
+
+FEWEST: Final = 200  # moments, four seconds
+BETTER: Final = 0.25  # by which another reading of yaw must fit the course better (mean resultant length)
+STEADIER: Final = 0.5  # of the spread of ground speed over wheel speed, that exchanging must leave
+# what the log's yaw may be instead: how to make ours of it
+COMPASS: Final[dict[str, Callable[[FloatArray], FloatArray]]] = {
+    "compass": lambda yaw: np.pi / 2.0 - yaw,
+    "deg": np.radians,
+    "compass, deg": lambda yaw: np.pi / 2.0 - np.radians(yaw),
+    "sign": lambda yaw: -yaw,
+}
+
+
+def yaw_findings(signals: FloatArray, drive: EvenDrive) -> list[Finding]:
+    """Faults of yaw."""
+    from edge_agent.inputs.doctor.findings import Finding
+
+    findings = []
+    if np.isfinite(signals[:, S.LATITUDE]).sum() < 10:
+        return []
+    fast = np.nanpercentile(np.abs(drive.v), 95)
+    good = np.isfinite(drive.course) & np.isfinite(drive.course_yaw) & (np.abs(drive.v) > 0.3 * fast)
+    if good.sum() > FEWEST and np.ptp(np.unwrap(drive.course[good])) > 0.5:
+        yaw, course = drive.course_yaw[good], drive.course[good]
+        fits = {name: _agreement(made(yaw), course) for name, made in COMPASS.items()}
+        best = max(fits, key=lambda name: fits[name])
+        if fits[best] > _agreement(yaw, course) + BETTER:
+            words = f"agrees with the course over ground only as {best} ({fits[best]:.2f} of 1)"
+            findings.append(Finding("yaw", best, words))
+    return findings
+
+
+def _agreement(yaw: FloatArray, course: FloatArray) -> float:
+    """1 where they are equal, by the part of the mean resultant that lies along no difference at all."""
+    return float(np.mean(np.cos(yaw - course)))
+
+
+def exchanged(t: FloatArray, signals: FloatArray, drive: EvenDrive) -> bool:
+    """Whether the fixes go as the wheels do only when latitude and longitude are exchanged."""
+    latitude, longitude = signals[:, S.LATITUDE], signals[:, S.LONGITUDE]
+    if np.isfinite(latitude).sum() < 10:
+        return False
+    if np.nanmax(np.abs(latitude)) > 90.0:
+        return True
+    if np.nanmax(np.abs(longitude)) > 90.0:
+        return False
+    good = (drive.moving > 0) & np.isfinite(drive.v_ground) & (drive.v != 0.0)
+    if good.sum() < FEWEST:
+        return False
+    other, course = over_ground(t, longitude, latitude, drive.t)
+    spreads, turns = [], []
+    for speed, way in ((drive.v_ground, drive.course), (other, course)):
+        ratio = np.log(np.maximum(speed[good], 1e-3) / np.abs(drive.v[good]))
+        spreads.append(float(np.percentile(ratio, 84) - np.percentile(ratio, 16)))
+        rate = np.diff(np.unwrap(way[good]))
+        turns.append(float(np.sum(rate * drive.r[good][1:])))
+    return spreads[1] < STEADIER * spreads[0] and turns[1] * turns[0] <= 0.0

@@ -1,0 +1,95 @@
+"""The doctor's findings as lines for a terminal, and as one page with plots that needs nothing beside it."""
+
+from __future__ import annotations
+
+from html import escape
+from typing import Final
+
+import numpy as np
+
+from edge_agent.inputs.doctor.findings import Diagnosis
+from edge_agent.inputs.doctor.identities import Fit
+from schemas.numeric import FloatArray
+
+AXES: Final = {
+    "lateral": ("v · yaw rate [m/s²]", "ay [m/s²]"), "longitudinal": ("dv/dt of the wheels [m/s²]", "ax [m/s²]"),
+    "steering": ("L · yaw rate / v [rad]", "delta [rad]"), "axle": ("yaw rate [rad/s]", "of the wheels [rad/s]"),
+    "ground": ("speed of the wheels [m/s]", "speed over ground [m/s]"),
+    "turning": ("yaw rate [rad/s]", "of the course [rad/s]"),
+}  # fmt: skip
+POINTS: Final = 600
+SIDE: Final = 260  # of a plot [pixel]
+EDGE: Final = 36
+STYLE: Final = (
+    "body{font:15px/1.5 system-ui,sans-serif;max-width:60em;margin:2em auto;padding:0 1em;color:#222}"
+    "table{border-collapse:collapse}td,th{padding:.2em .8em;border-bottom:1px solid #ddd;text-align:left}"
+    "figure{display:inline-block;margin:.5em}figcaption{font-size:13px;color:#555}.bad{color:#b00020}"
+)
+
+
+def lines(said: Diagnosis) -> list[str]:
+    """What was found, a line each."""
+    told = [f"{'FAULT':<8} {f.channel:<10} {f.kind:<24} {f.words}" for f in said.findings]
+    told += [f"{'unknown':<8} {channel:<10} nothing in this drive tells" for channel in said.unknown]
+    return [*told, *(f"{'sound':<8} {channel}" for channel in said.sound)]
+
+
+def advice(said: Diagnosis) -> str:
+    """One line: whether the log may be published, and what to do if not."""
+    if said.passed:
+        return "passed: units, signs, clocks and offsets agree with each other"
+    if said.findings:
+        return "not passed: correct the profile (--fix writes it), import again"
+    return "not passed: drive half a minute with turns and some braking, or vouch for it with --trust"
+
+
+def page(said: Diagnosis, title: str) -> str:
+    """A page of HTML: verdict, findings, and each identity as a plot."""
+    rows = [f"<tr class='bad'><td>{escape(f.channel)}<td>{escape(f.kind)}<td>{escape(f.words)}" for f in said.findings]
+    rows += [f"<tr><td>{escape(channel)}<td>unknown<td>nothing in this drive tells" for channel in said.unknown]
+    rows += [f"<tr><td>{escape(channel)}<td>sound<td>" for channel in said.sound]
+    plots = "".join(_figure(name, fit) for name, fit in said.fits.items() if len(fit.right))
+    return (
+        f"<!doctype html><meta charset='utf-8'><title>{escape(title)}</title><style>{STYLE}</style>"
+        f"<h1>{escape(title)}</h1><p>{escape(advice(said))}</p>"
+        f"<table><tr><th>channel<th>finding<th>evidence{''.join(rows)}</table>{_table(said.fits)}{plots}\n"
+    )
+
+
+def _table(fits: dict[str, Fit]) -> str:
+    rows = [
+        f"<tr><td>{name}<td>{fit.gain:.3g}<td>{fit.offset:.3g}<td>{fit.correlation:.2f}<td>{fit.excited_s:.0f}"
+        f"<td>{fit.lag_s:+.2f} ± {fit.lag_error_s:.2f}"
+        for name, fit in fits.items()
+        if len(fit.right)
+    ]
+    return f"<table><tr><th>identity<th>gain<th>offset<th>correlation<th>excited [s]<th>lag [s]{''.join(rows)}</table>"
+
+
+def _figure(name: str, fit: Fit) -> str:
+    """A scatter of both sides, with the identity itself (grey) and what was found (red)."""
+    step = max(1, len(fit.right) // POINTS)
+    x, y = fit.right[::step], fit.left[::step]
+    low, high = (float(np.percentile(x, q)) for q in (0.5, 99.5))
+    bottom, top = (float(np.percentile(y, q)) for q in (0.5, 99.5))
+    if not (high > low and top > bottom):
+        return ""
+
+    def at(across: FloatArray, up: FloatArray) -> list[str]:
+        right = EDGE + (across - low) / (high - low) * (SIDE - 2 * EDGE)
+        down = SIDE - EDGE - (up - bottom) / (top - bottom) * (SIDE - 2 * EDGE)
+        return [f"{px:.0f},{py:.0f}" for px, py in zip(np.clip(right, 0, SIDE), np.clip(down, 0, SIDE), strict=True)]
+
+    dots = "".join(f"<circle cx='{p.split(',')[0]}' cy='{p.split(',')[1]}' r='1.3'/>" for p in at(x, y))
+    ends = np.array([low, high])
+    law, found = (" ".join(at(ends, gain * ends + fit.offset)) for gain in (1.0, fit.gain))
+    across, up = AXES[name]
+    return (
+        f"<figure><svg width='{SIDE}' height='{SIDE}' viewBox='0 0 {SIDE} {SIDE}' role='img'>"
+        f"<g fill='#3465a4' fill-opacity='.5'>{dots}</g>"
+        f"<polyline points='{law}' stroke='#999' fill='none'/><polyline points='{found}' stroke='#b00020' fill='none'/>"
+        f"<text x='{SIDE / 2}' y='{SIDE - 8}' font-size='12' text-anchor='middle'>{across}</text>"
+        f"<text x='12' y='{SIDE / 2}' font-size='12' text-anchor='middle' "
+        f"transform='rotate(-90 12 {SIDE / 2})'>{up}</text>"
+        f"</svg><figcaption>{name}: gain {fit.gain:.3g} (1 is right)</figcaption></figure>"
+    )

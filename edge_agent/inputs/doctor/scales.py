@@ -1,0 +1,195 @@
+"""Which quantities have a wrong unit, sign or clock: the fewest faults that explain all identities.
+
+Every quantity may be sound or have one of a few faults, each a factor on what is recorded (Occam: a fault costs as much
+as FAULT_COST / 2 in log probability, since few columns are wrong). An identity says, in logarithms,
+
+    ln |gain| = ln centre + Σ ± ln factor of the quantities in it + error,        sign(gain) = Π sign(factor)
+
+Every set of at most two faulty quantities is tried. A quantity is settled when all explanations that say otherwise of
+it cost SETTLED more. Clocks likewise: the lag of an identity is the difference of two devices' lags.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import combinations, product
+from typing import Final, NamedTuple
+
+from edge_agent.inputs.doctor.identities import Fit
+from edge_agent.inputs.units import ANGLE, DEG, SPEED
+from schemas.thresholds import GRAVITY
+from schemas.vehicle import Vehicle
+
+FAULT_COST: Final = 12.0  # a fault must explain three and a half standard deviations
+CLOCK_SETTLED: Final = 3.0  # beside LATE_S, which no sound clock reaches
+SETTLED: Final = 9.0  # odds of 90 to 1
+ALIKE: Final = 0.08  # of factors in logarithms
+WRONG_SIGN: Final = 60.0  # cost of a sign that nothing explains, at full correlation
+
+
+class Mistake(NamedTuple):
+    """A fault of a quantity: what it is called, and what the recorded value is of the true one."""
+
+    name: str
+    factor: float
+
+
+class Member(NamedTuple):
+    """A quantity in an identity, and the power of its factor in the gain."""
+
+    quantity: str
+    power: int
+
+
+class Law(NamedTuple):
+    """An identity's gain if all is sound, the spread of its logarithm among sound cars, and what it holds."""
+
+    centre: float
+    spread: float
+    members: tuple[Member, ...]
+
+
+# centres and spreads: bodies that roll make a_y larger (4 to 7 degrees a g), pitch a_x; steering bends by understeer
+LAWS: Final = {
+    "lateral": Law(1.03, 0.06, (Member("ay", 1), Member("v", -1), Member("r", -1))),
+    "longitudinal": Law(1.02, 0.10, (Member("ax", 1), Member("v", -1))),
+    "steering": Law(1.0, 0.18, (Member("delta", 1), Member("v", 1), Member("r", -1))),
+    "axle": Law(1.0, 0.08, (Member("v", 1), Member("r", -1), Member("sides", 1))),
+    "ground": Law(1.0, 0.015, (Member("v", -1),)),
+    "turning": Law(1.0, 0.08, (Member("r", -1), Member("place", 1))),
+}  # fmt: skip
+FLIPPED: Final = Mistake("sign", -1.0)
+QUANTITIES: Final = ("ax", "ay", "r", "delta", "v", "sides", "place")
+# the clocks of the devices: identity -> (device on the left, device on the right)
+CLOCKS: Final = {"longitudinal": ("imu", "wheels"), "axle": ("wheels", "imu"), "steering": ("steering", "imu"),
+                 "ground": ("receiver", "wheels"), "turning": ("receiver", "imu")}  # fmt: skip
+CLOCK_SPREAD_S: Final = {"longitudinal": 0.06, "axle": 0.04, "steering": 0.06, "ground": 0.05, "turning": 0.12}
+CLOCK_CENTRE_S: Final = {"longitudinal": 0.03, "axle": 0.0, "steering": -0.05, "ground": 0.0, "turning": -0.06}
+LATE_S: Final = 0.15  # a clock this far off is a fault; sound logs lie within .1
+CLOCK_COST: Final = 4.0  # lags have no table of faults that one could hit by chance
+
+
+def faults_of(vehicle: Vehicle, ground: Fit) -> dict[str, list[Mistake]]:
+    """What each quantity may have."""
+    g, deg, ratio, radius = 1.0 / GRAVITY, 1.0 / DEG, vehicle.steering_ratio or 16.0, vehicle.wheel_radius
+    rims = [Mistake(unit, radius / SPEED[unit]) for unit in SPEED]
+    if ground.known and 0.7 < ground.gain < 1.4 and abs(ground.gain - 1.0) > 0.03:
+        rims.append(Mistake("radius", 1.0 / ground.gain))
+    angles = [
+        Mistake("deg", 1.0 / ANGLE["deg"]),
+        Mistake("steering wheel", ratio),
+        Mistake("steering wheel, deg", ratio * deg),
+    ]
+    return {
+        "ax": [FLIPPED, Mistake("g", g), Mistake("g, sign", -g)],
+        "ay": [FLIPPED, Mistake("g", g), Mistake("g, sign", -g)],
+        "r": [FLIPPED, Mistake("deg/s", deg), Mistake("deg/s, sign", -deg)],
+        "delta": [FLIPPED, *angles, *(Mistake(f"{name}, sign", -factor) for name, factor in angles)],
+        "v": [*rims, Mistake("deg/s", deg), Mistake("rpm", 60.0 / (2.0 * math.pi))],
+        "sides": [Mistake("left and right exchanged", -1.0)],
+        "place": [Mistake("mirrored", -1.0)],
+    }
+
+
+# several quantities that go wrong for one reason count as one fault
+JOINT: Final = (
+    (("ay", "sign"), ("r", "sign")), (("ax", "g"), ("ay", "g")), (("ax", "sign"), ("ay", "sign")),
+    (("ay", "sign"), ("r", "sign"), ("delta", "sign")),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Of each quantity: the fault or None, and by how much the best explanation that differs costs more."""
+
+    faults: dict[str, Mistake | None]
+    margins: dict[str, float]
+
+    def settled(self, quantity: str) -> bool:
+        """Whether nothing else is plausible of it."""
+        return self.margins[quantity] >= SETTLED
+
+
+def explain(found: Mapping[str, Fit], vehicle: Vehicle) -> Verdict:
+    """The fewest faults of unit and sign that explain the identities."""
+    choices = faults_of(vehicle, found["ground"])
+    known = {name: fit for name, fit in found.items() if fit.known}
+    costs: list[tuple[float, dict[str, Mistake]]] = []
+    for guess, price in _guesses(choices):
+        costs.append((price + sum(_misfit(name, fit, guess) for name, fit in known.items()), guess))
+    best_cost, best = min(costs, key=lambda pair: pair[0])
+    margins = {}
+    for quantity in QUANTITIES:
+        others = [cost for cost, guess in costs if not _alike(guess.get(quantity), best.get(quantity))]
+        margins[quantity] = min(others) - best_cost if _asked(quantity, known) else 0.0
+    return Verdict({quantity: best.get(quantity) for quantity in QUANTITIES}, margins)
+
+
+def _alike(one: Mistake | None, other: Mistake | None) -> bool:
+    """Whether two faults come to the same: km/h is a radius of .28 m, which no drive tells from a wrong one."""
+    if one is None or other is None:
+        return one is other
+    return abs(math.log(abs(one.factor / other.factor))) < ALIKE and one.factor * other.factor > 0.0
+
+
+def _asked(quantity: str, known: Mapping[str, Fit]) -> bool:
+    return any(member.quantity == quantity for name in known for member in LAWS[name].members)
+
+
+def _guesses(choices: Mapping[str, list[Mistake]]) -> Iterator[tuple[dict[str, Mistake], float]]:
+    yield {}, 0.0
+    for count in (1, 2):
+        for quantities in combinations(QUANTITIES, count):
+            for faults in product(*(choices[quantity] for quantity in quantities)):
+                odd = sum(fault.name == "radius" for fault in faults)  # a known unit is the likelier of two alike
+                yield dict(zip(quantities, faults, strict=True)), FAULT_COST * count + odd
+    for joint in JOINT:
+        chosen = {q: next(f for f in choices[q] if f.name == name) for q, name in joint}
+        yield chosen, 1.25 * FAULT_COST
+
+
+def _misfit(name: str, fit: Fit, guess: Mapping[str, Mistake]) -> float:
+    law = LAWS[name]
+    factor = law.centre
+    for quantity, power in law.members:
+        if quantity in guess:
+            factor *= guess[quantity].factor ** power
+    away = math.log(abs(fit.gain) / abs(factor)) if fit.gain else 10.0
+    cost = away**2 / (law.spread**2 + fit.error**2)
+    if fit.gain * factor < 0.0:
+        cost += WRONG_SIGN * fit.correlation**2
+    return min(cost, 400.0)
+
+
+def clocks(found: Mapping[str, Fit]) -> dict[str, tuple[float, float]]:
+    """Device -> (seconds that its clock is late, the margin of that), for the fewest late devices; empty for none."""
+    known = {
+        name: fit for name, fit in found.items() if name in CLOCKS and fit.known and math.isfinite(fit.lag_error_s)
+    }
+    devices = sorted({device for name in known for device in CLOCKS[name]})
+
+    def cost(late: Mapping[str, float]) -> float:
+        total = 0.0
+        for name, fit in known.items():
+            left, right = CLOCKS[name]
+            away = fit.lag_s - CLOCK_CENTRE_S[name] - late.get(left, 0.0) + late.get(right, 0.0)
+            total += min(away**2 / (CLOCK_SPREAD_S[name] ** 2 + fit.lag_error_s**2), 100.0)
+        return total
+
+    base, options = cost({}), []
+    for device in devices:
+        guesses = []
+        for name, fit in known.items():
+            if device in CLOCKS[name]:
+                sign = 1.0 if CLOCKS[name][0] == device else -1.0
+                guesses.append(sign * (fit.lag_s - CLOCK_CENTRE_S[name]))
+        options += [(cost({device: guess}) + CLOCK_COST, device, guess) for guess in guesses]
+    if not options:
+        return {}
+    best, device, late = min(options)
+    if abs(late) < LATE_S or best > base:
+        return {}
+    rivals = [other for other, name, _ in options if name != device]
+    return {device: (late, min([base, *rivals]) - best)}

@@ -1,0 +1,192 @@
+"""Mistakes of recordings, planted into simulated drives: what the signal doctor has to find and name.
+
+Sizes are those met when foreign logs were brought in: units, signs, offsets, a clock .4 s off, status bits in a wheel
+speed, exchanged columns, and a vehicle file with another tyre.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Final, NamedTuple, TypeAlias
+
+import numpy as np
+
+from edge_agent.inputs.doctor.findings import diagnose
+from edge_agent.inputs.units import DEG, SPEED
+from edge_agent.lab.simulation import SimulatedFleet
+from schemas.numeric import FloatArray
+from schemas.runtime.figures import Figure
+from schemas.signals import S
+from schemas.thresholds import GRAVITY
+from schemas.vehicle import Vehicle
+
+RATE_HZ: Final = 100.0
+DRIVE_S: Final = 150
+LATE: Final = 40  # samples
+RATIO: Final = 16.0  # of the steering
+STATUS: Final = 512.0 / 3.6  # [m/s] that a status bit adds
+OMEGA = list(range(S.OMEGA, S.OMEGA + 4))
+DELTA = list(range(S.DELTA, S.DELTA + 4))
+IMU = [S.AX, S.AY, S.YAW_RATE]
+PLACE = [S.LATITUDE, S.LONGITUDE, S.YAW]
+
+
+class Recorded(NamedTuple):
+    """A drive: t (T,), signals (T, 18), and the vehicle file."""
+
+    t: FloatArray
+    signals: FloatArray
+    vehicle: Vehicle
+
+
+Spoil: TypeAlias = Callable[[Recorded], Recorded]
+
+
+class Planted(NamedTuple):
+    """A mistake, and the finding that names it: channel and kind."""
+
+    spoil: Spoil
+    channel: str
+    kind: str
+
+
+def scaled(columns: Sequence[int], factor: float | Callable[[float], float]) -> Spoil:
+    """Columns times a factor, which may depend on the wheel's radius."""
+
+    def spoil(drive: Recorded) -> Recorded:
+        signals = drive.signals.copy()
+        signals[:, columns] *= factor(drive.vehicle.wheel_radius) if callable(factor) else factor
+        return drive._replace(signals=signals)
+
+    return spoil
+
+
+def moved(columns: Sequence[int], offset: float) -> Spoil:
+    """Columns plus an offset."""
+
+    def spoil(drive: Recorded) -> Recorded:
+        signals = drive.signals.copy()
+        signals[:, columns] += offset
+        return drive._replace(signals=signals)
+
+    return spoil
+
+
+def late(columns: Sequence[int]) -> Spoil:
+    """Columns LATE samples late."""
+
+    def spoil(drive: Recorded) -> Recorded:
+        signals = drive.signals.copy()
+        signals[LATE:, columns] = drive.signals[:-LATE, columns]
+        signals[:LATE, columns] = drive.signals[0, columns]
+        return drive._replace(signals=signals)
+
+    return spoil
+
+
+def exchanged(one: Sequence[int], other: Sequence[int]) -> Spoil:
+    """Columns in each other's place."""
+
+    def spoil(drive: Recorded) -> Recorded:
+        signals = drive.signals.copy()
+        signals[:, [*one, *other]] = drive.signals[:, [*other, *one]]
+        return drive._replace(signals=signals)
+
+    return spoil
+
+
+def status_bits(drive: Recorded) -> Recorded:
+    """A bit above the number of a wheel speed, set in a third of the readings."""
+    signals = drive.signals.copy()
+    signals[np.arange(len(signals)) % 7 < 2, S.OMEGA] += STATUS / drive.vehicle.wheel_radius
+    return drive._replace(signals=signals)
+
+
+def compass(drive: Recorded) -> Recorded:
+    """Yaw clockwise from north."""
+    signals = drive.signals.copy()
+    signals[:, S.YAW] = math.pi / 2.0 - signals[:, S.YAW]
+    return drive._replace(signals=signals)
+
+
+def other_tyre(drive: Recorded) -> Recorded:
+    """A vehicle file whose radius is a tenth too small."""
+    radius = 0.9 * drive.vehicle.wheel_radius
+    return drive._replace(vehicle=drive.vehicle.model_copy(update={"wheel_radius": radius}))
+
+
+def rim(unit: str) -> Callable[[float], float]:
+    """Wheel speeds given as speeds at the rim."""
+    return lambda radius: radius / SPEED[unit]
+
+
+PLANTED: Final = {
+    "a_x in g": Planted(scaled([S.AX], 1.0 / GRAVITY), "ax", "g"),
+    "a_y in g": Planted(scaled([S.AY], 1.0 / GRAVITY), "ay", "g"),
+    "both in g": Planted(scaled([S.AX, S.AY], 1.0 / GRAVITY), "ax", "g"),
+    "yaw rate in deg/s": Planted(scaled([S.YAW_RATE], 1.0 / DEG), "yaw_rate", "deg/s"),
+    "steering in deg": Planted(scaled(DELTA, 1.0 / DEG), "delta", "deg"),
+    "steering wheel": Planted(scaled(DELTA, RATIO), "delta", "steering wheel"),
+    "steering wheel in deg": Planted(scaled(DELTA, RATIO / DEG), "delta", "steering wheel, deg"),
+    "wheels in km/h": Planted(scaled(OMEGA, rim("km/h")), "omega", "km/h"),
+    "wheels in m/s": Planted(scaled(OMEGA, rim("m/s")), "omega", "m/s"),
+    "wheels in mph": Planted(scaled(OMEGA, rim("mph")), "omega", "mph"),
+    "wheels in rpm": Planted(scaled(OMEGA, 30.0 / math.pi), "omega", "rpm"),
+    "wheels in deg/s": Planted(scaled(OMEGA, 1.0 / DEG), "omega", "deg/s"),
+    "time in ms": Planted(lambda drive: drive._replace(t=1000.0 * drive.t), "t", "ms"),
+    "a_x flipped": Planted(scaled([S.AX], -1.0), "ax", "sign"),
+    "a_y flipped": Planted(scaled([S.AY], -1.0), "ay", "sign"),
+    "yaw rate flipped": Planted(scaled([S.YAW_RATE], -1.0), "yaw_rate", "sign"),
+    "steering flipped": Planted(scaled(DELTA, -1.0), "delta", "sign"),
+    "a_y and yaw rate flipped": Planted(scaled([S.AY, S.YAW_RATE], -1.0), "ay", "sign"),
+    "a_x and a_y exchanged": Planted(exchanged([S.AX], [S.AY]), "ax", "exchanged with ay"),
+    "a_x offset": Planted(moved([S.AX], 2.0), "ax", "offset"),
+    "a_y offset": Planted(moved([S.AY], 1.2), "ay", "offset"),
+    "yaw rate offset": Planted(moved([S.YAW_RATE], 0.04), "yaw_rate", "offset"),
+    "steering offset": Planted(moved(DELTA, 0.035), "delta", "offset"),
+    "one wheel smaller": Planted(scaled([S.OMEGA], 1.05), "omega_fl", "radius"),
+    "radius of the file": Planted(other_tyre, "omega", "radius"),
+    "inertial unit late": Planted(late(IMU), "imu", "clock"),
+    "steering late": Planted(late(DELTA), "steering", "clock"),
+    "receiver late": Planted(late(PLACE), "receiver", "clock"),
+    "wheels late": Planted(late(OMEGA), "wheels", "clock"),
+    "status bits": Planted(status_bits, "omega_fl", "status bits"),
+    "left and right": Planted(exchanged(OMEGA[::2], OMEGA[1::2]), "omega", "left and right exchanged"),
+    "front and rear": Planted(exchanged(OMEGA[:2], OMEGA[2:]), "omega", "front and rear exchanged"),
+    "latitude and longitude": Planted(exchanged([S.LATITUDE], [S.LONGITUDE]), "latitude", "exchanged with longitude"),
+    "compass for yaw": Planted(compass, "yaw", "compass"),
+    "yaw in deg": Planted(scaled([S.YAW], 1.0 / DEG), "yaw", "deg"),
+}  # fmt: skip
+RADII_ALIKE: Final = ({"km/h", "radius", "mph", "kn"},)  # factors near one: no drive tells a unit from another tyre
+
+
+def drives(count: int, seed: int, *, rough: bool, seconds: int = DRIVE_S) -> list[Recorded]:
+    """Drives through the demonstration's town; rough: on its hills, with the devices of real cars."""
+    fleet = SimulatedFleet("hills" if rough else "demo", count, seed, RATE_HZ, rough=float(rough))
+    parts = [fleet.step(round(RATE_HZ)) for _ in range(seconds)]
+    t, signals = (np.concatenate([part[k] for part in parts]) for k in range(2))
+    return [Recorded(t[:, n], signals[:, n], fleet.vehicles[n]) for n in range(count)]
+
+
+def named(planted: Planted, drive: Recorded) -> tuple[bool, bool]:
+    """Whether the doctor names the mistake, and whether it lets the drive pass."""
+    said = diagnose(*planted.spoil(drive))
+    found = {(finding.channel, finding.kind) for finding in said.findings}
+    same = next((kinds for kinds in RADII_ALIKE if planted.kind in kinds), {planted.kind})
+    return any((planted.channel, kind) in found for kind in same), said.passed
+
+
+def figures(count: int, seed: int) -> list[Figure]:
+    """Shares over all mistakes and drives, smooth and rough; the drives without a mistake as the control."""
+    cars = [*drives(count, seed, rough=False), *drives(count, seed + 1, rough=True)]
+    clean = [diagnose(*drive) for drive in cars]
+    tries = [named(planted, drive) for planted in PLANTED.values() for drive in cars]
+    channels = sum(len(said.sound) + len(said.unknown) + len(said.findings) for said in clean)
+    return [
+        Figure("doctor.faults_named", sum(hit for hit, _ in tries) / len(tries), "1", 0.95, "more"),
+        Figure("doctor.false_accusations", sum(len(said.findings) for said in clean) / channels, "1", 0.01),
+        Figure("doctor.clean_passed", sum(said.passed for said in clean) / len(clean), "1"),
+        Figure("doctor.published_wrong", float(sum(passed for _, passed in tries)), "drives", 0.0),
+        Figure("doctor.tries", float(len(tries)), "drives"),
+    ]

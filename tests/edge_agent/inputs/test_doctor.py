@@ -1,0 +1,133 @@
+"""The signal doctor: planted mistakes are named, sound drives and the real minute pass, corrections correct."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from edge_agent.cli import main
+from edge_agent.inputs.doctor.findings import diagnose
+from edge_agent.lab.evaluation.planted import PLANTED, Recorded, drives, named
+from schemas.signals import CHANNELS, S
+from tests.edge_agent.inputs.formats import BLF, NMEA, VEHICLE
+from tests.edge_agent.service import Router, Service
+
+Output = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(scope="module")
+def rough() -> Recorded:
+    """Two minutes and a half of a car whose devices are as in real cars, on hills."""
+    return drives(1, 23, rough=True)[0]
+
+
+def write(path: Path, drive: Recorded) -> list[str]:
+    columns = {"t": pa.array(drive.t)}
+    columns |= {name: pa.array(drive.signals[:, i], from_pandas=True) for i, name in enumerate(CHANNELS)}
+    pq.write_table(pa.table(columns), path)
+    path.with_suffix(".json").write_text(drive.vehicle.model_dump_json(exclude_none=True))
+    return [str(path), "--vehicle", str(path.with_suffix(".json"))]
+
+
+@pytest.mark.parametrize("name", PLANTED)
+def test_a_planted_mistake_is_named_and_does_not_pass(rough: Recorded, name: str) -> None:
+    found, passed = named(PLANTED[name], rough)
+    assert found
+    assert not passed
+
+
+def test_a_sound_drive_passes_with_its_tilts_offsets_and_lags(rough: Recorded) -> None:
+    said = diagnose(*rough)
+    assert said.passed
+    assert set(said.sound) == {"ax", "ay", "yaw_rate", "delta", "omega", "latitude"}
+
+
+def test_a_standing_car_tells_nothing_and_does_not_pass(rough: Recorded) -> None:
+    still = rough.signals[:3000].copy()
+    still[:, : S.LATITUDE] = 0.0
+    still[:, S.LATITUDE :] = np.nan
+    said = diagnose(rough.t[:3000], still, rough.vehicle)
+    assert not said.findings
+    assert set(said.unknown) == {"ax", "ay", "yaw_rate", "delta", "omega"}
+    assert not said.passed
+
+
+@pytest.mark.parametrize(
+    "name", ["yaw rate in deg/s", "a_y flipped", "steering late", "radius of the file", "left and right"]
+)
+def test_a_fix_makes_the_drive_pass(rough: Recorded, tmp_path: Path, name: str, capsys: Output) -> None:
+    log = write(tmp_path / "bad.parquet", PLANTED[name].spoil(rough))
+    page, profile = tmp_path / "page.html", tmp_path / "fixed.json"
+    assert main(["check", *log, "--fix", str(profile), "--out", str(page)]) == 1
+    assert PLANTED[name].kind in capsys.readouterr().out
+    assert page.read_text().count("<svg") >= 5
+    good = str(tmp_path / "good.parquet")
+    assert main(["import", log[0], "--profile", str(profile), "--vehicle", log[2], "--out", good]) == 0
+    assert main(["check", good, *log[1:]]) == 0
+
+
+@pytest.mark.timeout(600)  # the kernels of the default estimator may have to be compiled
+def test_the_first_drive(tmp_path: Path, router: Router, service: Service, capsys: Output) -> None:
+    """The README's five lines on the real minute."""
+    log, page, out = (str(tmp_path / name) for name in ("drive.parquet", "check.html", "estimates.parquet"))
+    car = ["--vehicle", str(VEHICLE)]
+    config = {"zenoh": router.settings.model_dump(), "spool": str(tmp_path / "spool.sqlite")}
+    (tmp_path / "agent.json").write_text(json.dumps(config))
+    assert main(["import", str(BLF), str(NMEA), "--profile", "toyota", *car, "--out", log]) == 0
+    assert main(["check", log, *car, "--out", page]) == 0
+    publish = ["--publish", "--name", "car-one", "--config", str(tmp_path / "agent.json")]
+    assert main(["replay", log, *car, "--out", out, *publish]) == 0
+    said = capsys.readouterr()
+    assert "passed" in said.out
+    assert "NOT PLAUSIBLE" not in said.err
+    assert json.loads(said.out.splitlines()[-1])["observations_acknowledged"] > 50
+
+
+def test_what_has_not_passed_is_not_published_unless_it_is_trusted(
+    rough: Recorded, tmp_path: Path, router: Router, service: Service, capsys: Output
+) -> None:
+    bad = PLANTED["yaw rate in deg/s"].spoil(rough)
+    log = write(tmp_path / "bad.parquet", bad._replace(t=bad.t[:3000], signals=bad.signals[:3000]))
+    config = {"zenoh": router.settings.model_dump(), "spool": str(tmp_path / "spool.sqlite")}
+    (tmp_path / "agent.json").write_text(json.dumps(config))
+    send = ["--estimator", "ckf", "--name", "car-one", "--config", str(tmp_path / "agent.json")]
+    replay = ["replay", *log, *send, "--publish", "--out", str(tmp_path / "out.parquet")]
+    run = ["run", "--source", *log, *send, "--duration", "1"]
+    for words in (replay, run):
+        assert main(words) == 2
+        assert "error: log: is not fit to be published" in capsys.readouterr().err
+    assert not service.batches
+    assert main([*run, "--trust"]) == 0
+    assert main([*replay, "--trust"]) in (0, 3)
+    assert service.batches
+
+
+def test_estimates_that_are_not_plausible_have_an_exit_code_of_their_own(tmp_path: Path, capsys: Output) -> None:
+    cut = drives(1, 24, rough=False, seconds=40)[0]
+    good = [
+        "replay",
+        *write(tmp_path / "good.parquet", cut),
+        "--estimator",
+        "ckf",
+        "--out",
+        str(tmp_path / "o.parquet"),
+    ]
+    assert main(good) == 0
+    assert "4000 samples, 40.0 s; speed" in capsys.readouterr().err
+    bad = write(tmp_path / "bad.parquet", PLANTED["wheels in rpm"].spoil(cut))
+    assert main(["replay", *bad, "--estimator", "ckf", "--out", str(tmp_path / "o.parquet")]) == 3
+    assert "NOT PLAUSIBLE" in capsys.readouterr().err
+
+
+@pytest.mark.timeout(120)
+def test_only_the_inputs_are_evaluated_where_so_asked(tmp_path: Path) -> None:
+    assert main(["evaluate", "--only", "inputs", "--quick", "--out", str(tmp_path)]) in (0, 1)
+    figures = {row["name"]: row["value"] for row in json.loads((tmp_path / "figures.json").read_text())[1:]}
+    assert figures["doctor.tries"] == 2 * len(PLANTED)
+    assert figures["doctor.faults_named"] > 0.9
+    assert "doctor.published_wrong" in (tmp_path / "report.md").read_text()
