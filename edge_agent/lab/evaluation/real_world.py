@@ -5,7 +5,9 @@ are over samples, so that a minute on dry road weighs a minute.
 
 Legend
     surface       by the mean friction of the four wheels: ice to .2, snow to .45, wet to .75, dry above
-    false ice     share of the samples on wet and dry road whose whole interval lies below SLIPPERY_MU
+    false ice     share of all samples whose whole interval lies below SLIPPERY_MU on a road above SURE_GRIP; "strict":
+                  share of those on wet and dry road; "settled": of those that left snow and ice SETTLED_S ago, or never
+                  met any: who drives off the ice learns of it when he uses the grip
     below         share of all samples whose upper end lies below the grip in use: certainly wrong
     excited       some wheel used EXCITED_SHARE of its grip within the last second
     lost          share of the samples whose speed is off by more than LOST_M_S
@@ -36,6 +38,8 @@ LOST_M_S: Final = 1.0
 MISS: Final = 20.0  # of the interval score of Gneiting and Raftery (2007) at 90 %
 PRIOR: Final = (LOWER + 0.05 * (UPPER - LOWER), UPPER - 0.05 * (UPPER - LOWER))  # 90 % of it
 NOISE: Final = 0.03  # of the grip in use, which is smoothed over SMOOTH_S
+SURE_GRIP: Final = 0.6
+SETTLED_S: Final = 3.0
 SMOOTH_S: Final = 0.2
 RATE_HZ: Final = 100.0
 TOWN_CARS, TOWN_S, TOWNS = 16, 120.0, 5
@@ -84,9 +88,9 @@ def in_use(batch: DriveSet) -> FloatArray:
     return np.asarray((summed[width:] - summed[:-width]) / width - NOISE)
 
 
-def lately(used: FloatArray) -> FloatArray:
-    """Largest value of the last UTILISED_WINDOW_S, (T, N)."""
-    samples = round(UTILISED_WINDOW_S * RATE_HZ)
+def lately(used: FloatArray | BoolArray, seconds: float = UTILISED_WINDOW_S) -> FloatArray:
+    """Largest value of the last `seconds`, (T, N)."""
+    samples = round(seconds * RATE_HZ)
     padded = np.concatenate([np.zeros((samples - 1, used.shape[1])), used])
     return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, samples, axis=0).max(axis=-1))
 
@@ -105,7 +109,10 @@ def count(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatArray) 
         tally.add(f"coverage90.{name}", inside, (mu > above) & (mu <= most))
     tally.add("coverage90.excited", inside, excited)
     tally.add("coverage90.no_torque", inside[:, np.isnan(batch.signals[:, :, S.TORQUE]).all(axis=0)])
-    tally.add("false_ice", reported.mu_upper < SLIPPERY_MU, mu > SURFACES["wet"][0])
+    icy, grips = reported.mu_upper < SLIPPERY_MU, mu > SURFACES["wet"][0]
+    tally.add("false_ice", icy & (mu > SURE_GRIP))
+    tally.add("false_ice.strict", icy, grips)
+    tally.add("false_ice.settled", icy, grips & ~lately(~grips, SETTLED_S).astype(bool))
     tally.add("below", reported.mu_upper < in_use(batch))
     tally.add("width", width / (PRIOR[1] - PRIOR[0]), excited)
     tally.add("width.all", width / (PRIOR[1] - PRIOR[0]))

@@ -42,9 +42,11 @@ WORLD_HEAD: Final = """\
 ## The world as it is
 
 Rough cars in hilly towns that nobody tuned on (`real_world.py`), half of them without torque, for every estimator.
-False ice: on wet and dry road, the whole interval below .4. Below: the upper end lies under the grip in use, which is
-wrong for certain. Width where excited, over the prior's. Coverage of v_x and v_y: of what the stated standard deviation
-makes of 90 %. Lost: v_x off by more than 1 m/s. Standing: the largest speed given to a car that stands on 5 %.
+False ice: the whole interval below .4 on a road above .6; strict: the share of the samples on wet and dry road (from
+.45); settled: of those whose car left snow and ice 3 s ago or never met any. Below: the upper end lies under the grip
+in use, which is wrong for certain. Width where excited, over the prior's. Coverage of v_x and v_y: of what the stated
+standard deviation makes of 90 %. Lost: v_x off by more than 1 m/s. Standing: the largest speed given to a car that
+stands on 5 %.
 The baseline is the mean of the wheels' speeds for v_x and the prior for friction."""
 OWN_HEAD: Final = """\
 ## Paper 004's bars on plants that are not its filter's model
@@ -139,7 +141,8 @@ def oracles(barred: Sequence[Figure], values: dict[str, float]) -> str:
 def world(values: dict[str, float]) -> str:
     """One row per estimator in the rough world."""
     shown = {
-        "coverage90": "coverage", "coverage90.ice": "on ice", "false_ice": "false ice", "below": "below",
+        "coverage90": "coverage", "coverage90.ice": "on ice", "false_ice": "false ice", "false_ice.strict": "strict",
+        "false_ice.settled": "settled", "below": "below",
         "width": "width, excited", "score": "score", "rmse_vx": "rmse_vx", "coverage90.vx": "coverage of v_x",
         "rmse_vy": "rmse_vy", "coverage90.vy": "coverage of v_y", "lost": "lost",
         "standing_5pct.v_max": "standing [m/s]",
