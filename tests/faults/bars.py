@@ -26,6 +26,8 @@ BARS: Final = {
     "faults.router_down.recovery_s": Bar("s", 10),
     "faults.frozen.lost": Bar("batches", 0),
     "faults.frozen.agent_deadline_misses": Bar("blocks", 0),
+    "faults.leaving.longest_s": Bar("s", 3),
+    "faults.leaving.acknowledged_lost": Bar("batches", 0),
     "faults.disk_full.false_acks": Bar("batches", 0),
     "faults.disk_full.recovered": Bar("times", 1, "more"),
     "faults.fuzz.crashes": Bar("crashes", 0),

@@ -18,6 +18,7 @@ CAMPAIGNS: Final = (
     ),
     Campaign("router-down", outages.router_down, ("faults.router_down.lost", "faults.router_down.recovery_s")),
     Campaign("frozen", outages.frozen, ("faults.frozen.lost", "faults.frozen.agent_deadline_misses")),
+    Campaign("leaving", outages.leaving, ("faults.leaving.longest_s", "faults.leaving.acknowledged_lost")),
     Campaign("disk-full", outages.disk_full, ("faults.disk_full.false_acks", "faults.disk_full.recovered")),
     Campaign("security", security.run, ("faults.security.breaches",)),
     Campaign("fuzz", fuzz.run, ("faults.fuzz.crashes", "faults.fuzz.admitted_out_of_range", "faults.fuzz.honest_lost")),

@@ -1,4 +1,5 @@
-"""Outages: the router gone for a minute, router and service frozen, disks full. Nothing is lost, nobody waits."""
+"""Outages: the router gone for a minute, router and service frozen, disks full; and leaving. Nothing is lost, nobody
+waits."""
 
 from __future__ import annotations
 
@@ -58,6 +59,26 @@ def frozen(site: Site) -> list[Figure]:
         Figure("faults.frozen.longest_lag_s", max(end["longest_lag_s"] for end in ends), "s"),
         Figure("faults.frozen.seconds", frozen_s, "s frozen, each"),
     ]
+
+
+def leaving(site: Site) -> list[Figure]:
+    """SIGTERM beside a router that runs, and beside a frozen one: agent and service are gone soon, and lose nothing."""
+    longest, lost = 0.0, 0
+    for freeze in (False, True):
+        with stage(site.folder / str(freeze)) as there:
+            _agents(there, 1)
+            time.sleep(site.of(3, 1))
+            if freeze:
+                there.router.send(signal.SIGSTOP)
+                time.sleep(site.of(3, 1))
+            for part in (*there.loads, there.service):
+                began = time.monotonic()
+                _clean(part)
+                longest = max(longest, time.monotonic() - began)
+            there.router.send(signal.SIGCONT)
+            lost += take(there.journals, there.archive).acknowledged_lost
+    site.say(f"gone after {longest:.1f} s at the most")
+    return [figure("faults.leaving.longest_s", longest), figure("faults.leaving.acknowledged_lost", lost)]
 
 
 def disk_full(site: Site) -> list[Figure]:
