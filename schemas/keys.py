@@ -21,16 +21,16 @@ class Topic(NamedTuple):
     """One kind of key.
 
     Attributes:
-        place: zoom of the quadint in the key, None where there is none.
-        who: whether the last chunk is a name (a vehicle, or a service).
+        zoom: of the quadint in the key, None where there is none.
+        named: whether the last chunk is a name (a vehicle, or a service).
         message: what is put there; None for a liveliness token.
         priority: Zenoh priority by name.
         block: congestion control: block (True) or drop (False).
     """
 
     name: str
-    place: int | None
-    who: bool
+    zoom: int | None
+    named: bool
     message: str | None
     priority: str
     block: bool
@@ -102,11 +102,11 @@ def shard_key(service: str) -> str:
 
 
 class Parsed(NamedTuple):
-    """A concrete key taken apart: topic, quadint (None where the topic has no place), name (None likewise)."""
+    """A concrete key taken apart: topic, quadint and name, None where the topic has none."""
 
     topic: Topic
-    place: int | None
-    who: str | None
+    quadint: int | None
+    name: str | None
 
 
 def parse(key: str) -> Parsed:
@@ -120,11 +120,11 @@ def parse(key: str) -> Parsed:
     if not key.startswith(ROOT + "/") or topic is None:
         raise InputError("key", f"{key[:80]!r} is none of ours", f"use {ROOT}/ and one of {', '.join(TOPICS)}")
     parts = rest.split("/")
-    who = parts.pop() if topic.who else None
-    if who is not None and not re.fullmatch(NAME_PATTERN, who):
-        raise InputError("key", f"{who[:80]!r} is no name", f"use {NAME_PATTERN}")
-    place = "".join(parts)
-    sizes = _CHUNKS[: len(parts)] if topic.place else ()
-    if (topic.place or 0) != len(place) or [len(part) for part in parts] != list(sizes) or set(place) - set("0123"):
-        raise InputError("key", f"{key[:80]!r} names no place", f"cut {topic.place or 0} quadkey digits by {_CHUNKS}")
-    return Parsed(topic, grid.from_quadkey(place) if topic.place else None, who)
+    name = parts.pop() if topic.named else None
+    if name is not None and not re.fullmatch(NAME_PATTERN, name):
+        raise InputError("key", f"{name[:80]!r} is no name", f"use {NAME_PATTERN}")
+    digits = "".join(parts)
+    sizes = _CHUNKS[: len(parts)] if topic.zoom else ()
+    if (topic.zoom or 0) != len(digits) or [len(part) for part in parts] != list(sizes) or set(digits) - set("0123"):
+        raise InputError("key", f"{key[:80]!r} names no place", f"cut {topic.zoom or 0} quadkey digits by {_CHUNKS}")
+    return Parsed(topic, grid.from_quadkey(digits) if topic.zoom else None, name)

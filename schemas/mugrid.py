@@ -43,11 +43,11 @@ def quantiles(probability: NDArray[np.floating[Any]], q: float) -> FloatArray:
     p = np.asarray(probability, dtype=np.float64)
     upto = np.cumsum(p, axis=-1)
     target = q * upto[..., -1:]
-    place = np.minimum((upto < target).sum(axis=-1, keepdims=True), BINS - 1)
-    mass = np.take_along_axis(p, place, -1)
-    below = np.where(place > 0, np.take_along_axis(upto, np.maximum(place - 1, 0), -1), 0.0)
+    bin_ = np.minimum((upto < target).sum(axis=-1, keepdims=True), BINS - 1)
+    mass = np.take_along_axis(p, bin_, -1)
+    below = np.where(bin_ > 0, np.take_along_axis(upto, np.maximum(bin_ - 1, 0), -1), 0.0)
     share = np.divide(target - below, mass, out=np.zeros_like(mass), where=mass > 0.0)
-    found: FloatArray = LOWER + (UPPER - LOWER) / BINS * (place + np.clip(share, 0.0, 1.0))
+    found: FloatArray = LOWER + (UPPER - LOWER) / BINS * (bin_ + np.clip(share, 0.0, 1.0))
     return found[..., 0]
 
 

@@ -26,7 +26,7 @@ from edge_agent.lab.tuning.objectives import (
     choices,
     objective_on,
     record,
-    worth,
+    scores_of,
 )
 from edge_agent.lab.tuning.search import Iteration, Objective, Progress, Result
 from schemas.errors import InputError
@@ -160,7 +160,7 @@ def reporter(way: str, iterations: int, clock: Callable[[], float], write: Calla
 
 
 def _score(memberships: Memberships, drives: TuningSet) -> Score:
-    return Score(**asdict(worth(memberships, drives, ESTIMATOR)))
+    return Score(**asdict(scores_of(memberships, drives, ESTIMATOR)))
 
 
 def _document(

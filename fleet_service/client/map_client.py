@@ -118,7 +118,7 @@ def watch(connection: ZenohSettings, bbox: str | None, stop: threading.Event, sa
     box = query.parse({} if bbox is None else {"bbox": bbox}).bbox
 
     def near(key: str) -> int | None:
-        tile = keys.parse(key).place
+        tile = keys.parse(key).quadint
         if tile is None or box is None:
             return tile
         return tile if grid.touches(box, grid.bounds(tile, grid.TILE_ZOOM)) else None

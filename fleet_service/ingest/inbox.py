@@ -155,10 +155,10 @@ class BatchIntake:
             self._count(error.field)
         time = found.columns[FIRST_TIME[kind]][np.cumsum(found.sizes) - found.sizes]
         keyed = [owner for owner in found_owners if owner is not None]
-        owners = keyed if len(found.places) == len(keyed) else [keyed[place] for place in found.places]
+        owners = keyed if len(found.indices) == len(keyed) else [keyed[place] for place in found.indices]
         broken, rules = validation.check_heads(kind, owners, found.heads, time, clock)
         for place in np.flatnonzero(broken >= 0).tolist():
-            self._refuse(str(owners[place].who), found.heads.at(place), rules[broken[place]])
+            self._refuse(str(owners[place].name), found.heads.at(place), rules[broken[place]])
         new = self._new(kind, found.heads, time, broken < 0)
         return self._rows(kind, new, time, found, clock) if new else AcceptedBatches([], {})
 
@@ -238,13 +238,13 @@ class BatchIntake:
             self._counts[f"refused.{rule}"] += times
 
 
-def _chosen(found: Decoded, places: list[int]) -> tuple[Rows, Heads, IntArray]:
+def _chosen(found: Decoded, indices: list[int]) -> tuple[Rows, Heads, IntArray]:
     """Rows, heads and sizes of the batches at these places, which are in order."""
     rows: Rows = {**found.columns, "with_likelihood": found.with_likelihood}
-    if len(places) == len(found.sizes):
+    if len(indices) == len(found.sizes):
         return rows, found.heads, found.sizes
     kept = np.zeros(len(found.sizes), bool)
-    kept[places] = True
+    kept[indices] = True
     mine = np.repeat(kept, found.sizes)
     return {name: column[mine] for name, column in rows.items()}, found.heads.take(kept), found.sizes[kept]
 

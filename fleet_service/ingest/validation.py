@@ -80,8 +80,8 @@ def check_heads(
         (k,) index of the first broken rule into the second value, -1 for a good one; and the rules.
     """
     topic, held = _TOPIC[kind], heads.first_held
-    wrong_owner = [o.who != name or o.topic.name != topic for o, name in zip(owners, heads.vehicle, strict=True)]
-    wrong_region = np.array([owner.place for owner in owners], np.int64) != heads.region
+    wrong_owner = [o.name != name or o.topic.name != topic for o, name in zip(owners, heads.vehicle, strict=True)]
+    wrong_region = np.array([owner.quadint for owner in owners], np.int64) != heads.region
     bad_names = {name for name in set(heads.estimator) if name and not _is_estimator(name)}
     bad_name = [name in bad_names for name in heads.estimator] if bad_names else np.zeros(len(owners), bool)
     broken = (
@@ -121,7 +121,7 @@ def owner_of(key: str) -> keys.Parsed | None:
         parsed = keys.parse(key)
     except InputError:
         return None
-    return None if parsed.who is None else parsed
+    return None if parsed.name is None else parsed
 
 
 def check_rows(kind: Kind, columns: Columns, region: IntArray, clock: Clock) -> tuple[IntArray, tuple[Refusal, ...]]:

@@ -97,7 +97,7 @@ class WeatherInbox:
 
 
 def _report(message: WeatherMessage, now: int) -> tuple[int, Report]:
-    region = keys.parse(message.key).place
+    region = keys.parse(message.key).quadint
     report = weather.decode(message.payload, message.encoding)
     if region is None or not now - VALID_NS <= report.time <= now + AHEAD_NS:
         raise InputError("time", "too old, or more than a day ahead", "set the clock")

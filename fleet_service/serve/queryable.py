@@ -93,6 +93,6 @@ class MapQueryable:
 def _tile(expression: str) -> int | None:
     """The tile that a key names; None where it is none's, or many."""
     try:
-        return keys.parse(expression).place
+        return keys.parse(expression).quadint
     except InputError:
         return None

@@ -28,19 +28,19 @@ def decode_many(kind: Kind, payloads: Sequence[tuple[bytes, str]]) -> Decoded:
     usual = {ENCODING[kind], *PLAIN}
     plain = [payload if encoding in usual and len(payload) <= MAX_BYTES else b"" for payload, encoding in payloads]
     data, walked = _walked(kind, plain, True)
-    places = list(range(len(plain)))
+    indices = list(range(len(plain)))
     if not walked.understood.all():
-        for place in np.flatnonzero(~walked.understood).tolist():
+        for index in np.flatnonzero(~walked.understood).tolist():
             try:
-                plain[place] = _plainly(kind, *payloads[place])
+                plain[index] = _plainly(kind, *payloads[index])
             except WireError as error:
-                errors.append((place, error))
-        wrong = {place for place, _ in errors}
-        places = [place for place in places if place not in wrong]
-        data, walked = _walked(kind, [plain[place] for place in places], False)
+                errors.append((index, error))
+        wrong = {index for index, _ in errors}
+        indices = [index for index in indices if index not in wrong]
+        data, walked = _walked(kind, [plain[index] for index in indices], False)
         assert walked.understood.all(), "the protobuf library writes what we do not read"
     fields = _Fields(kind, data, walked)
-    return complete(Decoded(places, fields.heads(), *fields.columns(), errors), fields.sent())
+    return complete(Decoded(indices, fields.heads(), *fields.columns(), errors), fields.sent())
 
 
 def _walked(kind: Kind, messages: list[bytes], strict: bool) -> tuple[NDArray[np.uint8], Walked]:

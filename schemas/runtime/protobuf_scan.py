@@ -163,8 +163,8 @@ def _field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) -> int:
         if wire != _FIXED64 or end - at < 8:
             return -1
         value = 0
-        for place in range(8):
-            value |= int(data[at + place]) << (8 * place)
+        for position in range(8):
+            value |= int(data[at + position]) << (8 * position)
         out.numbers[k, role] = value
         return at + 8
     if role < _TEXT:
@@ -175,8 +175,8 @@ def _field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) -> int:
         return -1
     if role < _COLUMN:
         out.texts[k, role - _TEXT, 0], out.texts[k, role - _TEXT, 1] = at, at + length
-        for place in range(at, at + length):
-            if scan.strict and data[place] >= 128:
+        for position in range(at, at + length):
+            if scan.strict and data[position] >= 128:
                 return -1
         return at + length
     column = role - _COLUMN
@@ -186,10 +186,10 @@ def _field(scan: _Scan, k: int, at: int, end: int, role: int, wire: int) -> int:
         if count * width != length:
             return -1
     else:
-        place = at
-        while place < at + length:
-            value, place = _varint(data, place, at + length)
-            if place < 0 or not -(1 << 31) <= value < 1 << 31:
+        position = at
+        while position < at + length:
+            value, position = _varint(data, position, at + length)
+            if position < 0 or not -(1 << 31) <= value < 1 << 31:
                 return -1
             count += 1
     out.begins[k, column], out.counts[k, column] = at, count
@@ -201,8 +201,8 @@ def _copy(data: ByteArray, begins: IntArray, lengths: IntArray, lengths_out: Int
     to = 0
     for k in range(len(begins)):
         sent, written = data[begins[k] : begins[k] + lengths[k]], into[to : to + lengths[k]]
-        for place in range(len(written)):  # of slices, so that many bytes are copied at once
-            written[place] = sent[place]
+        for position in range(len(written)):  # of slices, so that many bytes are copied at once
+            written[position] = sent[position]
         to += lengths_out[k]
 
 
@@ -211,6 +211,6 @@ def _unpack(data: ByteArray, begins: IntArray, counts: IntArray, sizes: IntArray
     to = 0
     for k in range(len(begins)):
         at = begins[k]
-        for place in range(counts[k]):
-            into[to + place], at = _varint(data, at, len(data))
+        for position in range(counts[k]):
+            into[to + position], at = _varint(data, at, len(data))
         to += sizes[k]

@@ -43,11 +43,11 @@ KINDS: dict[Any, Any] = {
 class Records(Protocol[R_co]):
     """A record array as a kernel sees it: rows with the fields of R."""
 
-    def __getitem__(self, place: int | tuple[int, int], /) -> R_co:
+    def __getitem__(self, index: int | tuple[int, int], /) -> R_co:
         """The row, which is part of the array."""
         ...
 
-    def __setitem__(self, place: int | tuple[int, int], row: object, /) -> None:
+    def __setitem__(self, index: int | tuple[int, int], row: object, /) -> None:
         """Copy another row there."""
         ...
 

@@ -44,11 +44,11 @@ class Heads(NamedTuple):
     first_held: IntArray
     estimator: list[str]
 
-    def at(self, place: int) -> Head:
+    def at(self, index: int) -> Head:
         """The head of one."""
         return Head(
-            self.kind, self.vehicle[place], int(self.boot[place]), int(self.region[place]), int(self.seq[place]),
-            int(self.first_held[place]), self.estimator[place],
+            self.kind, self.vehicle[index], int(self.boot[index]), int(self.region[index]), int(self.seq[index]),
+            int(self.first_held[index]), self.estimator[index],
         )  # fmt: skip
 
     def take(self, kept: BoolArray) -> Heads:
@@ -63,15 +63,15 @@ class Decoded(NamedTuple):
     """The good ones of several messages.
 
     Attributes:
-        places: which messages these are, (k,).
+        indices: which messages these are, (k,).
         heads: of each.
         sizes: records of each, (k,).
         columns: every column of the kind's table, all records one after the other, (n,); `log_likelihood` is (n, 32).
         with_likelihood: whether a record came with one, (n,).
-        errors: place and reason of each message that is no batch.
+        errors: index and reason of each message that is no batch.
     """
 
-    places: list[int]
+    indices: list[int]
     heads: Heads
     sizes: IntArray
     columns: Columns
@@ -193,9 +193,9 @@ def complete(found: Decoded, sent: PresentColumns) -> Decoded:
     kept = np.array([at not in bad for at in range(len(found.sizes))])
     rows = kept[owner]
     return Decoded(
-        list(compress(found.places, kept)), heads.take(kept), found.sizes[kept],
+        list(compress(found.indices, kept)), heads.take(kept), found.sizes[kept],
         {name: column[rows] for name, column in columns.items()}, found.with_likelihood[rows],
-        found.errors + [(found.places[at], error) for at, error in bad.items()],
+        found.errors + [(found.indices[at], error) for at, error in bad.items()],
     )  # fmt: skip
 
 

@@ -60,10 +60,10 @@ def _refuse_compressed(payload: bytes) -> None:
                 raise WireError("tile", "is compressed", "send it as it is; a small message may not become a large one")
 
 
-def _field(data: bytes, table: int, place: int) -> int:
+def _field(data: bytes, table: int, index: int) -> int:
     """Where a field of a FlatBuffers table lies; 0 where it is absent."""
     layout = table - int(struct.unpack_from("<i", data, table)[0])
-    if 4 + 2 * place >= int(struct.unpack_from("<H", data, layout)[0]):
+    if 4 + 2 * index >= int(struct.unpack_from("<H", data, layout)[0]):
         return 0
-    offset = int(struct.unpack_from("<H", data, layout + 4 + 2 * place)[0])
+    offset = int(struct.unpack_from("<H", data, layout + 4 + 2 * index)[0])
     return table + offset if offset else 0

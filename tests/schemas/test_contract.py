@@ -26,12 +26,12 @@ VEHICLE = {
 def test_a_key_is_taken_apart_as_it_was_built(region: int, vehicle: str) -> None:
     for name, build in (("obs", keys.observation_key), ("state", keys.state_key)):
         parsed = keys.parse(build(region, vehicle))
-        assert (parsed.topic.name, parsed.place, parsed.who) == (name, region, vehicle)
+        assert (parsed.topic.name, parsed.quadint, parsed.name) == (name, region, vehicle)
 
 
 @given(st.integers(0, 4**14 - 1))
 def test_a_tile_key_extends_the_key_of_its_region(tile: int) -> None:
-    assert keys.parse(keys.map_key(tile)).place == tile
+    assert keys.parse(keys.map_key(tile)).quadint == tile
     region = keys.chunks(int(grid.parent(tile, 10, of=14)), 10)
     assert keys.map_key(tile).startswith(f"gripmap/v1/map/{region}/")
 

@@ -117,8 +117,8 @@ class TuningScores:
 
 # objective by name -> the number to maximise
 OBJECTIVES: Final[dict[str, Callable[[TuningScores], float]]] = {
-    "interval": lambda worth: -worth.interval_score,
-    "innovation": lambda worth: worth.log_likelihood,
+    "interval": lambda scores: -scores.interval_score,
+    "innovation": lambda scores: scores.log_likelihood,
 }
 
 
@@ -143,7 +143,7 @@ def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> F
     return score
 
 
-def worth(memberships: Memberships, drives: TuningSet, estimator: str) -> TuningScores:
+def scores_of(memberships: Memberships, drives: TuningSet, estimator: str) -> TuningScores:
     """Run the estimator over the drives and score what it says after the first second."""
     estimates = create(estimator, drives.vehicles, memberships=memberships).advance(drives.t, drives.signals)
     settled = drives.t[:, 0] >= SETTLED_S
@@ -171,7 +171,7 @@ def objective_on(drives: TuningSet, estimator: str, name: str) -> Objective:
             memberships = Memberships.from_vector(vector)
         except InputError:
             return -np.inf
-        return OBJECTIVES[name](worth(memberships, drives, estimator))
+        return OBJECTIVES[name](scores_of(memberships, drives, estimator))
 
     return objective
 

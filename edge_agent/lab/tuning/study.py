@@ -120,7 +120,7 @@ def setting(condition: Condition) -> Setting:
     return AT_THE_TRUTH._replace(noise=(condition.scale * VARIANCE,) * 3)
 
 
-def worth(memberships: Memberships, drives: StudySet, name: str) -> StudyScores:
+def scores_of(memberships: Memberships, drives: StudySet, name: str) -> StudyScores:
     """Run the filter over the drives under the condition of that name."""
     filters = bank(drives.vehicles, memberships, setting(CONDITIONS[name]))
     reported = filters.advance(drives.t, drives.signals[name])
@@ -144,7 +144,7 @@ def interval(memberships: Memberships, drives: StudySet, name: str) -> tuple[flo
 
 def overall(memberships: Memberships, drives: StudySet) -> float:
     """Mean log-likelihood over the conditions [nat/s]: what is searched for."""
-    return float(np.mean([worth(memberships, drives, name).log_likelihood for name in CONDITIONS]))
+    return float(np.mean([scores_of(memberships, drives, name).log_likelihood for name in CONDITIONS]))
 
 
 def memberships_of(vector: FloatArray) -> Memberships:

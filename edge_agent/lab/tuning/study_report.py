@@ -13,7 +13,7 @@ from edge_agent.adaptation.memberships import SETS, Memberships
 from edge_agent.app.tuned_memberships import Score
 from edge_agent.lab.tuning import study
 from edge_agent.lab.tuning.search import Progress, Result
-from edge_agent.lab.tuning.study import CONDITIONS, WAYS, StudyScores, StudySet, memberships_of, overall, worth
+from edge_agent.lab.tuning.study import CONDITIONS, WAYS, StudyScores, StudySet, memberships_of, overall, scores_of
 from schemas.runtime.figures import Figure
 
 UNITS: Final = {"log_likelihood": "nat/s", "nis": "1", "rmse_vx": "m/s", "rmse_vy": "m/s", "rmse_yaw_rate": "rad/s"}
@@ -69,7 +69,7 @@ def figures(done: Study) -> list[Figure]:
     for way in SHOWN:
         sets = done.memberships(way)
         for name in CONDITIONS:
-            listed += _spread(f"tuning.{name}.{way}", [worth(one, done.held_out, name) for one in sets])
+            listed += _spread(f"tuning.{name}.{way}", [scores_of(one, done.held_out, name) for one in sets])
         for drives, recorded in (("train", done.train), ("held_out", done.held_out)):
             values = [overall(one, recorded) for one in sets]
             listed += _mean_sd(f"tuning.overall.{way}.{drives}", values, "nat/s")
@@ -85,11 +85,11 @@ def figures(done: Study) -> list[Figure]:
     return listed
 
 
-def _spread(prefix: str, worths: Sequence[StudyScores]) -> list[Figure]:
+def _spread(prefix: str, per_condition: Sequence[StudyScores]) -> list[Figure]:
     return [
         figure
         for name, unit in UNITS.items()
-        for figure in _mean_sd(f"{prefix}.{name}", [getattr(one, name) for one in worths], unit)
+        for figure in _mean_sd(f"{prefix}.{name}", [getattr(one, name) for one in per_condition], unit)
     ]
 
 
@@ -127,12 +127,12 @@ def scores(done: Study, way: str) -> dict[str, Score]:
     found = {}
     for drives, recorded in (("train", done.train), ("held_out", done.held_out)):
         intervals = [study.interval(done.best(way), recorded, name) for name in CONDITIONS]
-        worths = [worth(done.best(way), recorded, name) for name in CONDITIONS]
+        per_condition = [scores_of(done.best(way), recorded, name) for name in CONDITIONS]
         found[drives] = Score(
             interval_score=float(np.mean([score for score, _ in intervals])),
             coverage=float(np.mean([coverage for _, coverage in intervals])),
-            log_likelihood=float(np.mean([one.log_likelihood for one in worths])),
-            nis_ratio=float(np.mean([one.nis for one in worths])),
+            log_likelihood=float(np.mean([one.log_likelihood for one in per_condition])),
+            nis_ratio=float(np.mean([one.nis for one in per_condition])),
         )
     return found
 

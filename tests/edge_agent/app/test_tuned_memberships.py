@@ -12,7 +12,7 @@ from edge_agent.adaptation.memberships import Memberships
 from edge_agent.app.tuned_memberships import FOLDER, WAYS, Document, load, parse, save, shipped
 from edge_agent.cli.tune import DURATION_S
 from edge_agent.lab.tuning import study
-from edge_agent.lab.tuning.objectives import HELD_OUT, record, worth
+from edge_agent.lab.tuning.objectives import HELD_OUT, record, scores_of
 from schemas.errors import InputError
 
 Change = Callable[[dict[str, Any]], object]
@@ -134,5 +134,5 @@ def test_the_memberships_of_the_papers_filter_gain_on_held_out_drives_and_are_sc
 def test_scores_in_the_shipped_file_are_those_of_the_filter_as_it_is() -> None:
     """Fails when the filter changed after the tuning: run the command in the file again."""
     document = load(FOLDER / "aco-fckf.json").document
-    found = worth(shipped("aco-fckf"), record(HELD_OUT, DURATION_S), "aco-fckf")
+    found = scores_of(shipped("aco-fckf"), record(HELD_OUT, DURATION_S), "aco-fckf")
     assert found.interval_score == pytest.approx(document.scores["colony"].held_out.interval_score, rel=0.02)

@@ -59,7 +59,7 @@ def test_every_record_arrives_once_under_its_vehicles_key_and_is_settled(
     assert rows(service.batches, Kind.STATE) == len(states.vehicle)
     for key, batch in zip(service.keys, service.batches, strict=True):
         parsed = keys.parse(key)
-        assert (parsed.who, parsed.place, parsed.topic.name) == (batch.vehicle, batch.region, batch.kind)
+        assert (parsed.name, parsed.quadint, parsed.topic.name) == (batch.vehicle, batch.region, batch.kind)
         assert batch.estimator == "test"
 
 

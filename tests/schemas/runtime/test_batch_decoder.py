@@ -136,8 +136,8 @@ def test_what_our_encoder_never_writes_is_left_to_the_module(more: bytes) -> Non
     assert agrees(Kind.OBSERVATION, payload)
     assert not agrees(Kind.OBSERVATION, payload + more)
     with_error = decode_many(Kind.OBSERVATION, [(payload, ""), (payload + more, ""), (payload, "")])
-    assert with_error.places[0] == 0
-    assert with_error.places[-1] == 2
+    assert with_error.indices[0] == 0
+    assert with_error.indices[-1] == 2
 
 
 def test_a_message_with_unknown_fields_columns_apart_or_unpacked_is_read_all_the_same() -> None:

@@ -20,7 +20,7 @@ from edge_agent.lab.tuning.objectives import (
     interval_score,
     objective_on,
     record,
-    worth,
+    scores_of,
 )
 from edge_agent.lab.tuning.search import Iteration
 from schemas.errors import InputError
@@ -50,7 +50,7 @@ def test_drives_that_judge_share_no_seed_and_no_setting_with_those_that_are_sear
 
 
 def test_worth_is_finite_and_the_same_every_time(drives: TuningSet) -> None:
-    first, second = (worth(Memberships(), drives, ESTIMATOR) for _ in range(2))
+    first, second = (scores_of(Memberships(), drives, ESTIMATOR) for _ in range(2))
     assert first == second
     assert np.isfinite(astuple(first)).all()
     assert 0.0 <= first.coverage <= 1.0
@@ -58,7 +58,7 @@ def test_worth_is_finite_and_the_same_every_time(drives: TuningSet) -> None:
 
 def test_worth_of_several_drives_is_the_mean_of_each(drives: TuningSet) -> None:
     single = [
-        worth(
+        scores_of(
             Memberships(),
             TuningSet((vehicle,), drives.t[:, [n]], drives.signals[:, [n]], drives.mu[:, [n]]),
             ESTIMATOR,
@@ -66,7 +66,7 @@ def test_worth_of_several_drives_is_the_mean_of_each(drives: TuningSet) -> None:
         for n, vehicle in enumerate(drives.vehicles)
     ]
     mean = np.mean([astuple(one) for one in single], axis=0)
-    np.testing.assert_allclose(astuple(worth(Memberships(), drives, ESTIMATOR)), mean, rtol=1e-12)
+    np.testing.assert_allclose(astuple(scores_of(Memberships(), drives, ESTIMATOR)), mean, rtol=1e-12)
 
 
 def test_interval_score_pays_for_width_and_twenty_times_for_a_miss() -> None:
@@ -83,14 +83,14 @@ def test_interval_score_is_least_at_the_true_quantiles() -> None:
 
 def test_inflated_noise_does_not_win_the_innovation_likelihood(drives: TuningSet) -> None:
     """R times 4.5 makes the innovations less likely than R as it is, however seldom it is surprised."""
-    usual, inflated = (worth(Memberships(ln_scales=(s, s)), drives, ESTIMATOR) for s in (0.0, 1.5))
+    usual, inflated = (scores_of(Memberships(ln_scales=(s, s)), drives, ESTIMATOR) for s in (0.0, 1.5))
     assert inflated.log_likelihood < usual.log_likelihood
     assert inflated.nis_ratio < usual.nis_ratio
 
 
 def test_each_objective_maximises_its_own_score(drives: TuningSet) -> None:
     vector = Memberships().to_vector()
-    found = worth(Memberships(), drives, ESTIMATOR)
+    found = scores_of(Memberships(), drives, ESTIMATOR)
     assert set(OBJECTIVES) == {"interval", "innovation"}
     assert objective_on(drives, ESTIMATOR, "interval")(vector) == -found.interval_score
     assert objective_on(drives, ESTIMATOR, "innovation")(vector) == found.log_likelihood
@@ -162,4 +162,4 @@ def test_table_has_a_row_per_way_and_set_of_drives() -> None:
 
 def test_another_drive_of_the_set_gives_another_worth(drives: TuningSet) -> None:
     other = record((replace(TRAIN[0], seed=77), *TRAIN[1:3]), 4.0)
-    assert worth(Memberships(), other, ESTIMATOR) != worth(Memberships(), drives, ESTIMATOR)
+    assert scores_of(Memberships(), other, ESTIMATOR) != scores_of(Memberships(), drives, ESTIMATOR)

@@ -13,7 +13,17 @@ from edge_agent.app.tuned_memberships import WAYS, load
 from edge_agent.cli import main
 from edge_agent.lab.simulation.white import SCHEDULE
 from edge_agent.lab.tuning import study, study_report
-from edge_agent.lab.tuning.study import CONDITIONS, HELD_OUT, TRAIN, VARIANCE, StudySet, overall, record, search, worth
+from edge_agent.lab.tuning.study import (
+    CONDITIONS,
+    HELD_OUT,
+    TRAIN,
+    VARIANCE,
+    StudySet,
+    overall,
+    record,
+    scores_of,
+    search,
+)
 from schemas.runtime.figures import Figure
 from schemas.signals import S
 
@@ -47,7 +57,7 @@ def test_conditions_say_what_the_filter_takes_the_noise_for() -> None:
 
 
 def test_without_adaptation_the_right_noise_is_the_most_likely_and_its_nis_is_one(drives: StudySet) -> None:
-    right, small, large = (worth(STILL, drives, name) for name in ("right", "too-small", "too-large"))
+    right, small, large = (scores_of(STILL, drives, name) for name in ("right", "too-small", "too-large"))
     assert right.log_likelihood > max(small.log_likelihood, large.log_likelihood) + 50.0
     assert right.nis == pytest.approx(1.0, abs=0.1)
     assert small.nis > 7.0
@@ -55,9 +65,9 @@ def test_without_adaptation_the_right_noise_is_the_most_likely_and_its_nis_is_on
 
 
 def test_adaptation_recovers_most_of_what_a_wrong_noise_costs(drives: StudySet) -> None:
-    best = worth(STILL, drives, "right").log_likelihood
+    best = scores_of(STILL, drives, "right").log_likelihood
     for name in ("too-small", "too-large"):
-        lost, left = (best - worth(sets, drives, name).log_likelihood for sets in (STILL, Memberships()))
+        lost, left = (best - scores_of(sets, drives, name).log_likelihood for sets in (STILL, Memberships()))
         assert left < 0.2 * lost
 
 
