@@ -12,6 +12,8 @@ import pytest
 
 from deploy.router import open_router
 
+pytestmark = pytest.mark.timeout(400)  # a service whose kernels are not compiled yet takes minutes to begin
+
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
