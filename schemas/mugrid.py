@@ -8,7 +8,7 @@ Legend
     ℓ        log p(a visit's measurements | μ), up to a constant      (…, 32), nats
 
 A log-likelihood travels as 32 bytes: steps of 1/16 nat below the maximum, floored at 255 steps.
-A flat one (all zeros) says that nothing was learned.
+A flat one (all zeros) means that nothing was learned.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The live loop: blocks of samples in real time through the pipeline to the publisher, until it is stopped.
 
 The clock paces the loop. A block that is worked off more than its own length too late counts as behind; nothing is
-skipped: a loop that fell behind catches up as fast as it can, and says so.
+skipped: a loop that fell behind catches up as fast as it can, and counts it.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Estimates -> what is worth telling: one observation per cell visit, and states at a set rate.
+"""Estimates -> what is published: one observation per cell visit, and states at a set rate.
 
-For each block of samples: `located` says where visits end (`cell_tracker`), the estimator bank is advanced with these
+For each block of samples: `located` marks where visits end (`cell_tracker`), the estimator bank is advanced with these
 `closes`, and `observe` makes the records. What must be carried is an `OpenVisits`. Any split of the samples gives the
 same records in the same order. Pure.
 """

@@ -1,4 +1,4 @@
-"""The estimation loop's one step: where are the vehicles, what do they estimate, what is worth telling.
+"""The estimation loop's one step: where are the vehicles, what do they estimate, what is published.
 
 The same for one car and a fleet, live and replayed: a block of samples in, estimates and records out.
 """

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from prometheus_client.registry import CollectorRegistry
 
 PREFIX: Final = "gripmap_"
-READ_S: Final = 5.0  # a client that says nothing is cut off
+READ_S: Final = 5.0  # a silent client is cut off
 
 
 class Metric(NamedTuple):

@@ -2,8 +2,7 @@
 
 The protobuf module stays the one authority. This reader knows only what our own encoder, and any other that
 follows the .proto plainly, writes: each field once, columns packed, numbers that fit, names of plain letters, columns
-of one length. Of all else it says that it did not understand it; then `decoding` has the module read it and write it
-anew.
+of one length. All else it marks as not understood; then `batch_decoder` has the module read it and write it anew.
 Source: protobuf's encoding reference (tags, varints, packed fields).
 """
 
@@ -134,7 +133,7 @@ def _varint(data: ByteArray, at: int, end: int) -> tuple[int, int]:
 
 @refcount_free
 def _walk(scan: _Scan, ends: IntArray, first: int) -> None:
-    """Fill the result for all messages; `first`: the column that says how many records a message has."""
+    """Fill the result for all messages; `first`: the column whose length is the number of records."""
     data, layout, out = scan.data, scan.layout, scan.out
     at = 0
     for k in range(len(ends)):

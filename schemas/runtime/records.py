@@ -1,6 +1,6 @@
 """Rows of named fields, as one NumPy array of a structured type: what a compiled kernel carries for each vehicle.
 
-A class with annotations says the fields: float, int, bool, a NumPy number, another such class, or
+The annotations of a class are the fields: float, int, bool, a NumPy number, another such class, or
 Annotated[FloatArray, size, ...] and likewise for arrays of the other numbers.
 `record_type` makes the type of it and `records` the array; a kernel sees a row as an object with these names.
 

@@ -22,7 +22,7 @@ LIKELIHOOD: Final = "log_likelihood"
 
 
 class Head(NamedTuple):
-    """What a batch says of itself, beside its records."""
+    """The fields of a batch beside its records."""
 
     kind: Kind
     vehicle: str
