@@ -25,12 +25,12 @@ from schemas.runtime.jit import compiled
 from schemas.thresholds import Z_95
 
 
-def evidence(columns: Mapping[str, NDArray[Any]], has_likelihood: BoolArray) -> Evidence:
+def evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) -> Evidence:
     """Log-likelihood of each visit in steps of 1/16 nat below its maximum, (n, 32), and the values as reported.
 
     Args:
         columns: `log_likelihood` (n, 32); `mu`, `mu_lower`, `mu_upper`, `mu_utilised`, each (n,), NaN where absent.
-        has_likelihood: (n,) whether the sender gave a likelihood.
+        with_likelihood: (n,) whether the sender gave a likelihood.
 
     A likelihood that falls towards the upper end is a value, any other a bound; see `shape.unshaped` and `levelled`.
     A posterior counts as a value where `mu_utilised ≥ 0.6·mu`; otherwise, and where there is no `mu`, only "at least
@@ -39,7 +39,7 @@ def evidence(columns: Mapping[str, NDArray[Any]], has_likelihood: BoolArray) -> 
     sent = columns["log_likelihood"]
     steps, reported = unshaped(sent, columns["mu_utilised"])
     out = levelled(steps, columns["mu_utilised"])
-    rest = np.flatnonzero(~has_likelihood)
+    rest = np.flatnonzero(~with_likelihood)
     if len(rest):
         mu, lower, upper, used = (
             columns[n][rest].astype(np.float64) for n in ("mu", "mu_lower", "mu_upper", "mu_utilised")
