@@ -76,7 +76,7 @@ ELSEWHERE = {
                "--clock": "test_clocks_that_do_not_meet_are_an_error_with_its_remedy"},
     "replay": {"log": REPLAYED, "--vehicle": REPLAYED, "--estimator": REPLAYED, "--out": REPLAYED, "--config": REPLAYED,
                "--publish": SENT_BY_REPLAY, "--trust": UNFIT, "--name": SENT_BY_REPLAY, "--start": SENT_BY_REPLAY,
-               "--jobs": "test_two_jobs_write_what_one_writes_and_what_a_single_replay_writes"},
+               "--jobs": "test_so_many_drives_are_under_way_at_once"},
     "check": {"log": FIX, "--vehicle": FIX, "--out": FIX, "--fix": FIX},
     "run": {"--trust": UNFIT}, "fleet": {},
     "tune": {"--quick": "test_quick_tuning_writes_a_valid_file_and_says_what_it_does",

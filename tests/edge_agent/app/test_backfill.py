@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import threading
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -10,6 +12,7 @@ import pytest
 from edge_agent.app.backfill import Task, backfill, tasks_of
 from edge_agent.cli import main
 from schemas.errors import InputError
+from tests.waiting import until
 
 DRIVES = 3
 
@@ -39,6 +42,38 @@ def test_two_jobs_write_what_one_writes_and_what_a_single_replay_writes(drives: 
     for path in logs(tmp_path / "1"):
         assert pq.read_table(path).equals(pq.read_table(tmp_path / "2" / path.name))
     assert len(logs(tmp_path / "2")) == DRIVES
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_so_many_drives_are_under_way_at_once(drives: Path, tmp_path: Path, jobs: int) -> None:
+    """Their vehicle files are pipes: a drive waits there until something is written, or the writer leaves."""
+    tasks = [task._replace(vehicle=tmp_path / task.vehicle.name) for task in tasks_of(logs(drives), None, tmp_path)]
+    writers: dict[Path, int] = {}
+    under_way: list[int] = []
+
+    def is_waiting(pipe: Path) -> bool:
+        if pipe not in writers:
+            try:
+                writers[pipe] = os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)
+            except OSError:  # nobody reads
+                return False
+        return True
+
+    def watch() -> None:
+        until(lambda: all(is_waiting(task.vehicle) for task in tasks[:jobs]))
+        under_way.append(sum(is_waiting(task.vehicle) for task in tasks))
+        for task in tasks:  # what is empty is no vehicle, and ends the drive
+            until(lambda task=task: is_waiting(task.vehicle))  # type: ignore[misc]
+            os.close(writers[task.vehicle])
+
+    for task in tasks:
+        os.mkfifo(task.vehicle)
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    outcomes = list(backfill(tasks, "ckf", jobs))
+    watcher.join()
+    assert under_way == [jobs]
+    assert all(outcome.error is not None for outcome in outcomes)
 
 
 def test_a_bad_log_is_told_and_the_others_are_estimated(
