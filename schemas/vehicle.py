@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -11,6 +11,30 @@ from schemas.config import explain
 from schemas.errors import InputError
 
 Metres = Annotated[float, Field(gt=0.0, lt=20.0, allow_inf_nan=False)]
+
+
+Spread = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Learned = tuple[Annotated[float, Field(allow_inf_nan=False)], Spread]
+"""A value and its standard deviation."""
+
+
+class Calibration(BaseModel):
+    """What a car's own drives say its devices are off by: value and standard deviation; None where not learned."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    version: Literal[1] = 1
+    drives: Annotated[int, Field(ge=1, description="that it was learned from")]
+    radius_fl: Annotated[Learned | None, Field(description="turns faster than the mean of the four [1]")] = None
+    radius_fr: Annotated[Learned | None, Field(description="likewise")] = None
+    radius_rl: Annotated[Learned | None, Field(description="likewise")] = None
+    radius_rr: Annotated[Learned | None, Field(description="likewise")] = None
+    ax: Annotated[Learned | None, Field(description="[m/s^2] read on level road at constant speed")] = None
+    ay: Annotated[Learned | None, Field(description="[m/s^2] likewise")] = None
+    yaw_rate: Annotated[Learned | None, Field(description="[rad/s] read straight on")] = None
+    steer_offset: Annotated[Learned | None, Field(description="[rad] read straight on")] = None
+    steer_gain: Annotated[Learned | None, Field(description="reading over the road wheels' true angle [1]")] = None
+    understeer: Annotated[Learned | None, Field(description="[rad per m/s^2], told and not yet used")] = None
 
 
 class Vehicle(BaseModel):
@@ -41,6 +65,7 @@ class Vehicle(BaseModel):
         float | None,
         Field(gt=1.0, lt=60.0, description="angle of the steering wheel over the road wheels', where known"),
     ] = None
+    calibration: Annotated[Calibration | None, Field(description="learned by edge-agent calibrate")] = None
 
 
 def load_vehicle(path: Path | str) -> Vehicle:

@@ -26,6 +26,7 @@ MAY_IMPORT = {
 ROOMS: dict[str, dict[str, set[str]]] = {
     "edge_agent": {
         "inputs": set(),
+        "calibration": {"inputs"},
         "dynamics": set(),
         "filters": set(),
         "adaptation": set(),
@@ -33,8 +34,8 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "observe": {"inputs", "estimators"},
         "publish": {"observe"},
         "app": {"inputs", "adaptation", "estimators", "observe", "publish"},
-        "lab": {"inputs", "dynamics", "filters", "adaptation", "estimators", "observe", "app"},
-        "cli": {"inputs", "adaptation", "estimators", "observe", "publish", "app", "lab"},
+        "lab": {"inputs", "calibration", "dynamics", "filters", "adaptation", "estimators", "observe", "app"},
+        "cli": {"inputs", "calibration", "adaptation", "estimators", "observe", "publish", "app", "lab"},
     },
     "fleet_service": {
         "fusion": set(),

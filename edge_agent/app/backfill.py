@@ -7,11 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 from edge_agent.app.estimates_file import EstimatesFile
 from edge_agent.app.estimator_factory import bank_of
+from edge_agent.inputs.correct import corrected
 from edge_agent.inputs.signal_log import read_log
 from schemas.errors import InputError
 from schemas.vehicle import load_vehicle
@@ -70,7 +72,9 @@ def backfill(tasks: Sequence[Task], estimator: str, jobs: int) -> Iterator[Outco
 def estimate(task: Task, estimator: str) -> Outcome:
     """Estimate one drive."""
     try:
-        bank, log = bank_of(estimator, [load_vehicle(task.vehicle)]), read_log(task.log)
+        vehicle = load_vehicle(task.vehicle)
+        bank, log = bank_of(estimator, [vehicle]), read_log(task.log)
+        log = replace(log, signals=corrected(log.signals, vehicle))
         with EstimatesFile(task.out) as file:
             for block in log.blocks(0):
                 file.write(block.t, bank.advance(block.t, block.signals))

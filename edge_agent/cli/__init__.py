@@ -1,4 +1,4 @@
-"""`edge-agent`: simulate, import, check, replay, run, fleet, tune, evaluate.
+"""`edge-agent`: simulate, import, check, calibrate, replay, run, fleet, tune, evaluate.
 
 Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. What a command needs is imported when
 it is chosen, so that help is quick.
@@ -31,6 +31,7 @@ COMMANDS: Final = (
     Command("simulate", "edge_agent.cli.simulate", "write the signal log of a manoeuvre, with truth"),
     Command("import", "edge_agent.cli.import_", "any car's recording to a signal log: CAN, MDF, ROS, CSV, GNSS"),
     Command("check", "edge_agent.cli.check", "the signal doctor: units, signs, clocks, offsets, by physics"),
+    Command("calibrate", "edge_agent.cli.calibrate", "a vehicle file learned from a car's own drives"),
     Command("replay", "edge_agent.cli.replay", "estimate a recorded drive, and publish it on request"),
     Command("run", "edge_agent.cli.run", "one vehicle, live, in real time"),
     Command("fleet", "edge_agent.cli.fleet", "many simulated vehicles in real time, each with its own session"),

@@ -14,6 +14,7 @@ from schemas.errors import InputError
 LEAST_SEEDS: Final = 20  # of a campaign whose bars count
 QUICK_SEEDS: Final = 2
 ONLY: Final = ("inputs",)
+LEARNED_CARS: Final = 20
 CARS: Final = 5  # smooth ones, and as many rough ones, of the inputs' campaign
 
 
@@ -22,7 +23,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder for figures.json, report.md and the plots")
     parser.add_argument("--quick", action="store_true", help="three scenarios, two estimators, two seeds: does it run?")
     parser.add_argument("--seeds", type=int, help=f"how many drives per scenario (default {LEAST_SEEDS})")
-    parser.add_argument("--only", choices=ONLY, help="a campaign of its own: inputs, the signal doctor's")
+    parser.add_argument(
+        "--only", choices=ONLY, help="a campaign of its own: inputs, of the signal doctor and of calibration"
+    )
     parser.add_argument("--no-plots", action="store_true", help="figures and table only; needs no matplotlib")
 
 
@@ -68,11 +71,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _inputs(args: argparse.Namespace) -> int:
-    from edge_agent.lab.evaluation.planted import figures as figures_of
+    from edge_agent.lab.evaluation.calibrated import figures as calibrated
+    from edge_agent.lab.evaluation.planted import figures as planted
     from edge_agent.lab.seeds import FIGURES
     from schemas.runtime.figures import markdown, write
 
-    figures = figures_of(1 if args.quick else CARS, FIGURES)
+    figures = planted(1 if args.quick else CARS, FIGURES) + calibrated(1 if args.quick else LEARNED_CARS, FIGURES)
     write(args.out / "figures.json", "edge-agent evaluate --only inputs", [FIGURES, FIGURES + 1], figures)
     text = f"# Inputs\n\n{markdown(figures)}\n"
     (args.out / "report.md").write_text(text, encoding="utf-8")

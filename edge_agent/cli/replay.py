@@ -6,6 +6,7 @@ import argparse
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -47,6 +48,7 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.app.estimator_factory import bank_of
     from edge_agent.app.plausible import IMPLAUSIBLE, Plausibility
     from edge_agent.cli.common import insist_on_sound
+    from edge_agent.inputs.correct import corrected
     from edge_agent.inputs.signal_log import read_log
     from schemas.config import AgentConfig, load
     from schemas.errors import InputError
@@ -66,6 +68,7 @@ def run(args: argparse.Namespace) -> int:
     bank = bank_of(estimator, [vehicle])
     log = read_log(path)
     start_ns = _start(args.start, log)
+    log = replace(log, signals=corrected(log.signals, vehicle))
     plausibility = Plausibility(vehicle.wheel_radius)
     if args.publish and not args.trust:
         insist_on_sound(log, vehicle)

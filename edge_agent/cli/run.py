@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -51,6 +52,7 @@ def _simulated(args: argparse.Namespace) -> tuple[Vehicle, str, Iterator[Block]]
 
 def _logged(args: argparse.Namespace) -> tuple[Vehicle, str, Iterator[Block]]:
     from edge_agent.cli.common import insist_on_sound
+    from edge_agent.inputs.correct import corrected
     from edge_agent.inputs.signal_log import read_log
     from schemas.errors import InputError
     from schemas.thresholds import NS
@@ -60,6 +62,7 @@ def _logged(args: argparse.Namespace) -> tuple[Vehicle, str, Iterator[Block]]:
         raise InputError("vehicle", "is not given", "name the vehicle file of the log with --vehicle")
     vehicle = load_vehicle(args.vehicle)
     log = read_log(Path(args.source))
+    log = replace(log, signals=corrected(log.signals, vehicle))
     if not args.trust:
         insist_on_sound(log, vehicle)
     first_ns = time.time_ns() - round(float(log.t[0]) * NS)

@@ -65,6 +65,7 @@ REAL = "test_the_real_minute_becomes_a_log_in_si_with_its_provenance"
 CAMPAIGN = "test_the_quick_campaign_writes_figures_report_and_plots"
 SEEDS = "test_more_seeds_are_driven_and_no_plots_drawn_where_so_asked"
 UNFIT = "test_what_has_not_passed_is_not_published_unless_it_is_trusted"
+LEARNED = "test_a_calibrated_file_is_written_read_and_heeded"
 FIX = "test_a_fix_makes_the_drive_pass"
 ELSEWHERE = {
     "simulate": {"--list": "test_simulate_lists_the_manoeuvres",
@@ -78,6 +79,7 @@ ELSEWHERE = {
                "--publish": SENT_BY_REPLAY, "--trust": UNFIT, "--name": SENT_BY_REPLAY, "--start": SENT_BY_REPLAY,
                "--jobs": "test_so_many_drives_are_under_way_at_once"},
     "check": {"log": FIX, "--vehicle": FIX, "--out": FIX, "--fix": FIX},
+    "calibrate": {"log": LEARNED, "--vehicle": LEARNED, "--out": LEARNED, "--trust": LEARNED},
     "run": {"--trust": UNFIT}, "fleet": {},
     "tune": {"--quick": "test_quick_tuning_writes_a_valid_file_and_says_what_it_does",
              "--study": "test_the_quick_study_writes_figures_table_plot_and_a_tuned_file"},
@@ -91,7 +93,7 @@ OBSERVED = {
 }  # fmt: skip
 NUMBERS = [
     (estimator, name) for name in Vehicle.model_fields for estimator in ("aco-fckf", "compensated-wckf")
-    if name not in ("name", "steering_ratio")  # which only `import` reads: test_a_measurement_file_and_a_bag
+    if name not in ("name", "steering_ratio", "calibration")  # read by `import`, and by what reads logs: test_learn
     and (estimator, name) != ("compensated-wckf", "drive_split_front")
 ]  # fmt: skip
 SENT = {"zenoh", "spool", "spool_mb", "resend_s", "flush_s", "batch_rows", "estimator"}

@@ -40,6 +40,7 @@ class Fit:
     lag_error_s: float
     left: FloatArray
     right: FloatArray
+    beside: tuple[float, ...] = ()  # gains of what else the left holds
 
     @property
     def known(self) -> bool:
@@ -144,7 +145,8 @@ def fit(sides: Relation, moving: FloatArray, *, level: bool) -> Fit:
     gain = float(np.sign(solution[0])) * float(np.sqrt(abs(solution[0] * slope))) if correlation else 0.0
     count = max(excited_s / CORRELATED_S, 1.0)
     error = float(np.sqrt(max(1.0 - correlation**2, 1e-6) / max(correlation**2, 1e-6) / count))
-    return Fit(gain, float(solution[1]), correlation, error, excited_s, lag, lag_error, y, x)
+    found = tuple(float(k) for k in solution[2:])
+    return Fit(gain, float(solution[1]), correlation, error, excited_s, lag, lag_error, y, x, found)
 
 
 def _ratio(x: FloatArray, y: FloatArray) -> float:

@@ -1,0 +1,95 @@
+"""Errors of one car's devices from its own drives, each a mean over the drives with its standard deviation.
+
+    quantity          from
+    radius_fl … rr    turning of each wheel against the median of the four on calm moments, less what yaw makes of it
+    ax, ay            median of a_x − dv/dt and of a_y − v·r, the latter on straights
+    yaw_rate          intercept of the wheels' yaw rate over the gyro's
+    steer_offset      intercept of δ over L·r/v with understeer beside it
+    steer_gain        gain of the same
+    understeer        δ beyond L·r/v per v·r [rad per m/s²]
+
+A drive that was not excited enough for a quantity says nothing of it. The spread among drives (not less than FLOOR, as
+few drives may agree by chance) over the root of their number is the standard deviation; BIAS, what all drives have in
+common (crossfall of 2.5 %, a steering map that is bent, load), is added to it. Both were set on simulated rough cars.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, prepare
+from edge_agent.inputs.doctor.identities import fits
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+from schemas.signals import WHEELS
+from schemas.vehicle import Calibration, Vehicle
+
+CALM: Final = 0.7  # [m/s^2] of acceleration, up to which wheels hardly slip
+STRAIGHT: Final = 1.0  # [m/s^2] of v·r
+LEAST_S: Final = 10.0  # of moments that count
+# spread among drives that is always allowed for; and what drives have in common
+FLOOR: Final = {"radius": 0.0008, "ax": 0.10, "ay": 0.05, "yaw_rate": 0.0015, "steer_offset": 0.0010,
+                "steer_gain": 0.03, "understeer": 0.0015}  # fmt: skip
+BIAS: Final = {"radius": 0.0007, "ax": 0.06, "ay": 0.25, "yaw_rate": 0.0005, "steer_offset": 0.0006,
+               "steer_gain": 0.04, "understeer": 0.0010}  # fmt: skip
+
+
+def learn(drives: Sequence[tuple[FloatArray, FloatArray]], vehicle: Vehicle) -> Calibration:
+    """What the drives, (t (T,), signals (T, 18)) each, say of a vehicle.
+
+    Raises:
+        InputError: none of them says anything.
+    """
+    told: dict[str, list[float]] = {}
+    for t, signals in drives:
+        for name, value in one_drive(prepare(t, signals, vehicle), vehicle).items():
+            told.setdefault(name, []).append(value)
+    if not told:
+        raise InputError(
+            "log", "no drive is excited enough to learn from", "give drives with turns, straights, braking"
+        )
+    learned = {name: _mean(name, np.array(values)) for name, values in told.items()}
+    return Calibration.model_validate({"drives": len(drives), **learned})
+
+
+def _mean(name: str, values: FloatArray) -> tuple[float, float]:
+    kind = name.partition("_")[0] if name.startswith("radius") else name
+    spread = max(float(np.std(values, ddof=1)) if len(values) > 2 else 2.0 * FLOOR[kind], FLOOR[kind])
+    centre = float(np.median(values)) if len(values) > 2 else float(np.mean(values))
+    return round(centre, 6), round(float(np.hypot(spread / np.sqrt(len(values)), BIAS[kind])), 6)
+
+
+def one_drive(drive: EvenDrive, vehicle: Vehicle) -> dict[str, float]:
+    """What one drive says, by quantity; what it was not excited for is left out."""
+    moving, axle = drive.moving > 0, fits(drive)["axle"]
+    told: dict[str, float] = {}
+    if axle.known and axle.error < 0.1:
+        told["yaw_rate"] = -axle.offset / axle.gain
+        drive = replace(drive, r=drive.r - told["yaw_rate"])  # it would be taken for an offset of steering and a_y
+    told |= _radii(drive, vehicle)
+    calm = moving & np.isfinite(drive.ax) & np.isfinite(drive.v_dot)
+    if calm.sum() > LEAST_S * RATE_HZ:
+        told["ax"] = float(np.median((drive.ax - drive.v_dot)[calm]))
+    straight = moving & (np.abs(drive.v * drive.r) < STRAIGHT) & np.isfinite(drive.ay)
+    if straight.sum() > LEAST_S * RATE_HZ:
+        told["ay"] = float(np.median((drive.ay - drive.v * drive.r)[straight]))
+    steering = fits(drive)["steering"]
+    if steering.known and steering.error < 0.1:
+        told |= {"steer_offset": steering.offset, "steer_gain": steering.gain, "understeer": steering.beside[0]}
+    return told
+
+
+def _radii(drive: EvenDrive, vehicle: Vehicle) -> dict[str, float]:
+    """How much faster each wheel turns than the mean of the four."""
+    calm = (drive.moving > 0) & (np.abs(drive.v_dot) < CALM) & (np.abs(drive.v * drive.r) < STRAIGHT)
+    calm &= np.isfinite(drive.wheels).all(axis=1) & np.isfinite(drive.r)
+    if calm.sum() < LEAST_S * RATE_HZ:
+        return {}
+    half = 0.5 * np.array([-vehicle.track_front, vehicle.track_front, -vehicle.track_rear, vehicle.track_rear])
+    rims = drive.wheels[calm] - half * drive.r[calm, None]
+    ratio = np.median(rims / rims.mean(axis=1, keepdims=True), axis=0) - 1.0
+    return {f"radius_{wheel}": float(value) for wheel, value in zip(WHEELS, ratio, strict=True)}

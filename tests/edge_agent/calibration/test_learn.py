@@ -1,0 +1,116 @@
+"""Calibration: what was put into a simulated car's devices comes out of its drives, and mends them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from edge_agent.calibration.learn import learn
+from edge_agent.cli import main
+from edge_agent.inputs.correct import corrected
+from edge_agent.lab.evaluation.planted import Recorded, drives, moved, scaled
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+from schemas.signals import CHANNELS, S
+from schemas.vehicle import Vehicle, load_vehicle
+
+Output = pytest.CaptureFixture[str]
+OFF = {"ax": 0.5, "yaw_rate": 0.012, "steer_offset": 0.012, "radius_fl": 0.012}
+
+
+@pytest.fixture(scope="module")
+def smooth() -> Recorded:
+    """Three minutes of a car whose devices are well mounted, on a plane."""
+    return drives(1, 31, rough=False, seconds=180)[0]
+
+
+def spoiled(drive: Recorded) -> Recorded:
+    for spoil in (
+        moved([S.AX], OFF["ax"]),
+        moved([S.YAW_RATE], OFF["yaw_rate"]), moved([S.DELTA, S.DELTA + 1], OFF["steer_offset"]),
+        scaled([S.OMEGA], 1.0 + 4.0 / 3.0 * OFF["radius_fl"]),
+    ):  # fmt: skip
+        drive = spoil(drive)
+    return drive
+
+
+def parts(drive: Recorded, count: int) -> list[tuple[FloatArray, FloatArray]]:
+    size = len(drive.t) // count
+    return [(drive.t[k * size :][:size], drive.signals[k * size :][:size]) for k in range(count)]
+
+
+def test_what_is_put_in_comes_out_beside_its_standard_deviation(smooth: Recorded) -> None:
+    before = learn(parts(smooth, 3), smooth.vehicle)
+    after = learn(parts(spoiled(smooth), 3), smooth.vehicle)
+    assert after.drives == 3
+    for name, off in OFF.items():
+        one, other = getattr(before, name), getattr(after, name)
+        assert other[0] - one[0] == pytest.approx(off, abs=2.0 * other[1]), name
+        assert abs(one[0]) < 3.0 * one[1], name
+        assert 0.0 < other[1] < off
+
+
+def test_more_drives_are_surer(smooth: Recorded) -> None:
+    few, many = (learn(parts(smooth, count), smooth.vehicle) for count in (1, 3))
+    assert few.ax is not None
+    assert many.ax is not None
+    assert many.ax[1] < few.ax[1]
+
+
+def test_a_correction_takes_off_what_was_learned_and_leaves_what_is_unsure(smooth: Recorded) -> None:
+    bad = spoiled(smooth)
+    calibration = learn(parts(bad, 3), bad.vehicle)
+    mended = corrected(bad.signals, bad.vehicle.model_copy(update={"calibration": calibration}))
+    for channel, off in ((S.AX, OFF["ax"]), (S.YAW_RATE, OFF["yaw_rate"]), (S.DELTA, OFF["steer_offset"])):
+        left = np.nanmedian(mended[:, channel] - smooth.signals[:, channel])
+        assert abs(left) < 0.35 * off
+    unsure = bad.vehicle.model_copy(update={"calibration": calibration.model_copy(update={"ax": (0.1, 0.2)})})
+    assert np.array_equal(corrected(bad.signals, unsure)[:, S.AX], bad.signals[:, S.AX], equal_nan=True)
+    assert corrected(bad.signals, bad.vehicle) is bad.signals
+
+
+def test_a_car_that_stands_teaches_nothing(smooth: Recorded) -> None:
+    still = np.zeros_like(smooth.signals[:3000])
+    with pytest.raises(InputError, match="excited"):
+        learn([(smooth.t[:3000], still)], smooth.vehicle)
+
+
+def write(path: Path, drive: Recorded) -> str:
+    columns = {"t": pa.array(drive.t)}
+    columns |= {name: pa.array(drive.signals[:, i], from_pandas=True) for i, name in enumerate(CHANNELS)}
+    pq.write_table(pa.table(columns), path)
+    return str(path)
+
+
+@pytest.mark.timeout(600)  # kernels may have to be compiled
+def test_a_calibrated_file_is_written_read_and_heeded(smooth: Recorded, tmp_path: Path, capsys: Output) -> None:
+    log, car, better = write(tmp_path / "a.parquet", spoiled(smooth)), tmp_path / "car.json", tmp_path / "better.json"
+    car.write_text(smooth.vehicle.model_dump_json(exclude_none=True))
+    assert main(["calibrate", log, log, "--vehicle", str(car), "--out", str(better)]) == 0
+    assert "steer_offset" in capsys.readouterr().out
+    learned = load_vehicle(better)
+    assert learned.calibration is not None
+    assert learned.model_copy(update={"calibration": None}) == load_vehicle(car)
+    said = []
+    for number, file in enumerate((car, better)):
+        out = tmp_path / f"{number}.out"
+        assert main(["replay", log, "--vehicle", str(file), "--estimator", "ckf", "--out", str(out)]) in (0, 3)
+        said.append(pq.read_table(out))
+    assert not said[0].equals(said[1])
+    wrong = write(tmp_path / "b.parquet", scaled([S.AY], -1.0)(smooth))
+    assert main(["calibrate", wrong, "--vehicle", str(car), "--out", str(better)]) == 2
+    assert "ay sign" in capsys.readouterr().err
+    assert main(["calibrate", wrong, "--vehicle", str(car), "--out", str(better), "--trust"]) == 0
+
+
+def test_an_old_file_reads_and_an_unknown_quantity_is_refused(smooth: Recorded, tmp_path: Path) -> None:
+    old = json.loads(smooth.vehicle.model_dump_json(exclude_none=True))
+    assert Vehicle.model_validate(old).calibration is None
+    (tmp_path / "car.json").write_text(json.dumps(old | {"calibration": {"version": 1, "drives": 1, "az": [0, 1]}}))
+    with pytest.raises(InputError, match="az"):
+        load_vehicle(tmp_path / "car.json")
