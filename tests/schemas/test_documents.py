@@ -42,7 +42,7 @@ def test_every_health_flag_stands_with_its_bit(text: str, flag: Health) -> None:
 
 @BOTH
 def test_no_health_flag_stands_that_does_not_exist(text: str) -> None:
-    named = set(re.findall(r"\b(?:NO_[A-Z]{3,}(?:_[A-Z]+)?|TIME_GAP|OUTLIER|SLIDING|RESET)\b", text))
+    named = set(re.findall(r"\b(?:NO_[A-Z]{3,}(?:_[A-Z]+)?|TIME_GAP|OUTLIER|SLIDING|RESET|CONTRADICTION)\b", text))
     assert named == {flag.name for flag in Health if flag}
 
 

@@ -1,7 +1,8 @@
 """From the sums of a block to the few numbers that the measurement equations need (`BlockFeatures`).
 
-Longitudinal force comes from torque, F_x = (T - J*omega')/R; where torque or speed is missing, from a_x shared out by
-guess with a spread to match. Lateral axle forces come from m*a_y and Iz*r' (paper 004, equation 2; errata 000 on signs
+Longitudinal force comes from torque, F_x = (T - J*omega')/R; where torque or speed is missing, from a_x shared out
+with a spread to match (`drive_split.py`). An accelerometer feels slope and bank as tyres do: they are force, offsets
+are not. Lateral axle forces come from m*a_y and Iz*r' (paper 004, equation 2; errata 000 on signs
 and arms).
 """
 
@@ -17,13 +18,17 @@ from edge_agent.dynamics.wheel import force_from_torque
 from edge_agent.estimators import flags
 from edge_agent.estimators.friction_mixture.constants import Constants
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.drive_split import front_share
 from edge_agent.estimators.friction_mixture.memory import BlockSums, MixtureMemory
 from edge_agent.estimators.friction_mixture.workspace import BlockFeatures
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
+from schemas.thresholds import GRAVITY
 
 SLOWEST_COMPARED_M_S = 1.0  # slips of two wheels are compared at this speed at least: speeds differ by noise below
+NO_FORCE_SHARE = 0.3  # force over load that may act where nobody has measured any
+ROUNDING = 1 / math.sqrt(12.0)  # standard deviation of rounding to a step
 CERTAIN = 4.0  # standard deviations of wheel-speed noise that a difference between the sides must exceed
 
 
@@ -42,7 +47,8 @@ def block_features(memory: MixtureMemory, design: MixtureDesign, features: Block
         features.rolling[wheel] = row[Parameter.RADIUS] * mean_or(block, S.OMEGA + wheel, math.nan)
         change = (last.omega[wheel] - block.start_omega[wheel]) / features.duration
         features.spin[wheel] = 0.0 if math.isnan(change) else change
-    health = _forces(row, constants, block, features)
+    features.change, features.steer_rate = ax, _steer_rate(memory, features.duration)
+    health = _forces(memory, constants, features)
     _sides(memory, features)
     health |= _drop_unknown_sides(memory, features)
     _noise(memory, design, features)
@@ -65,45 +71,46 @@ def _kinematics(block: BlockSums, features: BlockFeatures) -> None:
     features.sin = block.sin_sum * share
     mean, total = features.gain, block.gain_sum
     mean.measured.x, mean.measured.y = total.measured.x * share, total.measured.y * share
-    mean.leak_x.x, mean.leak_x.y = total.leak_x.x * share, total.leak_x.y * share
     mean.leak_y.x, mean.leak_y.y = total.leak_y.x * share, total.leak_y.y * share
     mean.unit.x, mean.unit.y = total.unit.x * share, total.unit.y * share
 
 
 @compiled
-def _forces(row: FloatArray, constants: Constants, block: BlockSums, features: BlockFeatures) -> int:
+def _steer_rate(memory: MixtureMemory, duration: float) -> float:
+    """Rate of the mean front steering angle [rad/s]."""
+    now, before = memory.last.delta, memory.last.delta_before
+    return float(0.5 * (now[0] + now[1] - before[0] - before[1]) / duration)
+
+
+@compiled
+def _forces(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> int:
     """Force, and the part of noise_std that comes from it, of the four wheels; returns health flags."""
-    health, loads = 0, features.loads
+    health, loads, row, block = 0, features.loads, memory.row, memory.block
     ax = mean_or(block, S.AX, math.nan)
+    front, front_std = front_share(row, memory.drive_odds, features.change)
     for wheel in range(4):
         torque = mean_or(block, S.TORQUE + wheel, math.nan)
         if not (math.isnan(torque) or math.isnan(features.rolling[wheel])):
             force = force_from_torque(torque, features.spin[wheel], row[Parameter.WHEEL_INERTIA], row[Parameter.RADIUS])
-            spread = constants.force_share * abs(force)
+            spread, unit = constants.force_share * abs(force), 0.0
         else:
             if math.isnan(torque):
                 health |= flags.NO_TORQUE
-            known = 0.0 if math.isnan(ax) else row[Parameter.MASS] * ax
-            force = _wheel_share(row, constants, wheel, known) * known
-            spread = constants.no_torque_share * abs(known)
+            known = row[Parameter.MASS] * features.change
+            unit = 0.5 * (front if wheel < 2 else 1.0 - front) * row[Parameter.MASS]
+            force = unit * features.change
+            apart = math.hypot(constants.no_torque_share * force, 0.5 * front_std * known)
+            spread = math.hypot(apart, 0.25 * row[Parameter.MASS] * constants.no_torque_floor)
             if math.isnan(ax):
-                spread = constants.no_torque_share * loads[wheel]
-        features.force[wheel] = force / loads[wheel]
+                unit, spread = 0.0, NO_FORCE_SHARE * loads[wheel]
+        features.force[wheel], features.force_unit[wheel] = force / loads[wheel], unit / loads[wheel]
         features.noise_std[wheel] = spread / loads[wheel]
     return health
 
 
 @compiled
-def _wheel_share(row: FloatArray, constants: Constants, wheel: int, force: float) -> float:
-    """Guess of a wheel's share of the total longitudinal force where torque is missing."""
-    split = row[Parameter.DRIVE_FRONT]
-    front = constants.brake_front if force < 0.0 or math.isnan(split) else split
-    return 0.5 * front if wheel < 2 else 0.5 * (1.0 - front)
-
-
-@compiled
 def _sides(memory: MixtureMemory, features: BlockFeatures) -> None:
-    """side, side_leak and load_share of both axles; NaN without a_y."""
+    """side with its derivatives, and load_share of both axles; NaN without a_y."""
     row, loads, delta = memory.row, features.loads, memory.last.delta
     ay = mean_or(memory.block, S.AY, math.nan)
     yaw_acceleration = (memory.last.yaw_rate - memory.block.start_yaw_rate) / features.duration
@@ -121,6 +128,7 @@ def _sides(memory: MixtureMemory, features: BlockFeatures) -> None:
         cos = math.cos(angle)
         side = (front if axle == 0 else rear) - along * math.sin(angle)
         features.side[axle] = side / (cos * load)
+        features.side_unit[axle] = 1.0 / (GRAVITY * cos)
         features.side_leak[axle] = (leak_front if axle == 0 else leak_rear) / (cos * load)
         features.load_share[left] = loads[left] / load
         features.load_share[right] = loads[right] / load
@@ -152,9 +160,11 @@ def _noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures
         slip = constants.omega_noise / math.sqrt(samples) * row[Parameter.RADIUS] / speed
         white = row[Parameter.SLOPE_X] * slip
         shape = constants.shape_share * features.force[wheel] ** 2
-        variance = 0.5 * white**2 + constants.floor_x**2 + features.noise_std[wheel] ** 2 + shape**2
+        step = max(constants.step_noise, ROUNDING * memory.last.omega_step[wheel])
+        slip_variance = white**2 + (row[Parameter.SLOPE_X] * step * row[Parameter.RADIUS] / speed) ** 2
+        variance = 0.5 * slip_variance + constants.floor_x**2 + features.noise_std[wheel] ** 2 + shape**2
         features.noise_std[wheel] = math.sqrt(variance * scale)
-        features.slip_noise[wheel] = white**2 * scale
+        features.slip_noise[wheel] = slip_variance * scale
     scale = design.scales[1] * memory.factor[1]
     for axle in range(2):
         side = features.side[axle]

@@ -42,18 +42,22 @@ def nominal_states(constants: Constants) -> Nominal:
     mean, std, time = np.zeros(STATES), np.ones(STATES), np.full(STATES, np.inf)
     c, x = constants, NodeState
     for state, spread, back in (
-        (x.LN_KX, c.stiffness_std, c.stiffness_time),
-        (x.LN_KY, c.stiffness_std, c.stiffness_time),
+        (x.LN_KX, c.stiffness_x_std, c.stiffness_time),
+        (x.LN_KY, c.stiffness_y_std, c.stiffness_time),
         (x.LEAK_Y, c.leak_y_std, c.leak_time),
         (x.STEER, c.steer_std, c.stiffness_time),
         (x.SHAPE, c.shape_std, c.shape_time),
         (x.GAIN, c.gain_std, c.stiffness_time),
-        (x.LEAK_X, c.leak_x_std, c.leak_time),
-        (x.BIAS_X, c.bias_std, c.bias_time),
-        (x.BIAS_Y, c.bias_std, c.bias_time),
+        (x.BIAS_X, c.bias_x_std, c.bias_time),
+        (x.BIAS_Y, c.bias_y_std, c.bias_time),
+        *((x.RADIUS + wheel, c.wheel_std, c.bias_time) for wheel in range(4)),
+        (x.LAG_WHEEL, c.lag_std, c.bias_time),
+        (x.LAG_STEER, c.lag_std, c.bias_time),
+        (x.SLOPE, c.slope_std, c.slope_time),
+        (x.BANK, c.bank_std, c.slope_time),
     ):
         std[state], time[state] = spread, back
-    mean[x.LEAK_Y], mean[x.LEAK_X] = c.leak_y_mean, c.leak_x_mean
+    mean[x.LEAK_Y] = c.leak_y_mean
     return Nominal(mean, std, time)
 
 

@@ -12,10 +12,12 @@ from edge_agent.dynamics.body import advance_velocity
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators import flags
 from edge_agent.estimators.common.readings import GAP_S, INPUTS, believe, position_health, position_time
-from edge_agent.estimators.friction_mixture.constants import NodeState
+from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.grip_guard import note_grip
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory, PlanarVector, VelocityGain
 from edge_agent.estimators.friction_mixture.restart import UNKNOWN_YAW_VAR, YAW_STD, bridge
+from edge_agent.estimators.friction_mixture.wheel_readings import note_step, refuse_jumps
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
@@ -38,6 +40,7 @@ def take_sample(memory: MixtureMemory, design: MixtureDesign, time: float, sampl
         return flags.TIME_GAP, False
     now = last.now
     health = believe(sample, now) & ~flags.NO_STEERING  # which the block judges: a single angle is bridged
+    health |= refuse_jumps(memory.row, now)
     last.position_time = position_time(sample, time, last.position_time)
     health |= position_health(time, last.position_time)
     if dt > GAP_S:
@@ -51,7 +54,7 @@ def take_sample(memory: MixtureMemory, design: MixtureDesign, time: float, sampl
     last.read_ax, last.read_ay = now[S.AX], now[S.AY]
     if math.isnan(ax + ay) and not math.isnan(last.read_ax + last.read_ay):
         health |= flags.OUTLIER
-    _move(memory, time, dt, ax, ay, not math.isnan(now[S.YAW_RATE]))
+    _move(memory, design.constants, dt, ax, ay, not math.isnan(now[S.YAW_RATE]))
     _add(memory, ax, ay)
     last.time = time
     return health, time - memory.block.time >= design.constants.block_time - EARLY_S
@@ -70,12 +73,12 @@ def begin_block(memory: MixtureMemory) -> None:
         block.sums[channel] = 0.0
         block.counts[channel] = 0
     for wheel in range(4):
-        block.start_omega[wheel] = last.omega[wheel]
+        block.start_omega[wheel], last.delta_before[wheel] = last.omega[wheel], last.delta[wheel]
 
 
 @compiled
 def _clear(gain: VelocityGain) -> None:
-    gain.measured.x = gain.measured.y = gain.leak_x.x = gain.leak_x.y = 0.0
+    gain.measured.x = gain.measured.y = 0.0
     gain.leak_y.x = gain.leak_y.y = gain.unit.x = gain.unit.y = 0.0
 
 
@@ -104,37 +107,38 @@ def _believed(value: float, used: float, read: float) -> float:
 
 
 @compiled
-def _move(memory: MixtureMemory, time: float, dt: float, ax: float, ay: float, turning: bool) -> None:
+def _move(
+    memory: MixtureMemory, constants: Constants, dt: float, ax: float, ay: float, turning: bool
+) -> None:  # fmt: skip
     """Velocity gained since the block began, in the axes of now: the exact solution for inputs constant over dt.
 
     ax, ay are NaN where they are missing; `turning` is whether the yaw rate is not.
     """
     last, block = memory.last, memory.block
-    rate = last.yaw_rate
+    rate, time = last.yaw_rate, last.time + dt
     if not math.isnan(ax + ay):
         last.inertial_time = time
     elif time - last.inertial_time < HOLD_S:
         ax = last.ax if math.isnan(ax) else ax
         ay = last.ay if math.isnan(ay) else ay
-    leak_x, leak_y = ax, ay
+    leak_y = ay
     if math.isnan(ax):
-        ax = leak_x = 0.0
+        ax = 0.0
         block.missing_x = LOST_AX**2
     if math.isnan(ay) or not turning:
         block.missing_y = LOST_AY**2
     if math.isnan(ay):
         ay, leak_y = rate * memory.overall_mean[NodeState.VX], 0.0
     last.ax, last.ay = ax, ay
+    note_grip(memory.grip, ax, ay, dt)
     gain, total = block.gain, block.gain_sum
-    _advance(gain.measured, ax, ay, rate, dt)
-    _advance(gain.leak_x, leak_x, 0.0, rate, dt)
+    _advance(gain.measured, (1.0 - constants.leak_x) * ax, ay, rate, dt)
     _advance(gain.leak_y, 0.0, leak_y, rate, dt)
     _advance(gain.unit, 1.0, 0.0, rate, dt)
     block.angle += rate * dt
     block.cos_sum += math.cos(block.angle)
     block.sin_sum += math.sin(block.angle)
     _accumulate(total.measured, gain.measured)
-    _accumulate(total.leak_x, gain.leak_x)
     _accumulate(total.leak_y, gain.leak_y)
     _accumulate(total.unit, gain.unit)
     block.samples += 1
@@ -161,7 +165,9 @@ def _add(memory: MixtureMemory, ax: float, ay: float) -> None:
             block.counts[channel] += 1
     for wheel in range(4):
         omega = now[S.OMEGA + wheel]
-        last.omega[wheel] = last.omega[wheel] if math.isnan(omega) else omega
+        if not math.isnan(omega):
+            note_step(last, wheel, omega)
+            last.omega[wheel] = omega
         if block.counts[S.DELTA + wheel] > 0:
             last.delta[wheel] = block.sums[S.DELTA + wheel] / block.counts[S.DELTA + wheel]
             if wheel >= 2:

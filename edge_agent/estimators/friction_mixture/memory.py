@@ -25,7 +25,6 @@ class VelocityGain:
     """Velocity [m/s] gained since the block began, in the axes of now."""
 
     measured: PlanarVector  # by the measured accelerations
-    leak_x: PlanarVector  # the part of it from a_x, which its leak scales
     leak_y: PlanarVector  # the part of it from a_y
     unit: PlanarVector  # by 1 m/s^2 ahead, per [m/s^2] of offset
 
@@ -62,8 +61,40 @@ class LastInputs:
     yaw_rate: float  # scalar filter [rad/s]
     yaw_rate_var: float
     omega: Annotated[FloatArray, 4]  # [rad/s]
+    omega_held: Annotated[IntArray, 4]  # readings for which it has been the same
+    omega_step: Annotated[FloatArray, 4]  # width of the steps that it is read in [rad/s]
     delta: Annotated[FloatArray, 4]  # [rad]
+    delta_before: Annotated[FloatArray, 4]  # in the block before [rad]
     rear_steering: bool  # whether a rear steering angle has been seen
+
+
+class GripInUse:
+    """Grip that the accelerometers show in use, over g [1]."""
+
+    slow: float  # smoothed, for the nodes
+    fast: float  # smoothed less
+    held: float  # the largest of late: no friction is told below it
+    age: float  # of that [s]
+
+
+class RollingMotion:
+    """What wheels tell of the motion without a tyre."""
+
+    moved_time: float  # at which a wheel last turned [s]
+    disagreed_time: float  # at which wheels last disagreed [s]
+    resting_ax: float  # a_x while wheels stand, smoothed [m/s^2]
+    stands: bool
+    ahead: float  # v_x by wheels that agree [m/s]; NaN where they do not
+    ahead_std: float
+    left: float  # v_y by a rear axle that follows [m/s]; NaN where it may slide
+    left_std: float
+
+
+class Trust:
+    """Whether any friction explains what is measured."""
+
+    odd: float  # share of the last time in which none did
+    distrust: float  # from 0 to 1
 
 
 class Quantiles:
@@ -94,6 +125,10 @@ class MixtureMemory:
     factor: Annotated[FloatArray, 2]  # adapted over nominal R
     last_side: Annotated[FloatArray, 2]  # side force over load of the axles in the block before [1]
     usual_force: Annotated[FloatArray, 6]  # force over load of wheels and axles, smoothed [1]
+    drive_odds: Annotated[FloatArray, 3]  # of a car that drives its rear axle, all wheels, its front axle
+    rolling: RollingMotion
+    grip: GripInUse
+    trust: Trust
     excitation: Excitation
     friction: Quantiles
     friction_left: Quantiles

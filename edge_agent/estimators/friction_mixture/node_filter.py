@@ -16,7 +16,16 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from edge_agent.estimators.friction_mixture.constants import ACTIVE, CURVED, ROWS, STATES, Constants, NodeState
+from edge_agent.dynamics.slip import SLOWEST_M_S
+from edge_agent.estimators.friction_mixture.constants import (
+    ACTIVE,
+    CURVED,
+    ROWS,
+    STATES,
+    STRAIGHT,
+    Constants,
+    NodeState,
+)
 from edge_agent.estimators.friction_mixture.design import MixtureDesign, Nominal
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.residuals import (
@@ -49,6 +58,8 @@ class NodeUpdate(NamedTuple):
 def update_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int, inflation: float) -> NodeUpdate:
     """Cubature update of node j with R times `inflation`: its mean and scratch.root[j] are changed.
 
+    R of the axles is larger still where they are distrusted.
+
     Writes its innovation and its theoretical variance without the inflation.
     """
     constants, nominal, features, node = design.constants, design.nominal, scratch.features, scratch.node
@@ -57,6 +68,7 @@ def update_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, 
     node.gained.x, node.gained.y = gained_velocity(features.gain, mean)
     price = linearize(memory.row, design, side_mu, mean, features, node)
     spread(memory.row, design, side_mu, mean, root, features, node)
+    across = inflation * (1.0 + constants.distrust_noise * memory.trust.distrust)
     plain = square = 0.0
     for r in range(ROWS):
         innovation[r] = -node.residual[r]
@@ -66,7 +78,7 @@ def update_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, 
             variance += node.deviation[r, column] ** 2
         theoretical[r] = variance + noise
         excess = node.residual[r] ** 2 / constants.huber**2 - variance
-        node.inflated[r] = max(noise * inflation, excess) + node.nonlinearity[r]
+        node.inflated[r] = max(noise * (inflation if r < 4 else across), excess) + node.nonlinearity[r]
         if not math.isnan(node.residual[r]):
             ratio = node.residual[r] ** 2 / theoretical[r]
             square += ratio
@@ -94,22 +106,56 @@ def linearize(
     price = 0.0
     for i in range(STATES):
         node.point[i] = mean[i]
-    for state in range(ACTIVE, CURVED - 1, -1):  # at the mean, then with each moved, STEER last
-        step = 0.0 if state == ACTIVE else 0.5 * design.nominal.std[state]
-        node.point[state] += step
-        if state == ACTIVE or state == NodeState.STEER:
+    for state in range(STRAIGHT, CURVED - 1, -1):  # at the mean, then with each moved, STEER last
+        step = 0.0 if state == STRAIGHT else 0.5 * design.nominal.std[state]
+        if state < STRAIGHT:
+            node.point[state] += step
+        if state == STRAIGHT or state == NodeState.STEER:
             find_slips(row, constants, mean, features, node)
-        if state == ACTIVE:
+        if state == STRAIGHT:
             find_shape_force(curve, side_mu, features, node)
             price = weigh_slopes(curve, side_mu, features, constants.sliding_slope, node)
         correct_forces(curve, side_mu, features, node)
-        out = node.residual[:] if state == ACTIVE else node.derivative[state]
+        out = node.residual[:] if state == STRAIGHT else node.derivative[state]
         find_residuals(curve, side_mu, features, node, out)
-        node.point[state] -= step
-        if state < ACTIVE:
+        if state < STRAIGHT:
+            node.point[state] -= step
             for r in range(ROWS):
                 out[r] = (out[r] - node.residual[r]) / step
+    _by_wheel_speeds(row, design, side_mu, mean, features, node)
+    for r in range(ROWS):
+        node.derivative[NodeState.LAG_STEER, r] = node.derivative[NodeState.STEER, r] * features.steer_rate
     return price
+
+
+@compiled
+def _by_wheel_speeds(
+    row: FloatArray,
+    design: MixtureDesign,
+    side_mu: FloatArray,
+    mean: FloatArray,
+    features: BlockFeatures,
+    node: NodeWorkspace,
+) -> None:
+    """Derivatives by the radii and by the lag of the wheel speeds: the row of a wheel sees its own speed.
+
+    All radii are moved at once, for they bend the rows of the axles by next to nothing; node.force is as at the mean.
+    """
+    step = design.nominal.std[NodeState.RADIUS]
+    for wheel in range(4):
+        node.point[NodeState.RADIUS + wheel] = mean[NodeState.RADIUS + wheel] + step
+    find_slips(row, design.constants, mean, features, node)
+    correct_forces(design.curve, side_mu, features, node)
+    by_lag = node.derivative[NodeState.LAG_WHEEL]
+    find_residuals(design.curve, side_mu, features, node, by_lag)
+    for wheel in range(4):
+        node.point[NodeState.RADIUS + wheel] = mean[NodeState.RADIUS + wheel]
+        by_radius = node.derivative[NodeState.RADIUS + wheel]
+        for r in range(ROWS):
+            by_radius[r] = 0.0
+        by_radius[wheel] = (by_lag[wheel] - node.residual[wheel]) / step
+        by_lag[wheel] = by_radius[wheel] * features.change / max(abs(features.rolling[wheel]), SLOWEST_M_S)
+    by_lag[4] = by_lag[5] = 0.0
 
 
 @compiled
@@ -164,9 +210,8 @@ def spread(
         for sign in range(2):
             signed = scale if sign == 0 else -scale
             out = node.ahead[:] if sign == 0 else node.behind[:]
-            for i in range(ACTIVE):
+            for i in range(CURVED):
                 node.point[i] = mean[i] + signed * root[i, column]
-            node.point[NodeState.STEER] = mean[NodeState.STEER]
             find_slips(row, design.constants, mean, features, node)
             find_residuals(design.curve, side_mu, features, node, out)
         for r in range(ROWS):
@@ -218,8 +263,15 @@ def take_rows(mean: FloatArray, root: FloatArray, node: NodeWorkspace, axle_pena
 
 @compiled
 def keep_within(mean: FloatArray, constants: Constants, nominal: Nominal) -> None:
-    """Keep what is a property of vehicle or sensor within what it can be; mean (n,)."""
-    far = constants.farthest
+    """Keep what is a property of vehicle or sensor within what it can be; mean (n,).
+
+    Radii are told against each other only: what all share scales the speed, and no sensor here knows that scale.
+    """
+    far, common = constants.farthest, 0.0
+    for wheel in range(4):
+        common += 0.25 * mean[NodeState.RADIUS + wheel]
+    for wheel in range(4):
+        mean[NodeState.RADIUS + wheel] -= common
     for i in range(NodeState.LN_KX, mean.shape[0]):
         middle, reach = nominal.mean[i], far * nominal.std[i]
         mean[i] = min(max(mean[i], middle - reach), middle + reach)

@@ -42,16 +42,16 @@ def distance(along: float, across: float) -> float:
 
 @compiled
 def gained_velocity(gain: VelocityGain, x: FloatArray) -> tuple[float, float]:
-    """Velocity gained (ahead, left) [m/s] with the leaks and offsets of state x (n,).
+    """Velocity gained (ahead, left) [m/s] with the leak, offsets, slope and bank of state x (n,).
 
     An offset of a_y gains what one of a_x does, turned by a quarter.
     """
-    leak_x, leak_y = x[NodeState.LEAK_X], x[NodeState.LEAK_Y]
-    bias_x, bias_y = x[NodeState.BIAS_X], x[NodeState.BIAS_Y]
+    leak_y = x[NodeState.LEAK_Y]
+    bias_x, bias_y = x[NodeState.BIAS_X] + x[NodeState.SLOPE], x[NodeState.BIAS_Y] + x[NodeState.BANK]
     measured, unit = gain.measured, gain.unit
     return (
-        measured.x - leak_x * gain.leak_x.x - leak_y * gain.leak_y.x - bias_x * unit.x + bias_y * unit.y,
-        measured.y - leak_x * gain.leak_x.y - leak_y * gain.leak_y.y - bias_x * unit.y - bias_y * unit.x,
+        measured.x - leak_y * gain.leak_y.x - bias_x * unit.x + bias_y * unit.y,
+        measured.y - leak_y * gain.leak_y.y - bias_x * unit.y - bias_y * unit.x,
     )
 
 
@@ -79,7 +79,7 @@ def find_slips(
     vy = features.cos * x[NodeState.VY] - features.sin * x[NodeState.VX] + node.gained.y
     mean_kx, mean_ky = mean[NodeState.LN_KX], mean[NodeState.LN_KY]
     for axle in range(2):
-        offset = x[NodeState.STEER] if axle == 0 else 0.0
+        offset = x[NodeState.STEER] + x[NodeState.LAG_STEER] * features.steer_rate if axle == 0 else 0.0
         blind = math.isnan(features.side[axle])  # slip across is then guesswork, and must not bend the force along
         ln_kx = mean_kx + features.informs_x[axle] * (x[NodeState.LN_KX] - mean_kx)
         ln_ky = mean_ky + features.informs_y[axle] * (x[NodeState.LN_KY] - mean_ky)
@@ -92,7 +92,8 @@ def find_slips(
             cos, sin = features.steer_cos[wheel], features.steer_sin[wheel]
             along, across = cos * ahead + sin * left, cos * left - sin * ahead
             speed = max(abs(along), SLOWEST_M_S)
-            rolling = features.rolling[wheel]
+            rolling = features.rolling[wheel] * (1.0 + x[NodeState.RADIUS + wheel])
+            rolling += x[NodeState.LAG_WHEEL] * features.change
             known = not math.isnan(rolling)
             slip.along[wheel] = slope_x * (rolling - along) / speed if known else features.force[wheel]
             slip.across[wheel] = 0.0 if blind else slope_y * (offset - across / speed)
@@ -115,17 +116,18 @@ def find_shape_force(curve: TyreCurve, side_mu: FloatArray, features: BlockFeatu
 
 @compiled
 def correct_forces(curve: TyreCurve, side_mu: FloatArray, features: BlockFeatures, node: NodeWorkspace) -> None:
-    """Fill node.force and node.slip_at_force by what node.point believes of leak, gain of torque and shape."""
+    """Fill node.force and node.slip_at_force by what node.point believes of leak, offsets, gain of torque and shape."""
     leak, shape, gain = node.point[NodeState.LEAK_Y], node.point[NodeState.SHAPE], node.point[NodeState.GAIN]
+    bias_x, bias_y = node.point[NodeState.BIAS_X], node.point[NodeState.BIAS_Y]
     force, slip_at_force = node.force, node.slip_at_force
     for axle in range(2):
         left, right = 2 * axle, 2 * axle + 1
-        side = features.side[axle] + leak * features.side_leak[axle]
+        side = features.side[axle] + leak * features.side_leak[axle] - bias_y * features.side_unit[axle]
         across = 0.0 if math.isnan(side) else side
         mean_along = mean_mu = 0.0
         for wheel in range(left, right + 1):
             mu, load = side_mu[wheel % 2], features.load_share[wheel]
-            along = (1.0 + gain) * features.force[wheel]
+            along = (1.0 + gain) * features.force[wheel] - bias_x * features.force_unit[wheel]
             mean_along += load * along
             mean_mu += load * mu
             force[wheel] = along - shape * node.shape_force[wheel]

@@ -12,8 +12,10 @@ from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD
 from edge_agent.estimators.common.readings import believe, rolling_speed
 from edge_agent.estimators.friction_mixture.constants import ALL_NODES, NODES, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign, Nominal
+from edge_agent.estimators.friction_mixture.drive_split import FIRST_ODDS
 from edge_agent.estimators.friction_mixture.friction_grid import quantile
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles
+from edge_agent.estimators.friction_mixture.wheel_readings import refuse_jumps
 from edge_agent.estimators.friction_mixture.workspace import BlockFeatures
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
@@ -26,6 +28,7 @@ FREE_FORCE = 0.05  # along, over load, below which wheels that roll alike are ta
 ALIKE = 0.03  # relative difference of their speeds
 LOST_RATIO = 8.0  # of actual over nominal innovation variance in the window: no noise or curve does that
 LOST_SPREAD_M_S = 5.0
+FAR_M_S, FAR_SHARE, FAR_SPREADS = 0.7, 0.04, 2.0  # of the speed that agreeing wheels tell: beyond, the motion is lost
 SLOWEST_M_S = 1.5  # below this speed of vehicle and wheels slip has no meaning, and nothing is concluded
 
 
@@ -36,6 +39,7 @@ def start(memory: MixtureMemory, design: MixtureDesign, time: float, sample: Flo
         return flags.TIME_GAP
     last, now, block = memory.last, memory.last.now, memory.block
     believe(sample, now)
+    refuse_jumps(memory.row, now)
     last.time = block.time = time
     last.position_time = last.inertial_time = -math.inf
     last.read_ax = last.read_ay = math.nan
@@ -45,7 +49,7 @@ def start(memory: MixtureMemory, design: MixtureDesign, time: float, sample: Flo
     for wheel in range(4):
         block.start_omega[wheel] = last.omega[wheel] = now[S.OMEGA + wheel]
         angle = now[S.DELTA + wheel]
-        last.delta[wheel] = 0.0 if math.isnan(angle) else angle
+        last.delta[wheel] = last.delta_before[wheel] = 0.0 if math.isnan(angle) else angle
     speed = rolling_speed(memory.row, now)
     known = not math.isnan(speed)
     memory.overall_mean[NodeState.VX] = speed if known else 0.0
@@ -59,6 +63,12 @@ def start(memory: MixtureMemory, design: MixtureDesign, time: float, sample: Flo
         put_square(memory.covariance[j], covariance)
     for friction in (memory.friction, memory.friction_left, memory.friction_right):
         find_quantiles(design, design.prior, friction)
+    for kind in range(3):
+        memory.drive_odds[kind] = FIRST_ODDS[kind]
+    rolling = memory.rolling
+    rolling.moved_time = -math.inf if speed == 0.0 else time
+    rolling.disagreed_time, rolling.ahead, rolling.left = time, math.nan, math.nan
+    rolling.resting_ax = now[S.AX]
     begin_excitation(memory.excitation)
     memory.started = True
     return flags.OK
@@ -134,10 +144,20 @@ def bridge(memory: MixtureMemory, design: MixtureDesign, dt: float) -> int:
 
 @compiled
 def recover(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures) -> int:
-    """Begin the motion and the friction anew where freely rolling wheels have long contradicted them.
+    """Begin the motion and the friction anew where wheels that roll have long contradicted them.
 
-    A wheel without force rolls: if all nodes call it sliding, none finds back by itself, for the curve is flat there.
+    Wheels that agree call the motion back at once when it is far from what they tell. A wheel without force
+    rolls: if all nodes call it sliding, none finds back by itself, for the curve is flat there.
     """
+    rolling = memory.rolling
+    if not math.isnan(rolling.ahead):
+        far = FAR_M_S + FAR_SHARE * abs(rolling.ahead) + FAR_SPREADS * rolling.ahead_std
+        astray = abs(memory.overall_mean[NodeState.VX] - rolling.ahead) > far
+        if not math.isnan(rolling.left):
+            far = FAR_M_S + FAR_SHARE * abs(rolling.ahead) + FAR_SPREADS * rolling.left_std
+            astray = astray or abs(memory.overall_mean[NodeState.VY] - rolling.left) > far
+        if astray:
+            return _begin_anew(memory, design, rolling.ahead)
     if memory.actual[0] * memory.factor[0] < LOST_RATIO * memory.theoretical[0]:
         return 0
     least, most = math.inf, -math.inf
@@ -149,8 +169,14 @@ def recover(memory: MixtureMemory, design: MixtureDesign, features: BlockFeature
     turning = abs(features.yaw_rate) * memory.row[Parameter.TRACK_REAR]
     if most - least > ALIKE * max(most, SLOWEST_M_S) + turning:
         return 0
+    return _begin_anew(memory, design, most if most >= 0.0 else math.nan)
+
+
+@compiled
+def _begin_anew(memory: MixtureMemory, design: MixtureDesign, speed: float) -> int:
+    """Motion at `speed` [m/s], or where that is NaN at the one believed, and the prior of all else."""
     forget_vehicle(memory, design.nominal)  # what was learned while lost is as wrong as the motion was
-    restart_motion(memory, most if most >= 0.0 else math.nan, LOST_SPREAD_M_S)
+    restart_motion(memory, speed, LOST_SPREAD_M_S)
     for group in range(2):
         memory.actual[group] = memory.theoretical[group]
         memory.factor[group] = 1.0

@@ -16,13 +16,16 @@ from edge_agent.estimators.common.motion import SLIDING_THETA
 from edge_agent.estimators.friction_mixture.block_features import block_features
 from edge_agent.estimators.friction_mixture.constants import NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.drive_split import learn_drive
 from edge_agent.estimators.friction_mixture.intake import begin_block, take_sample
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles
 from edge_agent.estimators.friction_mixture.mixing import awake, drive_on, match_moments, wake_or_sleep
 from edge_agent.estimators.friction_mixture.node_filter import predict_node
 from edge_agent.estimators.friction_mixture.residuals import gained_velocity
 from edge_agent.estimators.friction_mixture.restart import find_quantiles, recover, start
+from edge_agent.estimators.friction_mixture.rolling_motion import watch_wheels
 from edge_agent.estimators.friction_mixture.split_sides import BOTH, LEFT, RIGHT, project
+from edge_agent.estimators.friction_mixture.trust import REPORTED, judge
 from edge_agent.estimators.friction_mixture.weighing import measure
 from edge_agent.estimators.friction_mixture.workspace import Scratch
 from schemas.numeric import FloatArray
@@ -49,11 +52,16 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
     features.duration = memory.last.time - memory.block.time
     features.speed = abs(memory.overall_mean[NodeState.VX])
     health = block_features(memory, design, features)
+    learn_drive(memory, design.constants, features)
+    watch_wheels(memory, design.constants, features)
     wake_or_sleep(memory, design, scratch)
     drive_on(memory, design, scratch, features.speed * features.duration)
     measure(memory, design, scratch)
+    judge(memory, design, features.duration)
     predict(memory, design, scratch)
     memory.health = health | recover(memory, design, features)
+    if memory.trust.distrust > REPORTED:
+        memory.health |= flags.CONTRADICTION
     conclude(memory, design, scratch)
     begin_block(memory)
     memory.block.missing_x = memory.block.missing_y = 0.0
@@ -67,9 +75,16 @@ def predict(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> N
     leak = constants.leak_wander * abs(memory.last.ax)
     gyro = constants.gyro_wander * scratch.features.speed
     process[NodeState.VX] = (constants.drift_x**2 + leak**2 + block.missing_x) * duration
-    process[NodeState.VY] = (constants.drift_y**2 + gyro**2 + block.missing_y) * duration
+    unsure = constants.distrust_drift * memory.trust.distrust
+    process[NodeState.VY] = (constants.drift_y**2 + gyro**2 + unsure**2 + block.missing_y) * duration
+    forgets, speed = memory.trust.distrust / constants.distrust_forget, scratch.features.speed
     for i in range(NodeState.LN_KX, nominal.mean.shape[0]):
-        keep[i] = math.exp(-duration / nominal.time[i])
+        pace = 1.0 / nominal.time[i] + forgets
+        if i == NodeState.SLOPE:
+            pace += speed / constants.slope_length
+        elif i == NodeState.BANK:
+            pace += speed / constants.bank_length
+        keep[i] = math.exp(-duration * pace)
         process[i] = nominal.std[i] ** 2 * (1.0 - keep[i] ** 2)
     cos, sin = math.cos(block.angle), math.sin(block.angle)
     count = awake(memory)

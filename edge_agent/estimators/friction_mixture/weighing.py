@@ -8,10 +8,12 @@ from edge_agent.adaptation.fuzzy import adapted
 from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.friction_grid import reweigh
+from edge_agent.estimators.friction_mixture.grip_guard import guard
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.mixing import awake, reset_diverged
 from edge_agent.estimators.friction_mixture.node_filter import update_node
 from edge_agent.estimators.friction_mixture.restart import SLOWEST_M_S
+from edge_agent.estimators.friction_mixture.rolling_motion import take_rolling
 from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, Scratch
 from edge_agent.filters.cholesky import factorize
 from schemas.numeric import FloatArray
@@ -45,7 +47,8 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
     for j in range(count):
         factorize(memory.covariance[j], scratch.root[j], LEAST_VARIANCE)
         found = update_node(memory, design, scratch, j, inflation)
-        scratch.log_likelihood[j], scratch.moved[j] = found.log_likelihood, found.moved
+        scratch.log_likelihood[j] = found.log_likelihood - take_rolling(memory, design, scratch, j)
+        scratch.moved[j] = found.moved
         scratch.joint[j] = found.plain + math.log(memory.weight[j])
         top, rows = max(top, scratch.joint[j]), found.rows
         nis += memory.weight[j] * found.square
@@ -65,7 +68,8 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
 def temper(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
     """scratch.log_likelihood becomes what the block counts for each node [nat].
 
-    Without accelerations, yaw rate or steering, sliding cannot be told from rolling: nothing is concluded on friction.
+    What falls short of the grip in use pays whatever the demand; nothing is concluded at full distrust. Without
+    accelerations, yaw rate or steering, sliding cannot be told from rolling: nothing is concluded on friction.
     """
     constants, features = design.constants, scratch.features
     count = awake(memory)
@@ -75,16 +79,15 @@ def temper(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> No
     need = (constants.demand_half / max(features.demand, LEAST_DEMAND)) ** constants.demand_power
     blind = memory.block.counts[S.AX] == 0 or math.isnan(features.side[0] + features.side[1])
     share = novelty(memory.usual_force, features, constants) / (1.0 + need)
-    moving = slip_meaning(features, memory.overall_mean[NodeState.VX])
+    moving = slip_meaning(features, memory.overall_mean[NodeState.VX]) * (1.0 - memory.trust.distrust)
     for j in range(count):
         loss = scratch.log_likelihood[j] - best
         beyond = min(loss + constants.plausible_loss, 0.0)
         loss = max(loss, -constants.plausible_loss)
         loss = max(moving * (share * loss + beyond), -constants.largest_loss)
-        if blind:
-            scratch.log_likelihood[j] = 0.0
-        else:
-            scratch.log_likelihood[j] = loss - charge(memory, j, need / (1.0 + need) * scratch.moved[j])
+        loss -= moving * guard(memory.grip, constants, design.sides.mu[j])
+        charged = charge(memory, j, moving * need / (1.0 + need) * scratch.moved[j])
+        scratch.log_likelihood[j] = 0.0 if blind else loss - charged
 
 
 @compiled

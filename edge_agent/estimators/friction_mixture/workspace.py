@@ -24,16 +24,20 @@ class BlockFeatures:
     gain: VelocityGain  # mean over the block
     yaw_rate: float  # mean [rad/s]
     demand: float  # largest force over load of any wheel [1]
+    change: float  # measured a_x, mean [m/s^2]
+    steer_rate: float  # of the front wheels [rad/s]
     asymmetry: float  # slip left against right beyond force and noise, in force over load [1]
     loads: Annotated[FloatArray, 4]  # [N]
     spin: Annotated[FloatArray, 4]  # wheel acceleration [rad/s^2]
     rolling: Annotated[FloatArray, 4]  # R*omega, mean [m/s]; NaN without a reading
     force: Annotated[FloatArray, 4]  # F_x/F_z [1]
+    force_unit: Annotated[FloatArray, 4]  # its derivative by a_x, where torque is missing [s^2/m]
     load_share: Annotated[FloatArray, 4]  # wheel load over axle load [1]
     steer_cos: Annotated[FloatArray, 4]
     steer_sin: Annotated[FloatArray, 4]
     side: Annotated[FloatArray, 2]  # F_y/F_z of an axle in the wheel's frame [1]; NaN where unknown
     side_leak: Annotated[FloatArray, 2]  # its derivative by the leak [1]
+    side_unit: Annotated[FloatArray, 2]  # its derivative by a_y [s^2/m]
     noise_std: Annotated[FloatArray, ROWS]  # nominal, of a residual where the curve rises [1]
     slip_noise: Annotated[FloatArray, ROWS]  # variance of slip, as linear force over load; half of it is in noise_std
     informs_x: Annotated[FloatArray, 2]  # how much the force of an axle's wheels informs of stiffness, 0 to 1
@@ -85,6 +89,7 @@ class Scratch:
     actual_sum: Annotated[FloatArray, 2]
     theoretical_sum: Annotated[FloatArray, 2]
     root: Annotated[FloatArray, ALL_NODES, STATES, STATES]
+    velocity_row: Annotated[FloatArray, STATES]  # deviation of a velocity in the axes of a root's columns
     projected: Annotated[FloatArray, NODES]
     expected: Annotated[FloatArray, NODES]
 

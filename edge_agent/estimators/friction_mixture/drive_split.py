@@ -1,0 +1,73 @@
+"""How the force along is shared by front and rear where torque is missing: which axles drive, learned from their slip.
+
+The driven axle of a car that pulls turns faster than the other, by what its force asks of its tyres; three kinds of car
+are told apart within a second of brisk driving. Brakes favour the front on all cars. Sums of wheels on low friction
+look like more force than is asked: an axle may slip more than its kind asks for, not less.
+"""
+
+from __future__ import annotations
+
+import math
+
+from edge_agent.dynamics.parameters import Parameter
+from edge_agent.estimators.friction_mixture.constants import Constants
+from edge_agent.estimators.friction_mixture.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.workspace import BlockFeatures
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+from schemas.thresholds import GRAVITY
+
+DRIVES = (0.0, 0.45, 1.0)  # share of the front axle of a car that drives its rear axle, all wheels, its front axle
+ALL_WHEELS = 1  # of these kinds
+FIRST_ODDS = (0.35, 0.3, 0.35)
+SHARE_STD = 0.03  # of a car of a known kind
+BRAKES_FRONT, BRAKES_STD = 0.64, 0.06  # share of the front in braking, and how it differs between cars
+ENGINE_BRAKE = 1.5  # [m/s^2] to twice this a car may slow by its engine, on the driven axle alone
+PULLS = 0.05  # a_x over g from which the driven axle shows
+FAST_M_S = 3.0  # slip is told above this speed
+TURNS_M_S2 = 3.0  # and below this lateral acceleration
+UNLIKE = 0.3  # share of the slip asked for by which stiffness and load differ
+LOOK_S = 0.2  # one independent look per so much time
+LARGEST_LOSS = 4.0  # [nat] of a look
+LEAST_ODDS = 1e-4  # a wrong certainty is left within seconds
+
+
+@compiled
+def front_share(row: FloatArray, odds: FloatArray, ax: float) -> tuple[float, float]:
+    """Share of the front axle in the force along at a_x [m/s^2], and its spread."""
+    front, spread = row[Parameter.DRIVE_FRONT], SHARE_STD
+    if math.isnan(front):
+        front = square = 0.0
+        for kind in range(3):
+            front += odds[kind] * DRIVES[kind]
+            square += odds[kind] * DRIVES[kind] ** 2
+        spread = math.sqrt(max(square - front * front, 0.0) + SHARE_STD**2)
+    if ax >= 0.0:
+        return front, spread
+    brakes = min(-0.5 * ax / ENGINE_BRAKE, 1.0)  # how surely it is the brakes
+    apart = brakes * (1.0 - brakes) * (BRAKES_FRONT - front) ** 2
+    variance = brakes * BRAKES_STD**2 + (1.0 - brakes) * spread**2 + apart
+    return brakes * BRAKES_FRONT + (1.0 - brakes) * front, math.sqrt(variance)
+
+
+@compiled
+def learn_drive(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
+    """Renew the odds of the three kinds by the slip of the axles in the block."""
+    row, odds, rolling = memory.row, memory.drive_odds, features.rolling
+    pull, speed = features.change / GRAVITY, 0.25 * (rolling[0] + rolling[1] + rolling[2] + rolling[3])
+    if not (pull > PULLS and speed > FAST_M_S and abs(features.yaw_rate) * speed < TURNS_M_S2):
+        return
+    apart = 0.5 * (rolling[2] + rolling[3] - rolling[0] - rolling[1]) / speed
+    rear_load = row[Parameter.TO_FRONT] / (row[Parameter.TO_FRONT] + row[Parameter.TO_REAR])
+    per_force, look = pull / row[Parameter.SLOPE_X], min(features.duration / LOOK_S, 1.0)
+    total = 0.0
+    for kind in range(3):
+        asked = per_force * ((1.0 - DRIVES[kind]) / rear_load - DRIVES[kind] / (1.0 - rear_load))
+        spread = constants.wheel_std + UNLIKE * (per_force + abs(asked))
+        off = (apart - asked) / spread
+        if kind != ALL_WHEELS and off * asked > 0.0:
+            off = 0.0
+        odds[kind] *= math.exp(-look * (min(0.5 * off * off, LARGEST_LOSS) + math.log(spread / constants.wheel_std)))
+        total += odds[kind]
+    for kind in range(3):
+        odds[kind] = max(odds[kind] / total, LEAST_ODDS)

@@ -1,0 +1,43 @@
+"""The grip in use, and what it forbids: no friction is believed or told below it."""
+
+from __future__ import annotations
+
+import math
+
+from edge_agent.estimators.friction_mixture.constants import Constants
+from edge_agent.estimators.friction_mixture.memory import GripInUse, Quantiles
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+from schemas.thresholds import GRAVITY
+
+SLOW_S, FAST_S = 0.15, 0.06  # smoothing: of the noise of accelerometers and of what a body shakes
+HELD_S = 1.0  # the largest grip holds so long,
+FORGOTTEN = 0.5  # [1/s] and then fades: roads change
+ABOVE = 0.02  # what smoothing takes from the top of a hard stop
+LARGEST_LOSS = 3.0  # [nat] a block
+
+
+@compiled
+def note_grip(grip: GripInUse, ax: float, ay: float, dt: float) -> None:
+    """Take in measured accelerations [m/s^2] of the last dt [s]."""
+    size = math.hypot(ax, ay) / GRAVITY
+    grip.slow += (1.0 - math.exp(-dt / SLOW_S)) * (size - grip.slow)
+    grip.fast += (1.0 - math.exp(-dt / FAST_S)) * (size - grip.fast)
+    grip.age += dt
+    if grip.fast >= grip.held:
+        grip.held, grip.age = grip.fast, 0.0
+    elif grip.age > HELD_S:
+        grip.held = max(grip.fast, grip.held - FORGOTTEN * dt)
+
+
+@compiled
+def guard(grip: GripInUse, constants: Constants, side_mu: FloatArray) -> float:
+    """What friction side_mu (2,) pays [nat] for what it lacks of the grip in use."""
+    lack = grip.slow - constants.guard_margin - 0.5 * (side_mu[0] + side_mu[1])
+    return float(min(0.5 * (max(lack, 0.0) / constants.guard_std) ** 2, LARGEST_LOSS))
+
+
+@compiled
+def told_upper(grip: GripInUse, friction: Quantiles) -> float:
+    """The upper end of a friction, never below the grip in use: racing tyres pass the grid's 1.2."""
+    return max(friction.upper, grip.held + ABOVE)

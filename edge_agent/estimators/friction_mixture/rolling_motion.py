@@ -1,0 +1,147 @@
+"""Motion that needs no tyre: wheels that stand, wheels that roll alike, a rear axle that follows.
+
+A tyre beyond its peak does not hold its slip: it locks or spins up within a tenth of a second unless something steers
+it, and never four alike. So four wheels that agree for a second are the speed, but for the slip that their force asks
+of them; without this a lasting offset of an accelerometer has one explanation, four wheels sliding on ice, which
+predicts anything and is never left. Likewise a rear axle that is hardly asked for side force does not slide across.
+"""
+
+from __future__ import annotations
+
+import math
+
+from edge_agent.dynamics.parameters import Parameter
+from edge_agent.dynamics.slip import wheel_position
+from edge_agent.estimators.friction_mixture.block_features import ROUNDING, mean_or
+from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
+from edge_agent.estimators.friction_mixture.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.residuals import gained_velocity
+from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, Scratch
+from edge_agent.filters.sequential import potter, project
+from schemas.runtime.jit import compiled
+from schemas.signals import S
+from schemas.thresholds import GRAVITY
+
+STANDING_STD = 0.05  # [m/s] sensors of a wheel that creeps show nothing
+STANDING_RAD_S = 0.05  # a wheel that turns slower stands
+RESTING_TIME = 1.0  # [s] smoothing of a_x while wheels stand
+STARTS = 0.25  # [m/s^2] from there within which the car does not start or stop
+SLOW_M_S = 3.0  # a faster car that stands has locked its wheels, or the filter is lost:
+LOCKED_S = 2.0  # no car slides on four locked wheels for longer
+AGREE_FLOOR = 0.15  # [m/s] within which wheels always agree
+TURN_SHARE = 0.05  # of the speed difference of the sides in a turn: track and yaw rate
+STEEPEST = 0.3  # least cosine of steering
+SIDE_SHARE = 0.5  # share by which sideslip differs from the side force over nominal stiffness
+LEFT_FLOOR = 0.03  # [m/s]
+TURNING = 1.5  # v*r against a_y: both must be small
+UNSURE = 0.5  # distrust from which the wheels' middle is taken whether they agree or not
+FARTHEST_FOLLOWED = 0.8  # a_y over g to which the rear axle is then taken to follow
+
+
+@compiled
+def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> None:
+    """Renew memory.rolling by the block."""
+    rolling, row, time = memory.rolling, memory.row, memory.last.time
+    rolling.ahead = rolling.left = math.nan
+    least, most, total, seen, step = math.inf, -math.inf, 0.0, 0, 0.0
+    fastest = 0.0
+    for wheel in range(4):
+        speed = features.rolling[wheel]
+        if math.isnan(speed):
+            continue
+        px, py = wheel_position(row, wheel)
+        across = features.steer_sin[wheel] * (row[Parameter.TO_REAR] + px) * features.yaw_rate
+        at_centre = (speed - across) / max(features.steer_cos[wheel], STEEPEST) + py * features.yaw_rate
+        least, most, total, seen = min(least, at_centre), max(most, at_centre), total + at_centre, seen + 1
+        fastest = max(fastest, abs(speed))
+        step = max(step, memory.last.omega_step[wheel] * ROUNDING * row[Parameter.RADIUS])
+    _stand(memory, constants, features, seen >= 3 and fastest < STANDING_RAD_S * row[Parameter.RADIUS])
+    if seen < 3:
+        rolling.disagreed_time = time
+        return
+    middle = total / seen
+    turning = TURN_SHARE * abs(features.yaw_rate) * row[Parameter.TRACK_FRONT]
+    allowed = constants.agreeing_width * abs(middle) + AGREE_FLOOR + 2.0 * step + turning
+    if not (most - least <= allowed and abs(features.change) < constants.agreeing_most):
+        rolling.disagreed_time = time
+    unsure = memory.trust.distrust > UNSURE
+    if unsure and seen == 4:
+        middle = 0.5 * (total - least - most)
+    if unsure or time - rolling.disagreed_time >= constants.agreeing_time:
+        _tell(memory, constants, features, middle, step)
+
+
+@compiled
+def _stand(memory: MixtureMemory, constants: Constants, features: BlockFeatures, still: bool) -> None:
+    rolling, time = memory.rolling, memory.last.time
+    if not still or math.isnan(rolling.resting_ax):
+        rolling.resting_ax = features.change
+    if not still:
+        rolling.moved_time = time
+    keep = math.exp(-features.duration / RESTING_TIME)
+    rolling.resting_ax = keep * rolling.resting_ax + (1.0 - keep) * features.change
+    wait = constants.standing_time if features.speed < SLOW_M_S else LOCKED_S
+    quiet = abs(features.change - rolling.resting_ax) < STARTS
+    rolling.stands = still and quiet and time - rolling.moved_time >= wait
+
+
+@compiled
+def _tell(memory: MixtureMemory, constants: Constants, features: BlockFeatures, middle: float, step: float) -> None:
+    """Velocities that wheels at `middle` [m/s] tell, and their spreads."""
+    rolling, row = memory.rolling, memory.row
+    pull = features.change / GRAVITY
+    slip = pull / row[Parameter.SLOPE_X]
+    share = constants.agreeing_std + constants.agreeing_slip * abs(slip) + constants.agreeing_cube * abs(pull) ** 3
+    rolling.ahead = (1.0 - slip) * middle
+    late = constants.agreeing_lag * features.change
+    rolling.ahead_std = math.sqrt((share * middle) ** 2 + constants.agreeing_floor**2 + step * step + late * late)
+    side = mean_or(memory.block, S.AY, math.nan) / GRAVITY
+    most = FARTHEST_FOLLOWED if memory.trust.distrust > UNSURE else constants.following_most
+    if abs(side) < most and abs(features.yaw_rate * middle) < TURNING * most * GRAVITY:
+        rolling.left = row[Parameter.TO_REAR] * features.yaw_rate - middle * side / row[Parameter.SLOPE_Y]
+        share = constants.following_std + SIDE_SHARE * abs(side) / row[Parameter.SLOPE_Y]
+        rolling.left_std = share * abs(middle) + LEFT_FLOOR
+
+
+@compiled
+def take_rolling(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> float:
+    """Take what the wheels tell of the motion into node j; returns what its disagreement costs it [nat]."""
+    rolling, constants, features = memory.rolling, design.constants, scratch.features
+    mean = memory.mean[j]
+    if rolling.stands:
+        variance = STANDING_STD**2
+        _take_velocity(memory, scratch, j, (1.0, 0.0), (-mean[NodeState.VX], variance, math.inf))
+        _take_velocity(memory, scratch, j, (0.0, 1.0), (-mean[NodeState.VY], variance, math.inf))
+        return 0.0
+    cost, cos, sin = 0.0, features.cos, features.sin
+    look = max(constants.agreeing_look / features.duration, 1.0)
+    if not math.isnan(rolling.ahead):
+        now = cos * mean[NodeState.VX] + sin * mean[NodeState.VY] + gained_velocity(features.gain, mean)[0]
+        reading = (rolling.ahead - now, rolling.ahead_std**2 * look, constants.huber)
+        cost += _take_velocity(memory, scratch, j, (cos, sin), reading)
+    if not math.isnan(rolling.left):
+        now = cos * mean[NodeState.VY] - sin * mean[NodeState.VX] + gained_velocity(features.gain, mean)[1]
+        reading = (rolling.left - now, rolling.left_std**2 * look, constants.huber)
+        cost += _take_velocity(memory, scratch, j, (-sin, cos), reading)
+    return cost
+
+
+@compiled
+def _take_velocity(
+    memory: MixtureMemory,
+    scratch: Scratch,
+    j: int,
+    direction: tuple[float, float],
+    reading: tuple[float, float, float],
+) -> float:
+    """Take in a velocity along `direction` (x, y): (innovation, variance, huber); half its normalised square."""
+    root, row = scratch.root[j], scratch.velocity_row
+    innovation, variance, huber = reading
+    own = 0.0
+    for k in range(row.shape[0]):
+        row[k] = direction[0] * root[NodeState.VX, k] + direction[1] * root[NodeState.VY, k]
+        own += row[k] ** 2
+    total, gain = potter(row, max(variance, (innovation / huber) ** 2 - own))
+    project(memory.mean[j], root, row, innovation / total, gain)
+    return 0.5 * innovation * innovation / total

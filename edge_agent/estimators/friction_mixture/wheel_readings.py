@@ -1,0 +1,48 @@
+"""Readings of a wheel speed: jumps that no wheel makes, and the width of the steps in which it is read."""
+
+from __future__ import annotations
+
+import math
+
+from edge_agent.dynamics.parameters import Parameter
+from edge_agent.estimators import flags
+from edge_agent.estimators.friction_mixture.memory import LastInputs
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+from schemas.signals import S
+
+SPINS_M_S = 20.0  # faster than the second slowest wheel by more is a decoding error (512 km/h were met), not a spin
+SAME_RAD_S = 0.02  # a reading that changes by less is the same
+HELD = 3  # readings that were the same before a change is a step, and not noise
+STEP_LEAST, STEP_MOST = 0.05, 2.0  # [rad/s] steps that are met: 1 km/h is .9
+STEP_PACE = 0.1  # share of a new step in the mean
+
+
+@compiled
+def refuse_jumps(row: FloatArray, now: FloatArray) -> int:
+    """Make NaN of the wheel speeds of readings (15,) that stand far above the others; returns health flags."""
+    slowest = second = math.inf
+    for wheel in range(4):
+        omega = now[S.OMEGA + wheel]
+        if omega < slowest:
+            slowest, second = omega, slowest
+        elif omega < second:
+            second = omega
+    health = 0
+    for wheel in range(4):
+        if row[Parameter.RADIUS] * (now[S.OMEGA + wheel] - second) > SPINS_M_S:
+            now[S.OMEGA + wheel] = math.nan
+            health = flags.OUTLIER | flags.NO_WHEEL_SPEED
+    return health
+
+
+@compiled
+def note_step(last: LastInputs, wheel: int, omega: float) -> None:
+    """Take in how a reading follows the last one: a speed that stands still and jumps is read in steps."""
+    change = abs(omega - last.omega[wheel])
+    if change < SAME_RAD_S:
+        last.omega_held[wheel] += 1
+    elif not math.isnan(change):
+        if last.omega_held[wheel] >= HELD and STEP_LEAST < change < STEP_MOST:
+            last.omega_step[wheel] += STEP_PACE * (change - last.omega_step[wheel])
+        last.omega_held[wheel] = 0
