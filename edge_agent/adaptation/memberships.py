@@ -6,6 +6,13 @@ Legend
     outputs     log of the multiplier on R that each set asks for [nat] (5,)
     ln_scales   log of the nominal R relative to the table of constants: wheel speed rows, axle rows [nat] (2,)
 
+Rules of the default estimator (`rule_base.py`), pairs (foot, peak) of ramps, and what two rules ask for:
+    far         mismatch from which, and at which, the innovations are FAR beyond their theory [1]
+    stretched   cost of what is believed of vehicle and sensors at which it is no explanation any more [nat]
+    lately      share of the last time in contradiction at which distrust begins, and is complete [1]
+    consequents ln of the axles' R where steering is WIDE [nat]; pace at which offsets, slope and bank return to their
+                prior where the wheels are FAR [1/s]
+
 Neighbouring triangles meet at each other's peaks, so memberships of a mismatch sum to one and the range is covered.
 """
 
@@ -22,7 +29,12 @@ SETS = 5
 CHANNELS = 2  # wheel speed against force; axle slip against lateral force
 LARGEST_MISMATCH = 20.0
 LARGEST_STEP = 0.7  # [nat] a step of adaptation at most doubles R
-LARGEST_SCALE = 1.5  # [nat]
+LARGEST_SCALE = 2.5  # [nat]
+NOISE = 2 * SETS + CHANNELS  # numbers of what concerns R alone
+LENGTHS = {
+    "inputs": SETS, "outputs": SETS, "ln_scales": CHANNELS, "far": 2, "stretched": 2, "lately": 2, "consequents": 2,
+}  # fmt: skip
+RAMPS = ("far", "stretched", "lately")
 CLOSEST = 0.01  # peaks of neighbouring sets stay apart
 
 
@@ -37,9 +49,13 @@ class Memberships:
     inputs: tuple[float, ...] = (-0.8, -0.4, 0.0, 1.0, 4.0)
     outputs: tuple[float, ...] = (-0.10, -0.04, 0.0, 0.06, 0.20)
     ln_scales: tuple[float, ...] = (0.0, 0.0)
+    far: tuple[float, ...] = (1.5, 4.0)
+    stretched: tuple[float, ...] = (14.0, 22.0)  # nine states within two spreads begin it
+    lately: tuple[float, ...] = (0.08, 0.15)  # a race car with late steering reaches it, ordinary drives do not
+    consequents: tuple[float, ...] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        for name, length in (("inputs", SETS), ("outputs", SETS), ("ln_scales", CHANNELS)):
+        for name, length in LENGTHS.items():
             value = np.asarray(getattr(self, name), float)
             if value.shape != (length,) or not np.isfinite(value).all():
                 raise InputError(f"memberships.{name}", "not a list of finite numbers", f"give {length} numbers")
@@ -59,44 +75,63 @@ class Memberships:
             raise InputError("memberships.outputs", "must shrink R at one end and grow it at the other", "bracket zero")
         if max(map(abs, self.ln_scales)) > LARGEST_SCALE:
             raise InputError("memberships.ln_scales", "out of range", f"stay within +-{LARGEST_SCALE:g} nat")
+        for name in RAMPS:
+            foot, peak = getattr(self, name)
+            if not 0.0 <= foot <= peak - CLOSEST:
+                raise InputError(f"memberships.{name}", "does not rise", f"give a foot and a peak {CLOSEST:g} above it")
+        if min(self.consequents) < 0.0 or max(self.consequents) > LARGEST_SCALE:
+            raise InputError("memberships.consequents", "out of range", f"stay within 0 and {LARGEST_SCALE:g}")
 
     def to_vector(self) -> FloatArray:
-        """Free numbers for an optimiser, shape (12,): inputs, outputs, ln_scales."""
-        return np.array([*self.inputs, *self.outputs, *self.ln_scales])
+        """Free numbers for an optimiser, shape (20,): the fields one after the other."""
+        return np.array([number for name in LENGTHS for number in getattr(self, name)])
 
     @classmethod
     def from_vector(cls, vector: FloatArray) -> Memberships:
-        """The memberships of a vector (12,) within `bounds`; inputs and outputs are sorted first, so all are valid."""
+        """The memberships of a vector (20,) within `bounds`; inputs and outputs are sorted first, so all are valid.
+
+        Of a vector (12,), which ends at ln_scales, the rest is as untuned.
+        """
         v = np.asarray(vector, float)
-        if v.shape != (2 * SETS + CHANNELS,):
-            raise InputError("memberships", f"a vector of {v.shape} numbers", f"give {2 * SETS + CHANNELS}")
+        if v.shape == (NOISE,):
+            v = np.append(v, cls().to_vector()[NOISE:])
+        if v.shape != (sum(LENGTHS.values()),):
+            raise InputError("memberships", f"a vector of {v.shape} numbers", f"give {sum(LENGTHS.values())}")
         inputs = np.sort(v[:SETS])
         for k in range(1, SETS):
             inputs[k] = max(inputs[k], inputs[k - 1] + 2.0 * CLOSEST)
         outputs = np.sort(v[SETS : 2 * SETS])
-        return cls(tuple(map(float, inputs)), tuple(map(float, outputs)), tuple(map(float, v[2 * SETS :])))
+        fields, first = {"inputs": inputs, "outputs": outputs}, 0
+        for name, length in LENGTHS.items():
+            fields.setdefault(name, v[first : first + length])
+            first += length
+        return cls(**{name: tuple(map(float, value)) for name, value in fields.items()})
 
     @staticmethod
     def bounds() -> tuple[FloatArray, FloatArray]:
-        """Lower and upper ends of the vector, (12,) each: where an optimiser may look."""
-        lower = [-0.95, -0.8, -0.3, 0.1, 1.0, -0.4, -0.2, -0.02, 0.0, 0.02, -1.0, -1.0]
-        upper = [-0.5, -0.1, 0.3, 2.0, 10.0, -0.02, 0.0, 0.02, 0.3, 0.6, 1.0, 1.0]
+        """Lower and upper ends of the vector, (20,) each: where an optimiser may look."""
+        lower = [-0.95, -0.8, -0.3, 0.1, 1.0, -0.4, -0.2, -0.02, 0.0, 0.02, -2.0, -2.0]
+        lower += [0.3, 2.5, 6.0, 16.0, 0.02, 0.11, 0.0, 0.0]
+        upper = [-0.5, -0.1, 0.3, 2.0, 10.0, -0.02, 0.0, 0.02, 0.3, 0.6, 1.5, 1.5]
+        upper += [2.3, 8.0, 15.0, 40.0, 0.10, 0.5, 2.0, 0.5]
         return np.array(lower), np.array(upper)
 
     def to_json(self) -> dict[str, list[float]]:
         """A plain dictionary for a JSON file."""
-        return {"inputs": list(self.inputs), "outputs": list(self.outputs), "ln_scales": list(self.ln_scales)}
+        return {name: list(getattr(self, name)) for name in LENGTHS}
 
     @classmethod
     def from_json(cls, document: object) -> Memberships:
-        """The memberships in a parsed JSON document.
+        """The memberships in a parsed JSON document; one without rules has the untuned ones.
 
         Raises:
             InputError: a field is missing or is not a list of numbers.
         """
         fields: dict[str, tuple[float, ...]] = {}
-        for name in ("inputs", "outputs", "ln_scales"):
+        for name in LENGTHS:
             value = document.get(name) if isinstance(document, dict) else None
+            if value is None and name not in ("inputs", "outputs", "ln_scales"):
+                continue
             if not isinstance(value, list) or not all(isinstance(x, int | float) for x in value):
                 raise InputError(
                     f"memberships.{name}", "missing or not a list of numbers", "write it with edge-agent tune"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 
+from edge_agent.adaptation.rule_base import wide_noise
 from edge_agent.dynamics.body import axle_lateral_forces
 from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import Parameter, body
@@ -177,8 +178,9 @@ def _noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures
         lag = 0.0 if math.isnan(change) else constants.lag * change / features.duration
         before[axle] = side
         variance = 0.5 * angle**2 + constants.floor_y**2 + share**2 + shape**2 + lag**2
-        features.noise_std[4 + axle] = math.sqrt(variance * scale)
-        features.slip_noise[4 + axle] = angle**2 * scale
+        wide = wide_noise(design.rules, math.asin(features.steer_sin[2 * axle])) if design.adaptive else 1.0
+        features.noise_std[4 + axle] = math.sqrt(variance * scale * wide)
+        features.slip_noise[4 + axle] = angle**2 * scale * wide
 
 
 @compiled

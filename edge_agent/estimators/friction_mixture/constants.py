@@ -216,20 +216,10 @@ class Constants(NamedTuple):
     # [1] one standard deviation of that
     guard_std: float = 0.03
 
-    # [1] innovation variance of the axles over its theory beyond which no friction explains them
-    odd_ratio: float = 2.5
-    # [nat] what all believe of vehicle and sensors beyond which it is no explanation: nine states within two spreads
-    odd_belief: float = 14.0
-    # [nat] more at which that is certain
-    odd_belief_width: float = 8.0
     # [s] of contradiction before it is believed
     odd_rise: float = 8.0
     # [s] without it before it is forgotten: sensors stay as they are
     odd_fall: float = 60.0
-    # [1] share of the last time in contradiction at which distrust begins
-    distrust_from: float = 0.08
-    # [1] at which it is complete: all 22 simulated drives stay below, a race car with late steering does not
-    distrust_full: float = 0.15
     # [1] R of the axles at full distrust, over R
     distrust_noise: float = 1000.0
     # [m/s/s^.5] walk of v_y at full distrust

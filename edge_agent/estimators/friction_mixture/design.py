@@ -7,6 +7,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from edge_agent.adaptation.memberships import Memberships
+from edge_agent.adaptation.rule_base import RuleBase, rule_base
 from edge_agent.estimators.friction_mixture.constants import NODES, STATES, Constants, NodeState
 from edge_agent.estimators.friction_mixture.friction_grid import node_table
 from edge_agent.estimators.friction_mixture.split_sides import Sides, side_table
@@ -33,8 +34,9 @@ class MixtureDesign(NamedTuple):
     nominal: Nominal
     fuzzy_inputs: Annotated[FloatArray, 5]  # sets of the adaptation of R
     fuzzy_outputs: Annotated[FloatArray, 5]
+    rules: RuleBase
     scales: Annotated[FloatArray, 2]  # on nominal variances: wheels, axles
-    adaptive: bool
+    adaptive: bool  # whether any rule is applied
 
 
 def nominal_states(constants: Constants) -> Nominal:
@@ -74,6 +76,7 @@ def design_of(memberships: Memberships, *, adaptive: bool, constants: Constants 
         nominal=nominal_states(constants),
         fuzzy_inputs=np.array(memberships.inputs),
         fuzzy_outputs=np.array(memberships.outputs),
+        rules=rule_base(memberships),
         scales=np.exp(np.array(memberships.ln_scales)),
         adaptive=adaptive,
     )

@@ -95,6 +95,7 @@ class Trust:
 
     odd: float  # share of the last time in which none did
     distrust: float  # from 0 to 1
+    hurry: float  # at which offsets, slope and bank return to their prior, beside the usual pace [1/s]
 
 
 class Quantiles:

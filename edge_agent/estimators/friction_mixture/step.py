@@ -84,6 +84,8 @@ def predict(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> N
             pace += speed / constants.slope_length
         elif i == NodeState.BANK:
             pace += speed / constants.bank_length
+        if i in (NodeState.BIAS_X, NodeState.BIAS_Y, NodeState.SLOPE, NodeState.BANK):
+            pace += memory.trust.hurry
         keep[i] = math.exp(-duration * pace)
         process[i] = nominal.std[i] ** 2 * (1.0 - keep[i] ** 2)
     cos, sin = math.cos(block.angle), math.sin(block.angle)

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from edge_agent.adaptation.memberships import CHANNELS, Memberships
+from edge_agent.adaptation.memberships import CHANNELS, SETS, Memberships
 from edge_agent.estimators.paper_aco_fckf import AT_THE_TRUTH, Setting, bank
 from edge_agent.lab.simulation import PRESETS, simulate_manoeuvre
 from edge_agent.lab.simulation.manoeuvres import kmh
@@ -27,6 +27,7 @@ from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS as SIGNALS
 from schemas.vehicle import Vehicle
 
+VERTICES: Final = 2 * SETS
 RATE_HZ: Final = 50.0  # the paper's sampling
 FINE: Final = 10  # the plant's steering is held over a tenth of it
 DURATION_S: Final = 6.0  # the period of the paper's noise schedule
@@ -163,7 +164,7 @@ def search(
 ) -> Result:  # fmt: skip
     """Search the vertices in one of WAYS; both begin at the untuned ones."""
     return WAYS[way](
-        objective_on(drives), choices(positions)[:-CHANNELS], ants=ants, iterations=iterations,
+        objective_on(drives), choices(positions)[:VERTICES], ants=ants, iterations=iterations,
         rng=np.random.default_rng([seed, list(WAYS).index(way)]), progress=progress,
-        start=Memberships().to_vector()[:-CHANNELS],
+        start=Memberships().to_vector()[:VERTICES],
     )  # fmt: skip

@@ -50,6 +50,11 @@ def test_memberships_survive_vector_and_json() -> None:
     assert Memberships.from_json(json.loads(json.dumps(sets.to_json()))) == sets
 
 
+def test_a_file_from_before_the_rules_has_the_untuned_ones() -> None:
+    old = {name: list(getattr(SETS, name)) for name in ("inputs", "outputs", "ln_scales")}
+    assert Memberships.from_json(old) == Memberships.from_vector(SETS.to_vector()[:12]) == SETS
+
+
 def test_every_vector_within_the_bounds_is_a_valid_set_of_memberships() -> None:
     lower, upper = Memberships.bounds()
     rng = np.random.default_rng(6)
@@ -67,6 +72,9 @@ def test_every_vector_within_the_bounds_is_a_valid_set_of_memberships() -> None:
         ({"outputs": (-0.1, 0.0, 0.0, 0.0, float("nan"))}, "outputs"),
         ({"outputs": (0.01, 0.02, 0.03, 0.04, 0.05)}, "outputs"),
         ({"ln_scales": (9.0, 0.0)}, "ln_scales"),
+        ({"far": (4.0, 1.5)}, "far"),
+        ({"lately": (0.1,)}, "lately"),
+        ({"consequents": (-0.1, 0.0)}, "consequents"),
     ],
 )
 def test_impossible_memberships_are_refused_by_name(change: dict[str, Any], field: str) -> None:
