@@ -68,7 +68,11 @@ class Document(Record):
     estimator: str
     memberships: dict[str, list[Finite]]
     objective: str
+    winner: Annotated[str, Field(description="way that found them: least interval score held out")] = "colony"
     scores: dict[str, SplitScores]
+    candidates: Annotated[
+        dict[str, list[dict[str, list[Finite]]]], Field(description="what every search of a way found")
+    ] = {}
     provenance: Provenance
 
 
@@ -115,6 +119,12 @@ def shipped(estimator: str) -> Memberships:
         InputError: there are none for that estimator.
     """
     return load(FOLDER / f"{estimator}.json").memberships
+
+
+def candidates(estimator: str) -> dict[str, list[Memberships]]:
+    """What every search behind the shipped file found, by way; empty where the file does not tell."""
+    document = load(FOLDER / f"{estimator}.json").document
+    return {way: [Memberships.from_json(one) for one in found] for way, found in document.candidates.items()}
 
 
 def save(path: Path, document: Document) -> None:

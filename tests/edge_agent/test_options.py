@@ -56,6 +56,7 @@ CHANGED: dict[tuple[str, str], list[str]] = {
     ("fleet", "--rough"): ["--rough", "0.5"], ("fleet", "--truth"): ["--truth", "{0}.truth"],
     **{("tune", option): [option, value] for option, value in (
         ("--seed", "1"), ("--ants", "4"), ("--iterations", "3"), ("--objective", "innovation"), ("--out", "{0}.tuned"),
+        ("--repeats", "2"),
     )},
 }  # fmt: skip
 REPLAYED = "test_log_vehicle_estimator_and_configuration_of_a_replay_change_what_it_says"

@@ -8,6 +8,7 @@ from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
+from edge_agent.lab.evaluation import worth
 from edge_agent.lab.evaluation.campaign import DEFAULT, Results
 from edge_agent.lab.evaluation.measures import COMPONENTS, bounds
 from edge_agent.lab.evaluation.real_world import SURFACES
@@ -132,6 +133,7 @@ def figures(results: Results, *, quick: bool) -> list[Figure]:
     """Bars first (when quick, those that were measured), then `KIND.SCENARIO.ESTIMATOR.MEASURE` with its spread."""
     barred = [Figure(bar.name, bar.read(results), bar.unit, bar.bar, bar.better) for bar in BARS]
     listed = [figure for figure in barred if not (quick and math.isnan(figure.value))]
+    listed += worth.figures(results.worth)
     for kind, table in (("ideal", results.ideal), ("real", results.real)):
         for (scenario, estimator), found in table.items():
             listed += _context(f"{kind}.{scenario}.{estimator}", found)

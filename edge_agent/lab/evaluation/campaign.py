@@ -9,7 +9,7 @@ import numpy as np
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import ESTIMATORS, Estimates, EstimatorBank, adaptive_federated_ckf, compensated_wckf
-from edge_agent.lab.evaluation import faults, oracle, real_world
+from edge_agent.lab.evaluation import faults, oracle, real_world, worth
 from edge_agent.lab.evaluation.batch import DriveSet, estimates, ideal, realistic, repeated
 from edge_agent.lab.evaluation.measures import arrival, consistency, false_changes, measures, sides
 from edge_agent.lab.evaluation.paper_004 import experiments
@@ -44,6 +44,7 @@ class Results:
     faults: dict[tuple[str, str], dict[str, FloatArray]] = field(default_factory=dict)  # by (fault, estimator)
     world: dict[str, dict[str, float]] = field(default_factory=dict)  # the rough one: by estimator and "baseline"
     oracle: dict[str, FloatArray] = field(default_factory=dict)  # errors that an oracle makes, by figure
+    worth: worth.Scores = field(default_factory=dict)  # of fuzzy inference and the ants
     rough: RealWorldResults | None = None  # its first town, kept for plots
     ranks: dict[str, list[FloatArray]] = field(default_factory=dict)  # of the truth in the posterior, by estimator
     seeds: int = 0
@@ -77,6 +78,8 @@ def run(seeds: Sequence[int], *, quick: bool, log_line: Callable[[str], None]) -
     results.rough = real_world.campaign(seeds, names, quick=quick)
     results.world = results.rough.found
     log_line(f"rough cars in {1 if quick else real_world.TOWNS} hilly towns, and standing on slopes")
+    results.worth = worth.campaign(seeds, quick=quick)
+    log_line("what fuzzy inference and the ant colony bring")
     if not quick:
         results.oracle = {"002.sine.rmse_vx": oracle.speed(seeds), "003.accel.mu_error": oracle.friction(seeds)[0]}
         log_line("what an oracle makes of two of the papers' manoeuvres")
