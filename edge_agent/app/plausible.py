@@ -9,19 +9,29 @@ import numpy as np
 
 from schemas.numeric import FloatArray
 from schemas.signals import Health, S
-from schemas.thresholds import EXCITED_SHARE
+from schemas.thresholds import EXCITED_SHARE, GRAVITY
 
 if TYPE_CHECKING:
     from edge_agent.estimators import Estimates
 
 IMPLAUSIBLE: Final = 3  # exit code
-# bounds that no sound drive of ours passes: hard stops with locked wheels slide half of the time and no longer
 FURTHEST_SPEED: Final = 0.15  # median of |v_x − wheels| over the wheels' speed
 LEAST_SPEED: Final = 3.0  # [m/s] below which speeds are not compared
-MOST_SLIDING: Final = 0.6
 MOST_VIOLATION: Final = 0.05  # share of samples whose upper bound lies below the grip in use
-SLACK: Final = 0.02  # of that comparison
+SLACK: Final = 0.05  # of that comparison: half a metre per second squared of a tilted mount
+SMOOTHED_S: Final = 0.2  # over which the grip in use is taken, as long as a tyre takes to build its force up
 MOST_RESETS_PER_S: Final = 0.2
+
+
+def in_use(t: FloatArray, signals: FloatArray) -> FloatArray:
+    """Grip in use by the accelerometers, (T,) [1], smoothed over SMOOTHED_S; 0 where they are silent.
+
+    Not `mu_utilised`, which looks a second back: on a road that has just become slippery more was used than there is.
+    """
+    used = np.nan_to_num(np.hypot(signals[:, S.AX], signals[:, S.AY])) / GRAVITY
+    step = float(np.median(np.diff(t))) if len(t) > 1 else SMOOTHED_S
+    width = min(max(round(SMOOTHED_S / max(step, 1e-3)), 1), len(used))
+    return np.convolve(used, np.full(width, 1.0 / width), mode="same")
 
 
 @dataclass
@@ -50,7 +60,7 @@ class Plausibility:
         self.sliding += int(np.sum(health & Health.SLIDING != 0))
         self.resets += int(np.sum(health & Health.RESET != 0))
         upper, used, mu = estimates.mu_upper[:, 0], estimates.mu_utilised[:, 0], estimates.mu[:, 0]
-        self.violations += int(np.sum(upper < used - SLACK))
+        self.violations += int(np.sum(upper < in_use(t[:, 0], signals[:, 0]) - SLACK))
         self.excited += int(np.sum(used > EXCITED_SHARE * mu))
         self.samples += len(health)
         self.first = min(self.first, float(t[0, 0]))
@@ -72,7 +82,6 @@ class Plausibility:
         n = max(self.samples, 1)
         found = {
             "speed far off the wheels": self.off > FURTHEST_SPEED,
-            "sliding most of the time": self.sliding / n > MOST_SLIDING,
             "an upper bound below the grip in use": self.violations / n > MOST_VIOLATION,
             "started anew again and again": self.resets > 1 + MOST_RESETS_PER_S * self.seconds,
         }
