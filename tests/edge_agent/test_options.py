@@ -177,7 +177,8 @@ def tuned(folder: Path, *words: str) -> tuple[object, list[str]]:
         assert main([*USUAL["tune"], *words]) == 0
     (path,) = folder.iterdir()
     document = json.loads(path.read_text())
-    return {name: part for name, part in document.items() if name != "provenance"}, [path.name]
+    found = {name: part for name, part in document.items() if name != "provenance"}
+    return found | {"budget": document["provenance"]["budget"]}, [path.name]
 
 
 @pytest.mark.parametrize("option", [option for command, option in CHANGED if command == "tune"])
