@@ -102,10 +102,12 @@ def test_slippery_drives_become_a_slippery_map_that_survives_a_restart(system: S
     assert cells
     excited = [cell for cell in cells if cell["basis"] == "measured"]
     assert excited
-    assert max(abs(float(str(cell["mu"])) - ICE) for cell in excited) <= 0.06
+    # since the cars know of slopes and offsets they are shyer of ice: the median stands a bin or two beside the truth
+    assert max(abs(float(str(cell["mu"])) - ICE) for cell in excited) <= 0.1
+    assert all(float(str(cell["mu_lower"])) <= ICE <= float(str(cell["mu_upper"])) for cell in excited)
     slippery = {cell["vehicles"]: float(str(cell["p_slippery"])) for cell in sorted(excited, key=_most_slippery_first)}
-    assert slippery[2] >= 0.75  # the least of the cells that two passed, and of those that all three did
-    assert slippery[3] >= 0.85
+    assert slippery[2] >= 0.6  # the least of the cells that two passed, and of those that all three did
+    assert slippery[3] >= 0.75
     rows = archived(system.folder)
     assert len(set(rows)) == len(rows)
     system.stop()

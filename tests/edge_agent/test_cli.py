@@ -299,7 +299,7 @@ def test_an_outbox_in_use_is_refused(drive: Path, tmp_path: Path, router: Router
     outbox = Outbox(tmp_path / "spool.sqlite")
     assert main(replay(drive, tmp_path / "out", *options)) == 2
     outbox.close()
-    _one_error(capsys, "^error: outbox: .* is used by another agent; give each agent its own")
+    _one_error(capsys, "^error: spool: .* is used by another agent; give each agent its own")
 
 
 @pytest.mark.parametrize("name", [command.name for command in COMMANDS])

@@ -88,7 +88,7 @@ SHOWN_BELOW: Final = {
     "watch": {"--bbox", "--connect", "--config"},
 }
 # A campaign takes minutes: tests/fleet_service/lab/test_evaluate.py runs it small.
-CAMPAIGN: Final = {"--out", "--quick", "--skip-whole-way", "--whole-way"}
+CAMPAIGN: Final = {"--out", "--quick", "--skip-end-to-end", "--end-to-end"}
 
 
 class Done(NamedTuple):

@@ -78,8 +78,7 @@ class Constants(NamedTuple):
     sliding_slope: float = 0.3
     # [1] weight of the density that sliding spreads over slip: not every braking car slides on all wheels
     sliding_penalty: float = 0.3
-    # [1] weight of ln det S of the axles: none favours the flexible node, all of it the saturated one; the more states
-    # are uncertain the more: at .45 a minute of gentle slalom on dry road read as ice
+    # [1] weight of ln det S of the axles: none favours the flexible node, all of it the saturated one (.45: false ice)
     axle_penalty: float = 0.28
 
     # [1] prior standard deviations within which stiffness, leaks and offsets are kept; more is a contradiction
