@@ -61,7 +61,7 @@ def update_by_downdate(
 ) -> tuple[int, float, float, bool]:
     """Measurement update in place as paper 003 does it: L loses the columns of U = P_xz*S^-T/2, one after the other.
 
-    Arguments as `squareroot.update`. Returns what it returns, and whether a downdate was refused: then `update` has
+    Arguments as `householder.update`. Returns what it returns, and whether a downdate was refused: then `update` has
     done the work, whose orthogonal transformation cannot fail.
     """
     n, points = state_deviations.shape
