@@ -90,10 +90,10 @@ class Plausibility:
     def line(self) -> str:
         """All of it in a line."""
         n = max(self.samples, 1)
-        told = (
+        summary = (
             f"{self.samples} samples, {self.seconds:.1f} s; speed {self.off:.1%} off the wheels, "
             f"excited {self.excited / n:.0%}, sliding {self.sliding / n:.0%}, "
             f"violations {self.violations / n:.1%}, resets {self.resets}"
         )
         bad = self.troubles()
-        return f"{told}; NOT PLAUSIBLE: {', '.join(bad)}; run edge-agent check" if bad else told
+        return f"{summary}; NOT PLAUSIBLE: {', '.join(bad)}; run edge-agent check" if bad else summary

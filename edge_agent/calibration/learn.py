@@ -39,20 +39,20 @@ BIAS: Final = {"radius": 0.0007, "ax": 0.06, "ay": 0.25, "yaw_rate": 0.0005, "st
 
 
 def learn(drives: Sequence[tuple[FloatArray, FloatArray]], vehicle: Vehicle) -> Calibration:
-    """What the drives, (t (T,), signals (T, 18)) each, say of a vehicle.
+    """Calibration of a vehicle from its drives, (t (T,), signals (T, 18)) each.
 
     Raises:
-        InputError: none of them says anything.
+        InputError: none of them is excited enough.
     """
-    told: dict[str, list[float]] = {}
+    estimates: dict[str, list[float]] = {}
     for t, signals in drives:
         for name, value in one_drive(prepare(t, signals, vehicle), vehicle).items():
-            told.setdefault(name, []).append(value)
-    if not told:
+            estimates.setdefault(name, []).append(value)
+    if not estimates:
         raise InputError(
             "log", "no drive is excited enough to learn from", "give drives with turns, straights, braking"
         )
-    learned = {name: _mean(name, np.array(values)) for name, values in told.items()}
+    learned = {name: _mean(name, np.array(values)) for name, values in estimates.items()}
     return Calibration.model_validate({"drives": len(drives), **learned})
 
 
@@ -64,23 +64,23 @@ def _mean(name: str, values: FloatArray) -> tuple[float, float]:
 
 
 def one_drive(drive: EvenDrive, vehicle: Vehicle) -> dict[str, float]:
-    """What one drive says, by quantity; what it was not excited for is left out."""
+    """Estimates of one drive, by quantity; those it was not excited for are left out."""
     moving, axle = drive.moving > 0, fits(drive)["axle"]
-    told: dict[str, float] = {}
+    quantities: dict[str, float] = {}
     if axle.known and axle.error < 0.1:
-        told["yaw_rate"] = -axle.offset / axle.gain
-        drive = replace(drive, r=drive.r - told["yaw_rate"])  # it would be taken for an offset of steering and a_y
-    told |= _radii(drive, vehicle)
+        quantities["yaw_rate"] = -axle.offset / axle.gain
+        drive = replace(drive, r=drive.r - quantities["yaw_rate"])  # else taken for offsets of steering and a_y
+    quantities |= _radii(drive, vehicle)
     calm = moving & np.isfinite(drive.ax) & np.isfinite(drive.v_dot)
     if calm.sum() > LEAST_S * RATE_HZ:
-        told["ax"] = float(np.median((drive.ax - drive.v_dot)[calm]))
+        quantities["ax"] = float(np.median((drive.ax - drive.v_dot)[calm]))
     straight = moving & (np.abs(drive.v * drive.r) < STRAIGHT) & np.isfinite(drive.ay)
     if straight.sum() > LEAST_S * RATE_HZ:
-        told["ay"] = float(np.median((drive.ay - drive.v * drive.r)[straight]))
+        quantities["ay"] = float(np.median((drive.ay - drive.v * drive.r)[straight]))
     steering = fits(drive)["steering"]
     if steering.known and steering.error < 0.1:
-        told |= {"steer_offset": steering.offset, "steer_gain": steering.gain, "understeer": steering.beside[0]}
-    return told
+        quantities |= {"steer_offset": steering.offset, "steer_gain": steering.gain, "understeer": steering.beside[0]}
+    return quantities
 
 
 def _radii(drive: EvenDrive, vehicle: Vehicle) -> dict[str, float]:

@@ -26,7 +26,7 @@ from edge_agent.lab.tuning.objectives import (
     record_all,
     scores_of,
 )
-from edge_agent.lab.tuning.search import Iteration, Objective, Progress, Result
+from edge_agent.lab.tuning.search import Iteration, Objective, Problem, Progress, Result
 from schemas.errors import InputError
 from schemas.runtime import figures
 
@@ -137,17 +137,15 @@ def _study(args: argparse.Namespace, ants: int, iterations: int) -> int:
 
 def _search(objective: Objective, ants: int, iterations: int, seed: int) -> dict[str, Result]:
     """Random search and ant colony from the same start, with the same positions and budget."""
-    start = Memberships().to_vector()
+    problem = Problem(objective, choices(POSITIONS), Memberships().to_vector())
     results = {}
     for stream, (way, search) in enumerate((("random", random_search.optimise), ("colony", colony.optimise))):
         results[way] = search(
-            objective,
-            choices(POSITIONS),
+            problem,
             ants=ants,
             iterations=iterations,
             rng=np.random.default_rng([seed, stream]),
             progress=reporter(way, iterations, time.monotonic, print_line),
-            start=start,
         )
     return results
 

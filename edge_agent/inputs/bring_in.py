@@ -83,8 +83,8 @@ def profile_of(log: Path) -> Profile:
     """
     with foreign(log, "Parquet"):
         schema = pq.ParquetFile(log).schema_arrow
-        if (told := (schema.metadata or {}).get(PROVENANCE)) is not None:
-            return Profile.model_validate(json.loads(told)["profile"])
+        if (provenance := (schema.metadata or {}).get(PROVENANCE)) is not None:
+            return Profile.model_validate(json.loads(provenance)["profile"])
         return Profile(name=log.stem[:64], channels={n: Channel(signal=n) for n in CHANNELS if n in schema.names})
 
 
@@ -97,10 +97,11 @@ def write_log(path: Path, merged: Merged, profile: Profile, sources: Sequence[st
     else:
         columns["t"] = pa.array(merged.t)
     columns |= {name: pa.array(values, from_pandas=True) for name, values in merged.columns.items()}
-    told: Mapping[str, object] = {
-        "profile": json.loads(profile.text()), "sources": list(sources), "channels": merged.told, "notes": merged.notes,
+    provenance: Mapping[str, object] = {
+        "profile": json.loads(profile.text()), "sources": list(sources),
+        "channels": merged.origins, "notes": merged.notes,
     }  # fmt: skip
-    table = pa.table(columns).replace_schema_metadata({PROVENANCE: json.dumps(told).encode()})
+    table = pa.table(columns).replace_schema_metadata({PROVENANCE: json.dumps(provenance).encode()})
     try:
         pq.write_table(table, path, compression="zstd")
     except OSError as error:

@@ -46,7 +46,7 @@ class Merged:
     columns: dict[str, FloatArray]
     start_ns: int | None
     notes: list[str] = field(default_factory=list)
-    told: dict[str, dict[str, object]] = field(default_factory=dict)  # per channel: source, rate, missing, jitter
+    origins: dict[str, dict[str, object]] = field(default_factory=dict)  # per channel: source, rate, missing, jitter
 
 
 def merge(
@@ -78,7 +78,7 @@ def merge(
     reference = next((place for name, place in found.items() if name.startswith("omega")), next(iter(found.values())))
     offsets, start_ns = _clocks(recordings, reference, shifts or {}, notes)
     series: dict[str, Series] = {}
-    told: dict[str, dict[str, object]] = {}
+    origins: dict[str, dict[str, object]] = {}
     for name, place in found.items():
         channel = profile.channels.get(name, GNSS.get(name, Channel(signal="speed", unit="m/s")))
         recording = recordings[place]
@@ -87,13 +87,13 @@ def merge(
         except _MissingError as error:
             raise InputError(f"{name} ({', '.join(channel.signals)})", str(error), error.fix) from None
         series[name] = Series(made.t + offsets[place] - channel.delay_s, made.values)
-        told[name] = {"source": recording.name, "signals": channel.signals, **_rates(made), "jitter_s": jitter}
+        origins[name] = {"source": recording.name, "signals": channel.signals, **_rates(made), "jitter_s": jitter}
     _still_courses(series)
     merged = _rows(series, profile, recordings, found)
     shift = merged.t[0]
     merged.t = merged.t - shift
     merged.start_ns = None if start_ns is None else start_ns + round(shift * NS)
-    merged.notes, merged.told = notes, told
+    merged.notes, merged.origins = notes, origins
     return merged
 
 

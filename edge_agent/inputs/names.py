@@ -1,7 +1,7 @@
 """A profile drafted from the names of signals: what is likely which channel, for a person to look over.
 
-Names are cut into words at case, digits and signs. A wheel is told by its two letters or words, in English or German
-(VL VR HL HR: vorn and hinten, links and rechts). Units come from the recording where it tells them.
+Names are cut into words at case, digits and signs. A wheel is recognised by its two letters or words, in
+English or German (VL VR HL HR: vorn and hinten, links and rechts). Units come from the recording where it tells them.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def draft(signals: Mapping[str, str], name: str) -> Profile:
     """A profile of what the names say.
 
     Args:
-        signals: name -> unit as recorded, "" where it is not told.
+        signals: name -> unit as recorded, "" where it is not given.
         name: of the profile.
     """
     channels: dict[str, Channel] = {}

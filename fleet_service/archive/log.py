@@ -107,7 +107,7 @@ class SegmentLog(Generic[Batch]):
             OSError: as `end`.
         """
         durable = self.end()
-        self._next.batches[:0] = durable  # they are told with the rest, which may fail
+        self._next.batches[:0] = durable  # they are reported with the rest, which may fail
         self.begin()
         return self.end()
 

@@ -45,7 +45,7 @@ def read(
         columns: all, if None.
         where: rows wanted; row groups that cannot hold any are skipped.
         days: first and last day of measurement wanted; may yield more.
-        damaged: is told of a damaged file.
+        damaged: is called with a damaged file.
 
     Raises:
         InputError: a file is of a newer major version.

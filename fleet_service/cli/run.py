@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from fleet_service.app.service import Service
 
 SWITCH_S = 0.0005  # after which a busy worker lets an answer go first; ten times that is Python's own
-LEAVE_AT_LAST_S = 2.7  # after a signal; the process is to be gone within 3 s
+LEAVE_AT_LAST_S = 2.7  # after a signal; the process is to have ended within 3 s
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,15 +48,15 @@ def run(arguments: argparse.Namespace) -> int:
     sys.setswitchinterval(SWITCH_S)
     gc.collect()
     gc.freeze()  # what came from the archive stays: looking through it takes longer than an alert may
-    gone = threading.Event()
-    threading.Thread(target=_leave_at_last, args=(stop, gone, service, log_line), daemon=True).start()
+    stopped = threading.Event()
+    threading.Thread(target=_leave_at_last, args=(stop, stopped, service, log_line), daemon=True).start()
     service.run(stop)
-    gone.set()
+    stopped.set()
     return 0
 
 
 def _leave_at_last(
-    stop: threading.Event, gone: threading.Event, service: Service, log_line: Callable[[str], None]
+    stop: threading.Event, stopped: threading.Event, service: Service, log_line: Callable[[str], None]
 ) -> None:
     """A session that hangs on a frozen router, or a long compaction, must not keep a stopped service.
 
@@ -64,7 +64,7 @@ def _leave_at_last(
     that it would have ended with.
     """
     stop.wait()
-    if not gone.wait(LEAVE_AT_LAST_S):
+    if not stopped.wait(LEAVE_AT_LAST_S):
         log_line("left at last: a session or a job did not end in time")
         if service.failure is not None:
             traceback.print_exception(service.failure)

@@ -17,7 +17,7 @@ AckedStream = tuple[int, Kind, int]  # boot, kind, region
 
 
 class Acks:
-    """What is to be told to whom."""
+    """Acknowledgements that are due, by stream."""
 
     def __init__(self) -> None:
         self._durable: dict[SequenceTracker, list[int]] = defaultdict(list)
@@ -60,7 +60,7 @@ class Acks:
 def _parts(
     stream: AckedStream, durable: tuple[tuple[int, int], ...], rejected: tuple[tuple[int, int, str], ...]
 ) -> Iterator[StreamAck]:
-    """What is to be told about a stream, in pieces."""
+    """Acknowledgements of a stream that are due, in pieces."""
     for at in range(0, max(len(durable), len(rejected)), ITEMS_PER_STREAM):
         some = slice(at, at + ITEMS_PER_STREAM)
         yield StreamAck(*stream, durable[some], rejected[some])

@@ -133,7 +133,7 @@ def archived(
 ) -> Reports:
     """Every report that a map used, in the order in which they came, as far as received in that time [ns].
 
-    `damaged` is told of a damaged file: the roads of its reports age by the clock.
+    `damaged` is called with a damaged file: the roads of its reports age by the clock.
 
     Raises:
         InputError: a file is of a newer major version.

@@ -108,7 +108,7 @@ def replay(
         root: of the archive.
         fusion: a new one, or one that holds everything that was received before.
         since: the rows wanted.
-        damaged: is told of a damaged file.
+        damaged: is called with a damaged file.
     """
     days = (None, None if since.until is None else since.until // layout.DAY_NS + 1)
     tables = list(reading.read(root, Kind.OBSERVATION, COLUMNS, since.where(), days, damaged))

@@ -46,7 +46,7 @@ class InputTrack:
 
 @compiled
 def take(track: InputTrack, row: FloatArray, time: float, sample: FloatArray) -> tuple[int, int, float]:
-    """Take sample (18,) of a vehicle at `time` [s]: (health flags, REFUSED | BEGUN | STEPPED, seconds gone by)."""
+    """Take sample (18,) of a vehicle at `time` [s]: (health flags, REFUSED | BEGUN | STEPPED, seconds elapsed)."""
     begins = not track.started
     dt = time - track.time
     if not math.isfinite(time) or not (begins or dt > 0.0):

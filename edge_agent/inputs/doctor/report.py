@@ -29,9 +29,9 @@ STYLE: Final = (
 
 def lines(said: Diagnosis) -> list[str]:
     """What was found, a line each."""
-    told = [f"{'FAULT':<8} {f.channel:<10} {f.kind:<24} {f.words}" for f in said.findings]
-    told += [f"{'unknown':<8} {channel:<10} nothing in this drive tells" for channel in said.unknown]
-    return [*told, *(f"{'sound':<8} {channel}" for channel in said.sound)]
+    lines = [f"{'FAULT':<8} {f.channel:<10} {f.kind:<24} {f.words}" for f in said.findings]
+    lines += [f"{'unknown':<8} {channel:<10} nothing in this drive tells" for channel in said.unknown]
+    return [*lines, *(f"{'sound':<8} {channel}" for channel in said.sound)]
 
 
 def advice(said: Diagnosis) -> str:

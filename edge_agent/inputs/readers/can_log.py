@@ -63,7 +63,7 @@ def decoded(
         name: of the log.
         database: how to decode it.
         wanted: whole names; what the database or the log does not have is left out.
-        buses: the bus of a message, where it is told.
+        buses: the bus of a message, where it is known.
     """
     messages: dict[str, list[str]] = defaultdict(list)
     for whole in wanted:

@@ -24,7 +24,7 @@ UNITS: Final = {"latitude": "deg", "longitude": "deg", "speed": "m/s", "course":
 
 
 class Fix(NamedTuple):
-    """A position: ns UTC, degrees, speed [m/s], and course [deg clockwise from north]; NaN where not told."""
+    """A position: ns UTC, degrees, speed [m/s], and course [deg clockwise from north]; NaN where not given."""
 
     time: int
     latitude: float

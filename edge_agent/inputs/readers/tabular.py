@@ -48,8 +48,8 @@ def _recording(path: Path, kind: str, time: str | None, time_unit: str | None) -
         raise InputError("source", f"{path} has no rows", "give a recording with at least one sample")
     named = {_UNIT.sub(r"\g<name>", name).strip() or name: name for name in table.column_names}
     column = _time_column(path, named, time)
-    told = _UNIT.match(named[column])
-    t, start_ns = _seconds(table[named[column]], column, time_unit or (told["unit"] if told else None))
+    unit = _UNIT.match(named[column])
+    t, start_ns = _seconds(table[named[column]], column, time_unit or (unit["unit"] if unit else None))
     back = np.flatnonzero(~(np.diff(t) >= 0.0))
     if len(back) or not np.isfinite(t[:1]).all():
         row = int(back[0]) + 1 if len(back) else 0

@@ -42,7 +42,7 @@ class Driver(IntEnum):
     WOBBLE = 6  # [m] amplitude of his wandering in the lane
     SHORT = 7  # [m] left to the next point of the lane
     STOPS = 8  # share of the ALERT_S in which he comes to a stop and waits; 0: nobody stops
-    LEAN = 9  # rise of the road to his left [1], as it has turned over so far from one bend into the next
+    CROSS_SLOPE = 9  # rise of the road to his left [1], as it has turned over so far from one bend into the next
 
 
 class Route(IntEnum):

@@ -28,7 +28,7 @@ from edge_agent.lab.simulation.plant import (
     wheel_place,
 )
 from edge_agent.lab.simulation.presets import nominal, one_of_a_fleet
-from edge_agent.lab.simulation.relief import gradient, lean, tilt
+from edge_agent.lab.simulation.relief import cross_slope, gradient, tilt
 from edge_agent.lab.simulation.roads import LanePoint, Network
 from edge_agent.lab.simulation.scenarios import Scenario, scenario_named
 from edge_agent.lab.simulation.sensors import (
@@ -93,9 +93,9 @@ def run(
             t = (first + k) * period
             lane = lanes[0][lanes[1][g[Route.LANE]] + g[Route.POINT]]
             turned = -math.expm1(-abs(x[Motion.VX]) * period / TURN_OVER_M)
-            d[Driver.LEAN] += (lean(relief, lane[LanePoint.CURVATURE]) - d[Driver.LEAN]) * turned
+            d[Driver.CROSS_SLOPE] += (cross_slope(relief, lane[LanePoint.CURVATURE]) - d[Driver.CROSS_SLOPE]) * turned
             heading = (math.cos(x[Motion.YAW]), math.sin(x[Motion.YAW]))
-            east, north = gradient(relief, (x[Motion.X], x[Motion.Y]), heading, d[Driver.LEAN])
+            east, north = gradient(relief, (x[Motion.X], x[Motion.Y]), heading, d[Driver.CROSS_SLOPE])
             u[Control.TILT, 0], u[Control.TILT, 1] = tilt(east, north, x[Motion.YAW])
             now = (t, period, gravity(u)[0])
             drive(x, (d, g), (lanes, friction), p, w, now, (keys[0][n], keys[1][n]))
@@ -154,7 +154,7 @@ class SimulatedFleet:
         )
         self._states = _start(self.scenario.network, self._parameters, rngs)
         self._states[1][:, Driver.STOPS] = np.where(self.rough, STOPS, 0.0)
-        self._states[1][:, Driver.LEAN] = self.scenario.relief.crossfall
+        self._states[1][:, Driver.CROSS_SLOPE] = self.scenario.relief.crossfall
         self._before = np.empty((0, vehicles, RECORD))  # what late clocks may still speak of
         self._wander = np.zeros((vehicles, 3))
         self._relief = self.scenario.relief.table

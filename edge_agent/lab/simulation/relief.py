@@ -75,7 +75,7 @@ class WaveColumn(IntEnum):
 
 
 @compiled
-def lean(table: FloatArray, curvature: float) -> float:
+def cross_slope(table: FloatArray, curvature: float) -> float:
     """How much a lane of that `curvature` [1/m] rises to its left [1]: crossfall, and less in a bend to the left."""
     return float(table[0, 0] - table[0, 1] * curvature)
 

@@ -31,7 +31,7 @@ from edge_agent.lab.simulation.plant import (
     wheel_place,
 )
 from edge_agent.lab.simulation.presets import TrueVehicle, nominal, true_vehicle
-from edge_agent.lab.simulation.relief import Relief, gradient, lean, road_named, tilt
+from edge_agent.lab.simulation.relief import Relief, cross_slope, gradient, road_named, tilt
 from edge_agent.lab.simulation.sensors import SENSORS, Sensors, error_row, noise_keys, sense, sensors_named
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
@@ -124,7 +124,7 @@ def _drive(
     records = np.empty((samples, RECORD))
     substeps, dt = substeps_of(rate_hz), 1.0 / rate_hz
     start_at(x, p, (0.0, 0.0, 0.0), speed)
-    across = lean(world.relief, 0.0)
+    across = cross_slope(world.relief, 0.0)
     steer = force = 0.0
     for k in range(samples):
         east, north = gradient(world.relief, (x[Motion.X], x[Motion.Y]), (1.0, 0.0), across)

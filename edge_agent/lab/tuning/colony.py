@@ -24,7 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge_agent.lab.tuning.search import Admissible, Graph, Ledger, Objective, Progress, Result, everything, nearest
+from edge_agent.lab.tuning.search import Graph, Ledger, Problem, Progress, Result, nearest
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, FloatArray, IntArray
 
@@ -108,29 +108,24 @@ def _weights(ants: int, habits: Habits) -> FloatArray:
 
 
 def optimise(
-    objective: Objective,
-    choices: Sequence[FloatArray],
+    problem: Problem,
     *,
     ants: int,
     iterations: int,
     rng: np.random.Generator,
     progress: Progress | None = None,
-    start: FloatArray | None = None,
-    admissible: Admissible = everything,
     visibility: Sequence[FloatArray] | None = None,
     habits: Habits | None = None,
 ) -> Result:
     """Search the vector with the largest objective.
 
-    choices: per vertex its positions, ascending. start (V,): walked by the first ant, so that the result is never
-    worse than it. admissible: vectors that may be asked for; others are drawn again. visibility: per vertex the
-    preference η > 0 of each position, all alike if absent. The objective is called at most ants·iterations times,
-    once per vector. Raises InputError for empty choices, no ants or no iterations.
+    visibility: per vertex the preference η > 0 of each position, all alike if absent. The objective is called at most
+    ants·iterations times, once per vector. Raises InputError for empty choices, no ants or no iterations.
     """
     habits = habits or Habits()
-    graph = Graph.of(choices)
+    graph = Graph.of(problem.choices)
     reachable = graph.reachable
-    ledger = Ledger(objective, graph, admissible)
+    ledger = Ledger(problem.objective, graph, problem.admissible)
     eta = np.ones(reachable.shape) if visibility is None else np.nan_to_num(Graph.of(visibility).positions, nan=1.0)
     pheromone = np.where(reachable, HIGHEST, 0.0)
     weights = _weights(ants, habits)
@@ -138,8 +133,8 @@ def optimise(
     for iteration in range(iterations):
         odds = transition_probabilities(pheromone, eta, reachable, alpha=habits.alpha, theta=habits.theta)
         paths = [ledger.draw(lambda odds=odds: _walk(odds, rng)) for _ in range(ants)]  # type: ignore[misc]
-        if iteration == 0 and start is not None:
-            paths[0] = nearest(graph, start)
+        if iteration == 0 and problem.start is not None:
+            paths[0] = nearest(graph, problem.start)
         values = [ledger.evaluate(path) for path in paths]
         ledger.record(values, progress)
         pheromone = renew(

@@ -15,6 +15,12 @@ from schemas.numeric import BoolArray, FloatArray, IntArray
 Objective = Callable[[FloatArray], float]
 Admissible = Callable[[FloatArray], bool]
 
+
+def everything(_vector: FloatArray) -> bool:
+    """The admissible set without limits."""
+    return True
+
+
 # Draws before an ant accepts a path that was already walked; a converged colony would else draw for ever.
 REDRAWS = 32
 
@@ -30,6 +36,21 @@ class Iteration:
 
 
 Progress = Callable[[Iteration], None]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is to be maximised, over which vectors.
+
+    objective: value of a vector (V,). choices: per vertex its positions, ascending. start (V,): the first vector
+    evaluated, so that the result is never worse than it. admissible: vectors that may be evaluated; others are drawn
+    again.
+    """
+
+    objective: Objective
+    choices: Sequence[FloatArray]
+    start: FloatArray | None = None
+    admissible: Admissible = everything
 
 
 @dataclass(frozen=True)
@@ -117,11 +138,6 @@ class Ledger:
         if self.best_path is None:
             raise InputError("ants, iterations", "nothing was evaluated", "use at least one of each")
         return Result(self.graph.vector(self.best_path), self.best_value, tuple(self.history))
-
-
-def everything(_vector: FloatArray) -> bool:
-    """The admissible set without limits."""
-    return True
 
 
 def nearest(graph: Graph, vector: FloatArray) -> IntArray:

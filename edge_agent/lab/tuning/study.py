@@ -22,7 +22,7 @@ from edge_agent.lab.simulation.presets import matched
 from edge_agent.lab.simulation.white import add_white, scheduled
 from edge_agent.lab.tuning import colony, random_search
 from edge_agent.lab.tuning.objectives import choices, interval_score
-from edge_agent.lab.tuning.search import Objective, Progress, Result
+from edge_agent.lab.tuning.search import Objective, Problem, Progress, Result
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS as SIGNALS
 from schemas.vehicle import Vehicle
@@ -164,7 +164,6 @@ def search(
 ) -> Result:  # fmt: skip
     """Search the vertices in one of WAYS; both begin at the untuned ones."""
     return WAYS[way](
-        objective_on(drives), choices(positions)[:VERTICES], ants=ants, iterations=iterations,
-        rng=np.random.default_rng([seed, list(WAYS).index(way)]), progress=progress,
-        start=Memberships().to_vector()[:VERTICES],
+        Problem(objective_on(drives), choices(positions)[:VERTICES], Memberships().to_vector()[:VERTICES]),
+        ants=ants, iterations=iterations, rng=np.random.default_rng([seed, list(WAYS).index(way)]), progress=progress,
     )  # fmt: skip

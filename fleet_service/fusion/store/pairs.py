@@ -95,7 +95,7 @@ def count_staying(pairs: RecordArray, least: int) -> int:
 @compiled
 def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, least: int) -> IntArray:
     """Move the pairs that reported since `least` [s] to another table; returns the places of the others."""
-    gone, count = np.empty(len(old), np.int64), 0
+    dropped, count = np.empty(len(old), np.int64), 0
     for begin in range(0, len(old), AHEAD):
         end = min(begin + AHEAD, len(old))
         for place in range(begin, end):
@@ -105,7 +105,7 @@ def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, least: 
             if old[place].slot == NONE:
                 continue
             if not _stays(old, place, least):
-                gone[count] = place
+                dropped[count] = place
                 count += 1
                 continue
             to = pair_place(new, old[place].slot, old[place].vehicle)
@@ -114,7 +114,7 @@ def move_pairs(entries: RecordArray, old: RecordArray, new: RecordArray, least: 
             while entry != NONE:
                 entries[entry].pair = to
                 entry = int(entries[entry].before)
-    return gone[:count]
+    return dropped[:count]
 
 
 @refcount_free_inlined

@@ -187,8 +187,8 @@ class Store:
         old = state.pairs
         count = count_staying(old, least)
         new = _no_pairs(places_for(max(count, most), PAIRS_MOST))
-        gone = move_pairs(state.entries, old, new, least)
-        mark_returned(state, old["slot"][gone], self.names["key"][old["vehicle"][gone]])
+        dropped = move_pairs(state.entries, old, new, least)
+        mark_returned(state, old["slot"][dropped], self.names["key"][old["vehicle"][dropped]])
         state.used[PAIRS] = count
         self.state = state._replace(pairs=new)
 

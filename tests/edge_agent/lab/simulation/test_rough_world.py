@@ -32,7 +32,7 @@ from edge_agent.lab.simulation.plant import (
     start_at,
     wheel_forces,
 )
-from edge_agent.lab.simulation.relief import STEEPEST, gradient, lean, tilt
+from edge_agent.lab.simulation.relief import STEEPEST, cross_slope, gradient, tilt
 from edge_agent.lab.simulation.roads import LanePoint
 from edge_agent.lab.simulation.scenarios import scenario_named
 from edge_agent.lab.simulation.sensors import ROUGH_FLEET, Sensors
@@ -159,7 +159,9 @@ def test_traffic_lights_stop_it_hold_it_and_let_it_go(slope: float) -> None:
 def test_every_road_is_the_gradient_of_a_height_and_public(name: str) -> None:
     for seed in range(20):
         table = ROADS[name](seed).table
-        slopes = np.array([gradient(table, (x, 0.0), (1.0, 0.0), lean(table, 0.0)) for x in np.arange(0.0, 1e3, 3.0)])
+        slopes = np.array(
+            [gradient(table, (x, 0.0), (1.0, 0.0), cross_slope(table, 0.0)) for x in np.arange(0.0, 1e3, 3.0)]
+        )
         assert np.hypot(*slopes.T).max() <= STEEPEST * (1 + 1e-12)
         assert slopes.any() == (name != "level")
         east, north = slopes[7].tolist()
@@ -186,7 +188,7 @@ def test_lanes_fall_to_their_right_and_bends_to_their_inside() -> None:
     for heading in np.linspace(0, 6, 9).tolist():
         lane, falls = (float(np.cos(heading)), float(np.sin(heading))), []
         for curvature in (0.0, 0.02, -0.02):
-            east, north = gradient(table, (0.0, 0.0), lane, lean(table, curvature))
+            east, north = gradient(table, (0.0, 0.0), lane, cross_slope(table, curvature))
             falls.append(tilt(east, north, heading))
         np.testing.assert_allclose([left for _, left in falls], [0.025, 0.015, 0.035], atol=1e-12)
         np.testing.assert_allclose([ahead for ahead, _ in falls], 0.0, atol=1e-12)
@@ -201,7 +203,7 @@ def test_the_town_on_hills_reaches_eight_per_cent_and_is_gentle_where_it_is_icy(
             table,
             (row[LanePoint.X], row[LanePoint.Y]),
             (row[LanePoint.COS], row[LanePoint.SIN]),
-            lean(table, row[LanePoint.CURVATURE]),
+            cross_slope(table, row[LanePoint.CURVATURE]),
         )
         along.append(east * row[LanePoint.COS] + north * row[LanePoint.SIN])
     steep = np.abs(along)

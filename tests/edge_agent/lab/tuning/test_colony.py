@@ -7,7 +7,7 @@ import pytest
 
 from edge_agent.lab.tuning import colony, random_search
 from edge_agent.lab.tuning.colony import Habits, deposit, lowest_pheromone, renew, transition_probabilities
-from edge_agent.lab.tuning.search import Graph, Iteration, Objective, Result
+from edge_agent.lab.tuning.search import Graph, Iteration, Objective, Problem, Result
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
@@ -33,8 +33,10 @@ def decoy(seed: int) -> Objective:
 
 
 def run(search: object, objective: Objective, seed: int, **options: object) -> Result:
+    of_the_problem = {name: options.pop(name) for name in ("start", "admissible") if name in options}
+    problem = Problem(objective, CHOICES, **of_the_problem)  # type: ignore[arg-type]
     return search.optimise(  # type: ignore[attr-defined, no-any-return]
-        objective, CHOICES, ants=ANTS, iterations=ITERATIONS, rng=np.random.default_rng(seed), **options
+        problem, ants=ANTS, iterations=ITERATIONS, rng=np.random.default_rng(seed), **options
     )
 
 
@@ -57,7 +59,7 @@ def test_colony_reaches_the_optimum_where_random_search_of_equal_budget_does_not
     for trial in range(TRIALS):
         for name, search in (("colony", colony), ("random", random_search)):
             result = search.optimise(
-                decoy(trial), CHOICES, ants=20, iterations=40, rng=np.random.default_rng(3000 + trial)
+                Problem(decoy(trial), CHOICES), ants=20, iterations=40, rng=np.random.default_rng(3000 + trial)
             )
             found[name] += result.value > VERTICES - 1e-9
     assert found["colony"] >= 18
@@ -207,8 +209,8 @@ def test_habits_outside_their_range_are_refused_by_name(name: str) -> None:
 @pytest.mark.parametrize("search", [colony, random_search])
 def test_a_vertex_without_positions_and_an_empty_budget_are_refused(search: object) -> None:
     with pytest.raises(InputError, match="choices"):
-        search.optimise(bowl(0), [], ants=1, iterations=1, rng=np.random.default_rng(0))  # type: ignore[attr-defined]
+        search.optimise(Problem(bowl(0), []), ants=1, iterations=1, rng=np.random.default_rng(0))  # type: ignore[attr-defined]
     with pytest.raises(InputError, match="ants"):
-        search.optimise(bowl(0), CHOICES, ants=4, iterations=0, rng=np.random.default_rng(0))  # type: ignore[attr-defined]
+        search.optimise(Problem(bowl(0), CHOICES), ants=4, iterations=0, rng=np.random.default_rng(0))  # type: ignore[attr-defined]
     with pytest.raises(InputError, match="admissible"):
         run(search, bowl(0), 0, admissible=lambda _vector: False)
