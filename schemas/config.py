@@ -58,7 +58,10 @@ class AgentConfig(MonitoringSettings):
     spool_mb: Positive = Field(
         default=256.0, description="[MB] at the most; oldest state goes first, then observations"
     )
-    resend_s: Positive = Field(default=2.0, description="first wait before a batch is sent again; doubles up to 6 s")
+    resend_s: Positive = Field(
+        default=2.0,
+        description="first wait before a batch is sent again; doubles up to 6 s, to minutes if nobody answers",
+    )
     trip_end_m: float = Field(
         default=0.0, ge=0.0, allow_inf_nan=False, description="[m] at both ends of a trip; nothing is published of them"
     )

@@ -18,19 +18,19 @@ import random
 import secrets
 import sqlite3
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
 from edge_agent.publish.batching import Draft
+from edge_agent.publish.pacing import Pacer
 from schemas.errors import InputError
 from schemas.runtime.durable import make_folder
 from schemas.wire import Kind
 
 BOOT_LIMIT = 2**63  # boot fits a signed 64-bit column
 FIRST_RESEND_S = 2.0  # a service writes a segment each second: an answer younger than this is on its way
-LONGEST_RESEND_S = 6.0  # after an outage everything is offered again within this time
-REOFFER_S = 1.0  # in which an agent that was cut off offers all that it holds
+LONGEST_RESEND_S = 6.0  # for an answer of a service that does answer; see `pacing` for one that does not
 JITTER = 0.25  # share of the delay, either way: agents that lost one router do not return in step
 DEFAULT_CAPACITY_BYTES = 256 * 2**20  # some days of one vehicle at a batch per second and kind
 EVICTION_ORDER = (Kind.STATE, Kind.OBSERVATION)  # an old state is worth least, an observation most
@@ -57,13 +57,14 @@ class Stream(NamedTuple):
 
 @dataclass(frozen=True)
 class StoredBatch:
-    """A batch that is on disk and not settled."""
+    """A batch that is on disk and not settled; `fresh` ones are to be put now, others wait for `due`."""
 
     key: int
     stream: Stream
     seq: int
     records: int
     payload: bytes
+    fresh: bool = True
 
 
 @dataclass
@@ -73,16 +74,19 @@ class OutboxCounts:
     stored: int = 0
     settled: int = 0
     evicted: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(EVICTION_ORDER, 0))
+    damaged: int = 0
 
 
-@dataclass
+@dataclass(slots=True)
 class _Entry:
+    """What is known of a batch without its payload; it flies while it is `due` at some time."""
+
     stream: Stream
     seq: int
     records: int
     size: int
     attempts: int = 0
-    due: float = 0.0
+    due: float | None = None
 
 
 @dataclass
@@ -119,8 +123,8 @@ class Outbox:
         self._entries: dict[int, _Entry] = {}
         self._oldest: dict[Kind, dict[int, None]] = {kind: {} for kind in Kind}  # keys in their order
         self._streams: dict[Stream, _Sequence] = {}
-        self._later: list[tuple[float, int]] = []
-        self._ready: list[int] = []
+        self._pacers: dict[tuple[str, int], Pacer] = {}
+        self._later: list[tuple[float, int]] = []  # heap of when what flies is given up
         self._bytes = 0
         self._deletable: list[int] = []
         self._database = _open(path)
@@ -133,8 +137,11 @@ class Outbox:
         )
         for key, vehicle, boot, kind, region, seq, records, size in rows:
             self._hold(key, _Entry(Stream(vehicle, boot, Kind(kind), region), seq, records, size))
-            self._ready.append(key)
+            self._pacer(self._entries[key]).wait(key)
         self._evict()
+
+    def _pacer(self, entry: _Entry) -> Pacer:
+        return self._pacers.setdefault((entry.stream.vehicle, entry.stream.region), Pacer())
 
     def _hold(self, key: int, entry: _Entry) -> None:
         self._entries[key] = entry
@@ -151,6 +158,8 @@ class Outbox:
         del sequence.held[entry.seq]
         if not sequence.held and entry.stream.boot != self.boot:
             del self._streams[entry.stream]
+        if entry.due is not None:
+            self._pacer(entry).settled()
         self._bytes -= entry.size
         self._deletable.append(key)
         return entry
@@ -165,10 +174,18 @@ class Outbox:
         held = list(self._entries.values())
         return sum(e.records for e in held if e.stream.vehicle in vehicles and kind in (None, e.stream.kind))
 
+    def stranded(self, vehicles: Collection[str]) -> int:
+        """Records in held batches of other vehicles than these: of a former name, which nobody sends."""
+        return sum(e.records for e in list(self._entries.values()) if e.stream.vehicle not in vehicles)
+
     @property
     def bytes(self) -> int:
         """Payload bytes held."""
         return self._bytes
+
+    def owed_s(self, now: float) -> float:
+        """For how long nothing was answered that was put, in the region that waits longest [s]."""
+        return max((now - pacer.owed for pacer in list(self._pacers.values()) if pacer.owed is not None), default=0.0)
 
     def store(self, drafts: Sequence[Draft], now: float) -> list[StoredBatch]:
         """Name the drafts and commit them in one transaction; nothing changes when the commit fails.
@@ -180,10 +197,16 @@ class Outbox:
             self._delete()
             held = [self._insert(draft, ahead) for draft in drafts]
         self._deletable.clear()
-        for batch in held:
-            self._hold(batch.key, _Entry(batch.stream, batch.seq, batch.records, len(batch.payload)))
-            self._postpone(batch.key, now)
+        for place, batch in enumerate(held):
+            entry = _Entry(batch.stream, batch.seq, batch.records, len(batch.payload))
+            self._hold(batch.key, entry)
             self.counts.stored += batch.records
+            pacer = self._pacer(entry)
+            if pacer.silent:
+                pacer.wait(batch.key)
+                held[place] = replace(batch, fresh=False)
+            else:
+                self._fly(batch.key, now)
         self._evict()
         return [batch for batch in held if batch.key in self._entries]
 
@@ -202,23 +225,28 @@ class Outbox:
             raise sqlite3.DatabaseError("an insert gave no row id")
         return StoredBatch(key, stream, seq, draft.records, payload)
 
-    def _postpone(self, key: int, now: float) -> None:
+    def _fly(self, key: int, now: float) -> None:
+        """A batch is put now; how long its answer is waited for."""
         entry = self._entries[key]
         delay = min(max(LONGEST_RESEND_S, self.first_resend_s), self.first_resend_s * 2.0 ** min(entry.attempts, 16))
         entry.attempts += 1
-        self._schedule(key, now + delay * self._random.uniform(1 - JITTER, 1 + JITTER))
+        entry.due = now + delay * self._jitter()
+        heapq.heappush(self._later, (entry.due, key))
+        self._pacer(entry).fly(now)
 
-    def _schedule(self, key: int, at: float) -> None:
-        """Offer a batch at a time; whatever was planned for it before no longer holds."""
-        self._entries[key].due = at
-        heapq.heappush(self._later, (at, key))
+    def _jitter(self) -> float:
+        return self._random.uniform(1 - JITTER, 1 + JITTER)
 
     def reoffer(self, vehicle: str, now: float) -> None:
-        """Offer everything of a vehicle anew within REOFFER_S, oldest first: it has just found a router again."""
-        keys = [key for key, entry in self._entries.items() if entry.stream.vehicle == vehicle]
-        for place, key in enumerate(keys):
-            self._entries[key].attempts = 0
-            self._schedule(key, now + REOFFER_S * (place + self._random.random()) / len(keys))
+        """What a vehicle had put is lost: it has just found a router again."""
+        for (name, _), pacer in self._pacers.items():
+            if name == vehicle:
+                pacer.reconnected(now)
+        for _, key in self._later:
+            entry = self._entries.get(key)
+            if entry is not None and entry.stream.vehicle == vehicle and entry.due is not None:
+                entry.due, entry.attempts = None, 0
+                self._pacer(entry).wait(key)
 
     def _evict(self) -> None:
         """Keep within the capacity: oldest state first, then oldest observation."""
@@ -246,30 +274,48 @@ class Outbox:
         sequence = self._streams.get(stream)
         if sequence is None:
             return 0
+        pacer = self._pacers.get((stream.vehicle, stream.region))
+        if pacer is not None:
+            pacer.answered()
         keys = {key for first, last in ranges for key in _within(sequence.held, first, last)}
         records = sum(self._forget(key).records for key in keys)
         self.counts.settled += records
         return records
 
-    def due(self, now: float, limit: int) -> list[StoredBatch]:
-        """At most `limit` batches whose time to be offered again has come, oldest first; each is postponed."""
+    def due(self, now: float, limit: int, vehicles: Collection[str] | None = None) -> list[StoredBatch]:
+        """At most `limit` batches to be put now, oldest first, of these vehicles or of all; `pacing` says how many.
+
+        Raises sqlite3.Error when the disk refuses.
+        """
         while self._later and self._later[0][0] <= now:
             at, key = heapq.heappop(self._later)
-            if key in self._entries and self._entries[key].due == at:
-                heapq.heappush(self._ready, key)
+            entry = self._entries.get(key)
+            if entry is not None and entry.due == at:
+                entry.due = None
+                self._pacer(entry).unanswered(now, self._jitter())
+                self._pacer(entry).wait(key)
         keys: list[int] = []
-        while self._ready and len(keys) < limit:
-            key = heapq.heappop(self._ready)
-            if key in self._entries:
-                keys.append(key)
-        for key in keys:
-            self._postpone(key, now)
-        return [self._read(key) for key in keys]
+        for (vehicle, _), pacer in self._pacers.items():
+            if vehicles is None or vehicle in vehicles:
+                taken = pacer.take(now, self._jitter(), limit - len(keys), self._entries)
+                for key in taken:
+                    self._fly(key, now)
+                keys += taken
+        self._pacers = {name: pacer for name, pacer in self._pacers.items() if not pacer.idle or pacer.silent}
+        return [batch for key in sorted(keys) if (batch := self._read(key)) is not None]
 
-    def _read(self, key: int) -> StoredBatch:
+    def held(self) -> list[StoredBatch]:
+        """All batches that are held, oldest first. Raises sqlite3.Error."""
+        return [batch for key in list(self._entries) if (batch := self._read(key)) is not None]
+
+    def _read(self, key: int) -> StoredBatch | None:
+        """A batch with its payload; None, and counted, where damage took its row."""
         entry = self._entries[key]
-        (payload,) = self._database.execute("SELECT payload FROM batch WHERE id = ?", (key,)).fetchone()
-        return StoredBatch(key, entry.stream, entry.seq, entry.records, payload)
+        row = self._database.execute("SELECT payload FROM batch WHERE id = ?", (key,)).fetchone()
+        if row is None:
+            self.counts.damaged += self._forget(key).records
+            return None
+        return StoredBatch(key, entry.stream, entry.seq, entry.records, row[0])
 
     def close(self) -> None:
         """Release the file. Raises sqlite3.Error when the disk refuses the last deletions."""

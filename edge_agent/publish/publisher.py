@@ -146,6 +146,7 @@ class Publisher:
         while not self._finished():
             self._take()
             self._settle()
+            self._look()
             self._waiting += self._batcher.due(self._clock(), everything=self._closing.is_set())
             self._store()
             try:
@@ -183,24 +184,22 @@ class Publisher:
             self.counts.published[draft.kind] += draft.records
         self._waiting = []
         for batch in batches:
-            if link := self._links.get(batch.stream.vehicle):
-                link.put(batch)
+            if batch.fresh and self._connected.get(batch.stream.vehicle):
+                self._links[batch.stream.vehicle].put(batch)
 
     def _resend(self) -> None:
-        if not self._links:
-            return
-        if self._clock() - self._checked_at >= CHECK_S:
-            self._checked_at = self._clock()
-            self._reoffer()
-        for batch in self._outbox.due(self._clock(), RESEND_LIMIT):
-            link = self._links.get(batch.stream.vehicle)
-            self.counts.resent_batches += link is not None and link.put(batch)
+        there = {name for name, connected in self._connected.items() if connected}
+        for batch in self._outbox.due(self._clock(), RESEND_LIMIT, there) if there else ():
+            self.counts.resent_batches += self._links[batch.stream.vehicle].put(batch)
 
-    def _reoffer(self) -> None:
-        """What was put while there was no router is lost: offer it anew as soon as there is one."""
+    def _look(self) -> None:
+        """Who has a router: what was put while there was none is lost, and is put anew as soon as there is one."""
+        if self._clock() - self._checked_at < CHECK_S and len(self._connected) == len(self._links):
+            return
+        self._checked_at = self._clock()
         for name, link in list(self._links.items()):
             connected = link.connected
-            if connected and not self._connected.get(name, True):
+            if connected and not self._connected.get(name, False):
                 self._outbox.reoffer(name, self._clock())
             self._connected[name] = connected
 

@@ -36,6 +36,10 @@ BARS: Final = {
     "faults.security.breaches": Bar("breaches", 0),
     "faults.flood.honest_delay_s": Bar("s", 2),
     "faults.flood.map_difference": Bar("-", 0.01),
+    "faults.away.bytes_ratio": Bar("bytes put by bytes of data", 1.5),
+    "faults.away.lost": Bar("batches", 0),
+    "faults.away.drain_share": Bar("of what the service takes", 0.8, "more"),
+    "faults.away.backlog": Bar("batches a car", 1000, "more"),
     "soak.memory_slope_mb_per_10min": Bar("MB per 10 min", 1),
     "soak.handles_growth": Bar("handles", 0),
 }

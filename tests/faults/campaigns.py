@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from tests.faults import compaction, crash_model, flood, fuzz, kill, outages, security, truncation
+from tests.faults import away, compaction, crash_model, flood, fuzz, kill, outages, security, truncation
 from tests.faults.frame import Campaign
 
 CAMPAIGNS: Final = (
@@ -18,6 +18,11 @@ CAMPAIGNS: Final = (
     ),
     Campaign("router-down", outages.router_down, ("faults.router_down.lost", "faults.router_down.recovery_s")),
     Campaign("frozen", outages.frozen, ("faults.frozen.lost", "faults.frozen.agent_deadline_misses")),
+    Campaign(
+        "away",
+        away.run,
+        ("faults.away.bytes_ratio", "faults.away.lost", "faults.away.drain_share", "faults.away.backlog"),
+    ),
     Campaign("leaving", outages.leaving, ("faults.leaving.longest_s", "faults.leaving.acknowledged_lost")),
     Campaign("disk-full", outages.disk_full, ("faults.disk_full.false_acks", "faults.disk_full.recovered")),
     Campaign("security", security.run, ("faults.security.breaches",)),

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from edge_agent.publish.batching import Draft
-from edge_agent.publish.outbox import JITTER, LONGEST_RESEND_S, REOFFER_S, Outbox, StoredBatch, Stream
+from edge_agent.publish.outbox import JITTER, Outbox, StoredBatch, Stream
+from edge_agent.publish.pacing import FIRST_WINDOW, LONGEST_PROBE_S, SILENT_S
 from schemas.errors import InputError
 from schemas.wire import Kind
 
@@ -121,26 +122,97 @@ def test_unsettled_batches_are_offered_again_oldest_first_and_less_and_less_ofte
     outbox.close()
 
 
-def test_the_wait_between_offers_is_bounded(path: Path) -> None:
-    outbox = Outbox(path, boot=BOOT, first_resend_s=1.0)
-    outbox.store([draft()], now=0.0)
-    now = 0.0
-    for _ in range(40):
-        now += LONGEST_RESEND_S * (1 + JITTER)
-        assert seqs(outbox.due(now, limit=1)) == [1]
+def silenced(outbox: Outbox, now: float = 0.0) -> float:
+    """Put a batch and let nobody answer until the route is silent; returns the time then."""
+    outbox.store([draft()], now)
+    while outbox.store([draft()], now)[0].fresh:
+        now += 0.5
+        outbox.due(now, limit=99)
+        assert now < 60.0
+    return now
+
+
+def test_while_nobody_answers_fresh_batches_stay_on_disk_and_one_is_put_as_a_probe_every_few_minutes(
+    path: Path,
+) -> None:
+    outbox = Outbox(path, boot=BOOT)
+    began = silenced(outbox)
+    assert SILENT_S <= began <= SILENT_S + 8.0
+    put = []
+    for second in range(0, 3600, 5):
+        assert not any(batch.fresh for batch in outbox.store([draft()], began + second))
+        put += [(second, batch.seq) for batch in outbox.due(began + second, limit=64)]
+    assert 10 <= len(put) <= 30
+    assert put[-1][0] - put[-2][0] <= LONGEST_PROBE_S * (1 + JITTER) + 5
+    assert len({seq for _, seq in put}) > 5  # not always the same: one may be such that nobody can answer it
     outbox.close()
 
 
-def test_after_an_outage_all_is_offered_anew_within_a_second_oldest_first_and_nothing_twice(path: Path) -> None:
+def test_the_first_answer_lets_everything_go_oldest_first_and_faster_with_each_answer(path: Path) -> None:
+    outbox = Outbox(path, boot=BOOT)
+    now = silenced(outbox)
+    for _ in range(300):
+        outbox.store([draft()], now)
+    while not (probe := outbox.due(now, limit=64)):
+        now += 1.0
+    outbox.settle(stream(), [(probe[0].seq, probe[0].seq)])
+    rounds, out = [], outbox.due(now, limit=10**6)
+    assert seqs(out) == sorted(seqs(out))
+    while out:
+        rounds.append(len(out))
+        now += 1.0
+        outbox.settle(stream(), [(batch.seq, batch.seq) for batch in out])
+        out = outbox.due(now, limit=10**6)
+    assert outbox.batches == 0
+    assert FIRST_WINDOW <= rounds[0] <= FIRST_WINDOW + 1
+    assert max(rounds) >= 2 * FIRST_WINDOW
+    assert outbox.store([draft()], now)[0].fresh
+    outbox.close()
+
+
+def test_a_region_that_nobody_serves_does_not_silence_the_others(path: Path) -> None:
+    outbox = Outbox(path, boot=BOOT)
+    now = 0.0
+    for _ in range(60):
+        batches = outbox.store([draft(), draft(region=9)], now)
+        outbox.settle(stream(), [(batches[0].seq, batches[0].seq)])
+        outbox.due(now, limit=64)
+        now += 1.0
+    assert [batch.fresh for batch in outbox.store([draft(), draft(region=9)], now)] == [True, False]
+    outbox.close()
+
+
+def test_with_a_router_again_all_that_was_put_is_put_anew_oldest_first_and_nothing_twice(path: Path) -> None:
     outbox = Outbox(path, boot=BOOT, first_resend_s=4.0)
     outbox.store([draft() for _ in range(5)] + [draft("car-b")], now=0.0)
-    assert len(outbox.due(now=4.0 * (1 + JITTER), limit=9)) == 6
-    outbox.reoffer("car-a", now=5.3)
-    offered = [seq for now in (5.5, 5.7, 5.9, 6.1, 5.3 + REOFFER_S) for seq in seqs(outbox.due(now, limit=9))]
-    assert offered == [1, 2, 3, 4, 5]
-    assert outbox.due(now=5.5 + 4.0 * (1 - JITTER) - 0.01, limit=9) == []
-    assert sorted(seqs(outbox.due(now=6.3 + 4.0 * (1 + JITTER), limit=9))) == [1, 1, 2, 3, 4, 5]  # and once the other's
+    outbox.reoffer("car-a", now=1.0)
+    assert seqs(outbox.due(now=1.0, limit=9)) == [1, 2, 3, 4, 5]
+    assert outbox.due(now=1.0, limit=9) == []
+    assert [b.stream.vehicle for b in outbox.due(now=4.0 * (1 + JITTER) - 0.01, limit=9) if b.seq == 1].count(
+        "car-a"
+    ) <= 1
     outbox.close()
+
+
+def test_with_a_router_again_a_silent_route_is_tried_at_once_with_one_batch(path: Path) -> None:
+    outbox = Outbox(path, boot=BOOT)
+    now = silenced(outbox)
+    for _ in range(12):
+        now += LONGEST_PROBE_S
+        outbox.due(now, limit=9)
+    outbox.reoffer("car-a", now)
+    assert len(outbox.due(now, limit=9)) == 1
+    outbox.close()
+
+
+def test_batches_of_a_former_name_are_not_put_and_are_told(path: Path) -> None:
+    outbox = Outbox(path, boot=BOOT)
+    outbox.store([draft("car-old", records=3), draft("car-new")], now=0.0)
+    outbox.close()
+    again = Outbox(path, boot=BOOT + 1)
+    assert [batch.stream.vehicle for batch in again.due(0.0, 9, {"car-new"})] == ["car-new"]
+    assert again.stranded({"car-new"}) == 3
+    again.close()
 
 
 def test_folders_made_for_an_outbox_are_synced_into_the_ones_above(
@@ -167,7 +239,7 @@ def test_a_full_outbox_gives_up_the_oldest_states_then_the_oldest_observations_a
     outbox.store([draft(size=1_000), draft(size=1_000)], now=0.0)
     assert outbox.counts.evicted == {Kind.STATE: 14, Kind.OBSERVATION: 1}
     assert outbox.bytes <= 4_500
-    assert seqs(outbox.due(now=9.0, limit=9)) == [2, 3, 4, 5]
+    assert seqs(outbox.due(now=2.0 * (1 + JITTER), limit=9)) == [2, 3, 4, 5]
     assert outbox.store([draft()], now=0.0)[0].payload == b"6/2"
     outbox.close()
 

@@ -1,0 +1,126 @@
+"""How fast one vehicle's batches for one region may be put: what nobody answers is not put again and again. Pure.
+
+Open, while acknowledgements come: fresh batches go at once, and of those that wait so many are in flight as a window
+allows, which grows with each that is settled and is halved when one is not answered in time (slow start and congestion
+avoidance as in Jacobson, 1988: what is lost on the way shows that somebody is overrun).
+Silent, when nothing was answered for SILENT_S: fresh batches stay on disk, and a single one is put now and then as a
+probe, after waits that double up to LONGEST_PROBE_S. The first acknowledgement opens the route again.
+Time is monotonic seconds.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Container
+from typing import Final
+
+# A service writes a segment each second and starts within some; it is not away before that.
+SILENT_S: Final = 8.0
+FIRST_PROBE_S: Final = 4.0
+LONGEST_PROBE_S: Final = 300.0  # a thousand cars then cost a service that is away three messages a second
+FIRST_WINDOW: Final = 16.0  # batches in flight; 3 kB, as much as TCP begins with
+LEAST_WINDOW: Final = 8.0  # a batch a vehicle, kind and second is put in any case
+LARGEST_WINDOW: Final = 512.0  # in a second, which is what a service takes for an answer: 100 kB
+HALVED_S: Final = 2.0  # all that is lost at once is one sign
+
+
+class Pacer:
+    """One vehicle's way to the service of one region.
+
+    Attributes:
+        flying: batches that were put and neither answered nor given up.
+        silent: whether nothing answers.
+    """
+
+    __slots__ = (
+        "_answered", "_halved", "_owed", "_probe_at", "_probe_s", "_stale", "_sure", "_turn", "_waiting", "_window",
+        "flying", "silent",
+    )  # fmt: skip
+
+    def __init__(self) -> None:
+        self.flying, self.silent = 0, False
+        self._waiting: list[int] = []  # heap of keys, and of such as are gone
+        self._window, self._sure = FIRST_WINDOW, LARGEST_WINDOW  # up to `sure` it grows fast
+        self._owed: float | None = None  # since when an answer is
+        self._halved = -float("inf")
+        self._answered = False
+        self._stale = 0  # of those that fly, put before the silence: that they are lost says nothing
+        self._probe_at, self._probe_s, self._turn = 0.0, FIRST_PROBE_S, 0
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing flies and nothing waits."""
+        return not self.flying and not self._waiting
+
+    @property
+    def owed(self) -> float | None:
+        """Since when something was put and nothing answered; None: nothing is owed."""
+        return self._owed
+
+    def wait(self, key: int) -> None:
+        """Let a batch wait for its turn; lower keys are older and go first."""
+        heapq.heappush(self._waiting, key)
+
+    def fly(self, now: float) -> None:
+        """A batch is put."""
+        self.flying += 1
+        if self._owed is None:
+            self._owed = now
+
+    def settled(self) -> None:
+        """A batch that flew was answered."""
+        self.flying -= 1
+        grown = self._window + (1.0 if self._window < self._sure else 1.0 / self._window)
+        self._window = min(grown, LARGEST_WINDOW)
+
+    def answered(self) -> None:
+        """An acknowledgement came, of whatever batch."""
+        self._answered = True
+        if self.silent:
+            self.silent, self._window, self._sure = False, FIRST_WINDOW, LARGEST_WINDOW
+            self._stale = self.flying
+
+    def unanswered(self, now: float, jitter: float) -> None:
+        """A batch that flew was not answered in time."""
+        self.flying -= 1
+        if self.silent:
+            return
+        if not self._answered and self._owed is not None and now - self._owed >= SILENT_S:
+            self.silent, self._probe_s = True, FIRST_PROBE_S
+            self._probe_at = now + jitter * self._probe_s
+        elif self._stale > 0:
+            self._stale -= 1
+        elif now - self._halved >= HALVED_S:
+            self._halved, self._window = now, max(self._window / 2.0, LEAST_WINDOW)
+            self._sure = self._window
+
+    def reconnected(self, now: float) -> None:
+        """A router is there again: what flew is lost, and a silent route is tried at once."""
+        self.flying, self._owed = 0, None
+        self._probe_at, self._probe_s = now, FIRST_PROBE_S
+
+    def take(self, now: float, jitter: float, most: int, held: Container[int]) -> list[int]:
+        """Keys of the batches to be put now, at most so many, oldest first; those not `held` are gone."""
+        if self._answered:
+            self._answered, self._owed = False, now if self.flying else None
+        if self.silent:
+            return self._probe(now, jitter, held)
+        out: list[int] = []
+        room = min(most, int(self._window) - self.flying)
+        while self._waiting and len(out) < room:
+            key = heapq.heappop(self._waiting)
+            if key in held:
+                out.append(key)
+        return out
+
+    def _probe(self, now: float, jitter: float, held: Container[int]) -> list[int]:
+        """The oldest batch and the newest in turn: one that nobody can read must not stand for all."""
+        if now < self._probe_at:
+            return []
+        self._waiting = sorted({key for key in self._waiting if key in held})
+        self._probe_s = min(2.0 * self._probe_s, LONGEST_PROBE_S)
+        self._probe_at = now + jitter * self._probe_s
+        if not self._waiting:
+            return []
+        self._turn ^= 1
+        return [self._waiting.pop(0 if self._turn else -1)]
