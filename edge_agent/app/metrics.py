@@ -11,6 +11,8 @@ from schemas.runtime.metrics import Metric, gauge
 from schemas.wire import Kind
 
 BEHIND_S: Final = 1.0  # of real time, from which on the agent is too slow for its vehicles
+OWED_S: Final = 60.0  # without any answer: longer than a service takes to start again
+FULL: Final = 0.9  # of the outbox
 _NAMES: Final = {Kind.OBSERVATION: "observation", Kind.STATE: "state"}
 
 
@@ -24,6 +26,12 @@ def metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
         Metric("dropped_records", "counter", "given up for want of room", {"": publisher.dropped}),
         Metric("resent_batches", "counter", "sent again", {"": counts.resent_batches}),
         Metric("bad_acks", "counter", "acknowledgements that could not be read", {"": counts.bad_acks}),
+        Metric("damaged_spools", "counter", "times that the outbox was found damaged", {"": publisher.damage[0]}),
+        Metric("damaged_records", "counter", "known to be lost by damage of the outbox", {"": publisher.damage[1]}),
+        Metric("sender_failures", "counter", "rounds of the sending thread that failed", {"": counts.failures}),
+        gauge("stranded_records", "in the outbox under a name that is no longer used", publisher.stranded),
+        gauge("unanswered_seconds", "since something was put that nobody answers", publisher.owed_s),
+        gauge("outbox_fill", "share of the outbox that is full", publisher.fill),
         gauge("unsettled_records", "neither acknowledged nor rejected yet", publisher.unsettled()),
         gauge("sessions", "sessions that are open", publisher.links),
         gauge("blocks_behind", "blocks that were worked off too late", progress.behind),
@@ -35,6 +43,14 @@ def metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
 def troubles(publisher: Publisher, progress: Progress) -> list[str]:
     """What is not as it should be."""
     found = [] if publisher.links else ["no session is open"]
+    if publisher.cut_off:
+        found.append("a session has no router")
+    if publisher.owed_s > OWED_S:
+        found.append(f"nothing was acknowledged for {publisher.owed_s:.0f} s")
+    if publisher.fill > FULL:
+        found.append("the outbox is full: the oldest states go first")
+    if publisher.stranded:
+        found.append(f"{publisher.stranded} records are kept under a former name; run once with --name as it was")
     if publisher.broken:
         found.append("the thread that sends has died; start the agent again")
     if progress.now_s > BEHIND_S:

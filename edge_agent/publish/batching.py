@@ -58,9 +58,11 @@ class Batcher:
         return sum(group.rows for group in self._groups.values())
 
     def add(self, records: RecordBlock, now: float) -> None:
-        """Take records in; rows of one vehicle and region keep their order."""
+        """Take records; rows of one vehicle and region keep their order. IndexError for an unknown vehicle."""
         if not len(records.vehicle):
             return
+        if records.vehicle.min() < 0 or records.vehicle.max() >= len(self._names):
+            raise IndexError("records of a vehicle that has no name")
         columns = records.columns
         if records.kind is Kind.OBSERVATION:
             cells = columns["cell"]

@@ -22,10 +22,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
+from edge_agent.publish import spool_file
 from edge_agent.publish.batching import Draft
 from edge_agent.publish.pacing import Pacer
-from schemas.errors import InputError
-from schemas.runtime.durable import make_folder
 from schemas.wire import Kind
 
 BOOT_LIMIT = 2**63  # boot fits a signed 64-bit column
@@ -34,16 +33,6 @@ LONGEST_RESEND_S = 6.0  # for an answer of a service that does answer; see `paci
 JITTER = 0.25  # share of the delay, either way: agents that lost one router do not return in step
 DEFAULT_CAPACITY_BYTES = 256 * 2**20  # some days of one vehicle at a batch per second and kind
 EVICTION_ORDER = (Kind.STATE, Kind.OBSERVATION)  # an old state is worth least, an observation most
-
-_SCHEMA = """
-CREATE TABLE IF NOT EXISTS batch (
-    id INTEGER PRIMARY KEY AUTOINCREMENT,
-    vehicle TEXT NOT NULL, boot INTEGER NOT NULL, kind TEXT NOT NULL, region INTEGER NOT NULL, seq INTEGER NOT NULL,
-    records INTEGER NOT NULL, payload BLOB NOT NULL,
-    UNIQUE (vehicle, boot, kind, region, seq)
-);
-CREATE INDEX IF NOT EXISTS batch_age ON batch (kind, id);
-"""
 
 
 class Stream(NamedTuple):
@@ -74,7 +63,8 @@ class OutboxCounts:
     stored: int = 0
     settled: int = 0
     evicted: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(EVICTION_ORDER, 0))
-    damaged: int = 0
+    damaged: int = 0  # records that damage took, as far as it is known
+    damages: int = 0  # times that the file was found damaged
 
 
 @dataclass(slots=True)
@@ -127,7 +117,9 @@ class Outbox:
         self._later: list[tuple[float, int]] = []  # heap of when what flies is given up
         self._bytes = 0
         self._deletable: list[int] = []
-        self._database = _open(path)
+        self._path = path
+        self._database, aside = spool_file.open_file(path)
+        self.counts.damages += aside is not None
         self._restore()
 
     def _restore(self) -> None:
@@ -139,6 +131,23 @@ class Outbox:
             self._hold(key, _Entry(Stream(vehicle, boot, Kind(kind), region), seq, records, size))
             self._pacer(self._entries[key]).wait(key)
         self._evict()
+
+    def mend(self) -> None:
+        """Go on in a new file with what can be read of the present one, which is damaged.
+
+        Raises sqlite3.Error or OSError when the disk refuses; then it can be done again.
+        """
+        self._database.close()
+        before = sum(entry.records for entry in self._entries.values())
+        self._database, _ = spool_file.mended(self._path)
+        self.counts.damages += 1
+        own = {stream: sequence for stream, sequence in self._streams.items() if stream.boot == self.boot}
+        for sequence in own.values():
+            sequence.held.clear()
+        self._entries, self._oldest, self._streams = {}, {kind: {} for kind in Kind}, own
+        self._pacers, self._later, self._deletable, self._bytes = {}, [], [], 0
+        self._restore()
+        self.counts.damaged += max(before - sum(entry.records for entry in self._entries.values()), 0)
 
     def _pacer(self, entry: _Entry) -> Pacer:
         return self._pacers.setdefault((entry.stream.vehicle, entry.stream.region), Pacer())
@@ -215,9 +224,10 @@ class Outbox:
         known = self._streams.get(stream, _Sequence())
         seq = ahead.get(stream, known.next)
         payload = draft.encode(seq, known.first_held())
-        row = (*stream, seq, draft.records, payload)
+        name = (stream.vehicle, stream.boot, str(stream.kind), stream.region, seq, draft.records)
         cursor = self._database.execute(
-            "INSERT INTO batch (vehicle, boot, kind, region, seq, records, payload) VALUES (?, ?, ?, ?, ?, ?, ?)", row
+            f"INSERT INTO batch ({spool_file.NAME}, payload, checksum) VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+            (*name, payload, spool_file.checksum(name, payload)),
         )
         ahead[stream] = seq + 1
         key = cursor.lastrowid
@@ -311,11 +321,12 @@ class Outbox:
     def _read(self, key: int) -> StoredBatch | None:
         """A batch with its payload; None, and counted, where damage took its row."""
         entry = self._entries[key]
-        row = self._database.execute("SELECT payload FROM batch WHERE id = ?", (key,)).fetchone()
-        if row is None:
+        query = f"SELECT {spool_file.NAME}, payload, checksum FROM batch WHERE id = ?"
+        row = self._database.execute(query, (key,)).fetchone()
+        if row is None or (row[-1] is not None and spool_file.checksum(row[:6], row[6]) != row[-1]):
             self.counts.damaged += self._forget(key).records
             return None
-        return StoredBatch(key, entry.stream, entry.seq, entry.records, row[0])
+        return StoredBatch(key, entry.stream, entry.seq, entry.records, row[6])
 
     def close(self) -> None:
         """Release the file. Raises sqlite3.Error when the disk refuses the last deletions."""
@@ -330,22 +341,3 @@ def _within(held: dict[int, int], first: int, last: int) -> list[int]:
     if last - first < len(held):
         return [held[seq] for seq in range(first, last + 1) if seq in held]
     return [key for seq, key in held.items() if first <= seq <= last]
-
-
-def _open(path: Path) -> sqlite3.Connection:
-    database: sqlite3.Connection | None = None
-    try:
-        make_folder(path.parent)
-        database = sqlite3.connect(path, timeout=0.0, check_same_thread=False)
-        database.execute("PRAGMA locking_mode = EXCLUSIVE")
-        database.execute("PRAGMA journal_mode = WAL")
-        database.execute("PRAGMA synchronous = FULL")
-        database.executescript(f"BEGIN EXCLUSIVE; {_SCHEMA} COMMIT;")
-    except (sqlite3.Error, OSError) as error:
-        if database is not None:
-            database.close()
-        if isinstance(error, sqlite3.OperationalError) and "locked" in str(error):
-            raise InputError("spool", f"{path} is used by another agent", "give each agent its own") from error
-        problem = f"{path} cannot be opened ({error})"
-        raise InputError("spool", problem, "name a writable place, or move the file aside") from error
-    return database

@@ -19,6 +19,7 @@ from typing import Final
 from edge_agent.observe.observation_builder import RecordBlock
 from edge_agent.publish.batching import Batcher, Draft
 from edge_agent.publish.outbox import Outbox, Stream
+from edge_agent.publish.spool_file import is_damage
 from edge_agent.publish.zenoh_link import Link
 from schemas.config import AgentConfig
 from schemas.errors import WireError
@@ -45,6 +46,7 @@ class Counts:
     dropped: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
     resent_batches: int = 0
     bad_acks: int = 0
+    failures: int = 0  # of the sending thread, which goes on
 
 
 class Publisher:
@@ -82,6 +84,31 @@ class Publisher:
     def links(self) -> int:
         """Sessions that are open."""
         return len(self._links)
+
+    @property
+    def cut_off(self) -> bool:
+        """Whether a session that is open has no router."""
+        return not all(list(self._connected.values()))
+
+    @property
+    def owed_s(self) -> float:
+        """For how long nothing was answered that was put [s]."""
+        return self._outbox.owed_s(self._clock())
+
+    @property
+    def stranded(self) -> int:
+        """Records in the outbox under names that are not these vehicles': of a former name."""
+        return self._outbox.stranded(self._names)
+
+    @property
+    def fill(self) -> float:
+        """Share of the outbox that is full."""
+        return self._outbox.bytes / self._outbox.capacity_bytes
+
+    @property
+    def damage(self) -> tuple[int, int]:
+        """How often the outbox was found damaged, and the records known to be lost by it."""
+        return self._outbox.counts.damages, self._outbox.counts.damaged
 
     @property
     def broken(self) -> bool:
@@ -144,16 +171,34 @@ class Publisher:
 
     def _send(self) -> None:
         while not self._finished():
-            self._take()
-            self._settle()
-            self._look()
-            self._waiting += self._batcher.due(self._clock(), everything=self._closing.is_set())
-            self._store()
             try:
-                self._outbox.delete_settled()
-                self._resend()
+                self._round()
             except sqlite3.Error as error:
-                log.warning("the outbox cannot be read or tidied (%s); trying again", error)
+                if is_damage(error):
+                    self._mend()
+                else:
+                    log.warning("the outbox cannot be read or tidied (%s); trying again", error)
+                self._stopped.wait(TICK_S)
+            except Exception:  # whatever it is: estimation goes on, and so must this thread
+                self.counts.failures += 1
+                log.exception("a round of sending failed; going on")
+                self._stopped.wait(TICK_S)
+
+    def _round(self) -> None:
+        self._take()
+        self._settle()
+        self._look()
+        self._waiting += self._batcher.due(self._clock(), everything=self._closing.is_set())
+        self._store()
+        self._outbox.delete_settled()
+        self._resend()
+
+    def _mend(self) -> None:
+        """The outbox is damaged while it is in use: save what can be read, and go on."""
+        try:
+            self._outbox.mend()
+        except (sqlite3.Error, OSError) as error:
+            log.warning("the damaged outbox cannot be mended (%s); trying again", error)
 
     def _finished(self) -> bool:
         if not self._closing.is_set():
@@ -162,11 +207,19 @@ class Publisher:
 
     def _take(self) -> None:
         try:
-            self._batcher.add(self._offered.get(timeout=TICK_S), self._clock())
+            self._add(self._offered.get(timeout=TICK_S))
             while True:
-                self._batcher.add(self._offered.get_nowait(), self._clock())
+                self._add(self._offered.get_nowait())
         except queue.Empty:
             return
+
+    def _add(self, records: RecordBlock) -> None:
+        try:
+            self._batcher.add(records, self._clock())
+        except Exception:
+            self.counts.failures += 1
+            self.counts.dropped[records.kind] += len(records.vehicle)
+            log.exception("%d records that nobody can send are dropped", len(records.vehicle))
 
     def _store(self) -> None:
         """Commit what waits, then put it. A disk that refuses is tried again with the next round."""
@@ -179,6 +232,12 @@ class Publisher:
             for draft in self._waiting[:-WAITING_LIMIT]:
                 self.counts.dropped[draft.kind] += draft.records
             self._waiting = self._waiting[-WAITING_LIMIT:]
+            if is_damage(error):
+                raise
+            return
+        except Exception:
+            log.exception("a batch cannot be written")
+            self._drop_unwritable()
             return
         for draft in self._waiting:
             self.counts.published[draft.kind] += draft.records
@@ -186,6 +245,18 @@ class Publisher:
         for batch in batches:
             if batch.fresh and self._connected.get(batch.stream.vehicle):
                 self._links[batch.stream.vehicle].put(batch)
+
+    def _drop_unwritable(self) -> None:
+        """Give up the drafts that protobuf refuses, and no other."""
+        waiting, self._waiting = self._waiting, []
+        for draft in waiting:
+            try:
+                draft.encode(1, 1)
+            except Exception:  # noqa: BLE001 whatever it is, the others must go
+                self.counts.failures += 1
+                self.counts.dropped[draft.kind] += draft.records
+            else:
+                self._waiting.append(draft)
 
     def _resend(self) -> None:
         there = {name for name, connected in self._connected.items() if connected}

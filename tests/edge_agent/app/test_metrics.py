@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
-import pytest
+import numpy as np
 
 from edge_agent.app import metrics
 from edge_agent.app.live_loop import Progress
+from edge_agent.publish.outbox import Outbox
+from edge_agent.publish.publisher import Publisher
 from schemas.wire import Kind
-from tests.edge_agent.publish.test_publisher import drive, publisher_of, settings
+from tests.edge_agent.publish.test_publisher import NAMES, drive, publisher_of, settings
 from tests.edge_agent.service import Router, Service
 from tests.waiting import until
 
@@ -32,15 +35,39 @@ def test_an_agent_shows_what_was_settled_and_what_waits(router: Router, service:
     assert (shown("unsettled_records"), shown("rejected_records", Kind.STATE.name.lower())) == (0, 0)
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_an_agent_whose_sender_has_died_is_in_trouble(tmp_path: Path, router: Router) -> None:
+def test_what_nobody_can_send_is_dropped_and_counted_and_the_rest_goes_on(
+    tmp_path: Path, router: Router, service: Service
+) -> None:
     publisher = publisher_of(settings(router, tmp_path))
-    until(lambda: publisher.links == 3)
-    assert metrics.troubles(publisher, Progress()) == []
-    observations, _ = drive()
+    observations, states = drive()
     publisher.offer(observations._replace(vehicle=observations.vehicle + 1000))  # nobody has this number
-    until(lambda: metrics.troubles(publisher, Progress()))
-    assert metrics.troubles(publisher, Progress()) == ["the thread that sends has died; start the agent again"]
+    strange = states.columns | {"health": np.full(len(states.vehicle), 1 << 40)}  # no 32 bits
+    publisher.offer(states._replace(columns=strange), observations)
+    until(lambda: publisher.counts.acknowledged[Kind.OBSERVATION] == len(observations.vehicle))
+    assert publisher.counts.dropped == {
+        Kind.OBSERVATION: len(observations.vehicle), Kind.STATE: len(states.vehicle)
+    }  # fmt: skip
+    assert publisher.counts.failures > 1
+    assert not publisher.broken
+    assert publisher.close(within_s=5.0)
+
+
+def test_an_agent_that_nobody_answers_or_whose_outbox_is_full_is_in_trouble(tmp_path: Path, router: Router) -> None:
+    late: list[float] = []
+    config = settings(router, tmp_path)
+    publisher = Publisher(
+        NAMES, Outbox(config.spool, capacity_bytes=40_000), config, "test",
+        clock=lambda: time.monotonic() + sum(late),
+    )  # fmt: skip
+    publisher.start()
+    for seed in range(6):
+        publisher.offer(*drive(seed))
+    until(lambda: publisher.fill > metrics.FULL)
+    until(lambda: publisher.owed_s > 0.0)
+    late.append(metrics.OWED_S)
+    found = metrics.troubles(publisher, Progress())
+    assert any(text.startswith("nothing was acknowledged for 6") for text in found)
+    assert "the outbox is full: the oldest states go first" in found
     publisher.close(within_s=0.0)
 
 

@@ -1,0 +1,133 @@
+"""The SQLite file of an outbox: opened for one agent alone; a damaged one is set aside, and what is readable saved.
+
+A batch carries a checksum of its name and its bytes, since SQLite does not notice a bit that changed within them.
+"""
+
+from __future__ import annotations
+
+import logging
+import sqlite3
+import zlib
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+from edge_agent.publish import salvage
+from schemas.errors import InputError
+from schemas.runtime.durable import make_folder, sync_directory
+
+log = logging.getLogger(__name__)
+SCHEMA: Final = """
+CREATE TABLE IF NOT EXISTS batch (
+    id INTEGER PRIMARY KEY AUTOINCREMENT,
+    vehicle TEXT NOT NULL, boot INTEGER NOT NULL, kind TEXT NOT NULL, region INTEGER NOT NULL, seq INTEGER NOT NULL,
+    records INTEGER NOT NULL, payload BLOB NOT NULL, checksum INTEGER,
+    UNIQUE (vehicle, boot, kind, region, seq)
+);
+CREATE INDEX IF NOT EXISTS batch_age ON batch (kind, id);
+"""
+NAME: Final = "vehicle, boot, kind, region, seq, records"
+DAMAGED: Final = "damaged"  # ending of a file set aside; with a number
+_MAGIC: Final = b"SQLite format 3\0"
+_SIMILAR: Final = 12  # of its bytes: another file that begins so is none of ours, and is left alone
+TYPES: Final = (object, str, int, str, int, int, int, bytes, int | None)  # of the columns; the id is the row's own
+_CORRUPT: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+
+Row = tuple[object, ...]
+
+
+def checksum(name: Row, payload: bytes) -> int:
+    """CRC-32 of a batch's name (the columns NAME) and bytes."""
+    return zlib.crc32(payload, zlib.crc32(repr(name).encode()))
+
+
+def is_damage(error: sqlite3.Error) -> bool:
+    """Whether an error says that the file is damaged, and not that the disk is full or slow."""
+    return getattr(error, "sqlite_errorcode", 0) & 0xFF in _CORRUPT
+
+
+def open_file(path: Path) -> tuple[sqlite3.Connection, Path | None]:
+    """The file, checked and for this process alone; and where a damaged one was set aside, from which it was saved.
+
+    Raises:
+        InputError: the file is another agent's or no outbox, or the place cannot be used.
+    """
+    try:
+        make_folder(path.parent)
+        try:
+            return _opened(path), None
+        except sqlite3.DatabaseError as error:
+            if not is_damage(error) or not _ours(path):
+                raise
+            log.warning("the outbox %s is damaged (%s): set aside, and what can be read is saved", path, error)
+            return mended(path)
+    except (sqlite3.Error, OSError) as error:
+        if isinstance(error, sqlite3.OperationalError) and "locked" in str(error):
+            raise InputError("spool", f"{path} is used by another agent", "give each agent its own") from error
+        problem = f"{path} cannot be opened ({error})"
+        raise InputError("spool", problem, "name a writable place, or move the file aside") from error
+
+
+def mended(path: Path) -> tuple[sqlite3.Connection, Path]:
+    """A new file with what can be read of a damaged one, which is set aside.
+
+    Raises sqlite3.Error or OSError when the disk refuses.
+    """
+    aside = next(p for n in range(1, 10_000) if not (p := path.with_name(f"{path.name}.{DAMAGED}-{n}")).exists())
+    for ending in ("-wal", "-shm", ""):  # its name last: a crash in between leaves it to be found damaged again
+        with suppress(FileNotFoundError):
+            path.with_name(path.name + ending).rename(aside.with_name(aside.name + ending))
+    sync_directory(path.parent)
+    database = _opened(path)
+    saved = 0
+    with database:
+        for row in _readable(aside):
+            database.execute(
+                f"INSERT OR IGNORE INTO batch (id, {NAME}, payload, checksum) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", row
+            )
+            saved += 1
+    log.warning("%d batches were saved from %s", saved, aside)
+    return database, aside
+
+
+def _opened(path: Path) -> sqlite3.Connection:
+    database = sqlite3.connect(path, timeout=0.0, check_same_thread=False)
+    try:
+        database.execute("PRAGMA locking_mode = EXCLUSIVE")
+        database.execute("PRAGMA journal_mode = WAL")
+        database.execute("PRAGMA synchronous = FULL")
+        database.executescript(f"BEGIN EXCLUSIVE; {SCHEMA} COMMIT;")
+        if "checksum" not in {row[1] for row in database.execute("PRAGMA table_info(batch)")}:
+            database.execute("ALTER TABLE batch ADD COLUMN checksum INTEGER")
+            database.commit()
+        (verdict,) = database.execute("PRAGMA integrity_check(1)").fetchone()
+        if verdict != "ok":
+            error = sqlite3.DatabaseError(str(verdict).splitlines()[0])
+            error.sqlite_errorcode = sqlite3.SQLITE_CORRUPT
+            raise error
+    except BaseException:
+        database.close()
+        raise
+    return database
+
+
+def _ours(path: Path) -> bool:
+    """Whether a file was an outbox: its beginning is SQLite's but for a few bytes, or all of it is gone."""
+    with path.open("rb") as file:
+        begin = file.read(len(_MAGIC))
+    return not any(begin) or sum(a == b for a, b in zip(begin, _MAGIC, strict=False)) >= _SIMILAR
+
+
+def _readable(path: Path) -> list[Row]:
+    """Batches of a damaged file by age, each once, whose checksum is right, or who are older than checksums."""
+    log_file = path.with_name(f"{path.name}-wal")
+    found: dict[int, Row] = {}
+    for key, values in salvage.rows(path.read_bytes(), log_file.read_bytes() if log_file.exists() else b""):
+        values += [None] * (len(TYPES) - len(values))
+        if len(values) != len(TYPES) or not all(isinstance(v, t) for v, t in zip(values[1:], TYPES[1:], strict=True)):
+            continue
+        name, payload, given = tuple(values[1:7]), values[7], values[8]
+        assert isinstance(payload, bytes)
+        if given is None or given == checksum(name, payload):
+            found.setdefault(key, (key, *values[1:]))
+    return [found[key] for key in sorted(found)]

@@ -1,0 +1,103 @@
+"""A damaged spool: set aside, what is readable saved, the car goes on, and it is counted."""
+
+from __future__ import annotations
+
+import random
+import sqlite3
+from pathlib import Path
+
+import pytest
+
+from edge_agent.publish.batching import Draft
+from edge_agent.publish.outbox import Outbox, StoredBatch
+from schemas.errors import InputError
+from schemas.wire import Kind
+
+PAGE = 4096
+BATCHES = 120
+
+
+def stored(path: Path) -> dict[int, bytes]:
+    """Some hundred batches on disk, by seq."""
+    random_ = random.Random(7)
+    payloads = [random_.randbytes(random_.choice((60, 190, 900))) for _ in range(BATCHES)]
+    outbox = Outbox(path, boot=5)
+    outbox.store([Draft("car-a", Kind.OBSERVATION, 77, 2, lambda s, f, p=p: p) for p in payloads], 0.0)  # type: ignore[misc]
+    outbox.close()
+    return dict(enumerate(payloads, 1))
+
+
+def found(batches: list[StoredBatch]) -> dict[int, bytes]:
+    return {batch.seq: batch.payload for batch in batches}
+
+
+def test_with_any_page_gone_the_car_goes_on_and_most_of_its_batches_are_saved(tmp_path: Path) -> None:
+    whole = stored(tmp_path / "whole.sqlite")
+    image = (tmp_path / "whole.sqlite").read_bytes()
+    noticed, least = 0, BATCHES
+    pages = len(image) // PAGE
+    for page in [*range(8), *range(8, pages, 3)]:
+        folder = tmp_path / str(page)
+        folder.mkdir()
+        path = folder / "spool.sqlite"
+        path.write_bytes(image[: page * PAGE] + bytes(PAGE) + image[(page + 1) * PAGE :])
+        outbox = Outbox(path, boot=6)
+        noticed += outbox.counts.damages
+        held = found(outbox.held())
+        assert held.items() <= whole.items(), "a batch is not what was stored"
+        least = min(least, len(held))
+        assert outbox.store([Draft("car-a", Kind.STATE, 77, 1, lambda s, f: b"goes on")], 0.0)[0].seq == 1
+        outbox.close()
+        assert len(list(folder.glob("spool.sqlite.damaged-*"))) == outbox.counts.damages
+    assert noticed > pages // 5
+    assert least > BATCHES // 2
+
+
+def test_a_bit_that_flips_within_a_batch_is_noticed(tmp_path: Path) -> None:
+    path, random_ = tmp_path / "spool.sqlite", random.Random(3)
+    whole = stored(path)
+    image = bytearray(path.read_bytes())
+    places = [image.find(whole[seq]) + random_.randrange(60) for seq in (20, 70, 110)]
+    for place in places:
+        image[place] ^= 1 << random_.randrange(8)
+    path.write_bytes(image)
+    outbox = Outbox(path, boot=6)
+    held = found(outbox.held())
+    assert held == {seq: payload for seq, payload in whole.items() if seq not in (20, 70, 110)}
+    assert outbox.counts.damaged == 6
+    outbox.close()
+
+
+def test_damage_while_it_is_in_use_is_mended_and_names_go_on(tmp_path: Path) -> None:
+    path = tmp_path / "spool.sqlite"
+    stored(path)
+    outbox = Outbox(path, boot=6)
+    draft = Draft("car-a", Kind.OBSERVATION, 77, 2, lambda s, f: b"mine")
+    first = outbox.store([draft, draft], 0.0)
+    outbox.settle(first[0].stream, [(1, 2)])
+    outbox.delete_settled()
+    outbox.mend()
+    assert outbox.counts.damages == 1
+    assert outbox.store([draft], 1.0)[0].seq == 3
+    assert outbox.batches == BATCHES + 1
+    outbox.close()
+
+
+def test_an_outbox_of_a_former_version_has_no_checksums_and_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "spool.sqlite"
+    whole = stored(path)
+    with sqlite3.connect(path) as database:
+        database.execute("ALTER TABLE batch DROP COLUMN checksum")
+    database.close()
+    outbox = Outbox(path, boot=6)
+    assert found(outbox.held()) == whole
+    assert outbox.counts.damages == 0
+    outbox.close()
+
+
+def test_another_file_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "spool.sqlite"
+    path.write_bytes(b"SQLite is what my shopping list is about" * 100)
+    with pytest.raises(InputError, match="cannot be opened"):
+        Outbox(path)
+    assert [p.name for p in tmp_path.iterdir()] == ["spool.sqlite"]
