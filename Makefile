@@ -54,8 +54,9 @@ spark-test: setup  ## Spark beside DuckDB; installs it, wants a Java
 tune: setup  ## the ant colony over the memberships; writes the shipped file anew
 	$(BIN)/edge-agent tune --out edge_agent/app/tuned/aco-fckf.json
 
-proto: setup  ## generate the message module from the .proto
+proto: setup  ## generate the message modules from the .proto files
 	$(BIN)/python -m grpc_tools.protoc -I schemas/proto --python_out=schemas/proto --pyi_out=schemas/proto gripmap.proto
+	cd edge_agent/inputs/live/kuksa && $(CURDIR)/$(BIN)/python -m grpc_tools.protoc -I . --python_out=. --pyi_out=. broker.proto
 
 lock: setup  ## write the installed versions to constraints.txt
 	$(BIN)/python -m pip freeze --exclude-editable --exclude gripmap > constraints.txt

@@ -33,7 +33,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "estimators": {"dynamics", "filters", "adaptation"},
         "observe": {"inputs", "estimators"},
         "publish": {"observe"},
-        "app": {"inputs", "adaptation", "estimators", "observe", "publish"},
+        "app": {"inputs", "calibration", "adaptation", "estimators", "observe", "publish"},
         "lab": {"inputs", "calibration", "dynamics", "filters", "adaptation", "estimators", "observe", "app"},
         "cli": {"inputs", "calibration", "adaptation", "estimators", "observe", "publish", "app", "lab"},
     },

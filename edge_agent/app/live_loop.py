@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from edge_agent.inputs.block import Block
+from edge_agent.observe.observation_builder import RecordBlock
 from edge_agent.observe.pipeline import Pipeline
 from edge_agent.publish.publisher import Publisher
 from schemas.wire import Kind
@@ -23,13 +24,17 @@ ENDED_DRAIN_S = 10.0  # at its own end it may wait for a busy service
 
 @dataclass
 class Progress:
-    """How far the loop is: seconds of signals, blocks, blocks that were behind, the longest and the last lag [s]."""
+    """How far the loop is: seconds of signals, blocks, blocks that were behind, the longest and the last lag [s].
+
+    `held` counts records that were not published, since nobody vouches for the signals that they were made of.
+    """
 
     signals_s: float = 0.0
     blocks: int = 0
     behind: int = 0
     lag_s: float = 0.0
     now_s: float = 0.0
+    held: int = 0
 
 
 def drive(
@@ -42,16 +47,18 @@ def drive(
     duration_s: float = float("inf"),
     clock: Callable[[], float] = time.monotonic,
     progress: Progress | None = None,
+    admitted: Callable[[], bool] = lambda: True,
 ) -> Progress:
     """Run until the blocks end, `duration_s` has passed or `stop` is set; then close the open visits.
 
-    `progress` is kept up to date while it runs, for others to look at, and returned.
+    `progress` is kept up to date while it runs, for others to look at, and returned. Records of blocks that are not
+    `admitted` are held back, and counted.
     """
     progress, status_at = progress or Progress(), STATUS_EVERY_S
     started = first = float("nan")
     for block in blocks:
         _, observations, states = pipeline.step(block)
-        publisher.offer(observations, states)
+        _offer(publisher, progress, admitted(), observations, states)
         if not progress.blocks:
             started, first = clock(), float(block.t.min())  # the first block may have had to load kernels
         length = float(block.t.max()) - first - progress.signals_s
@@ -66,8 +73,15 @@ def drive(
             status_at += STATUS_EVERY_S
             on_status(progress)
     if (last := pipeline.finish()) is not None:
-        publisher.offer(last)
+        _offer(publisher, progress, admitted(), last)
     return progress
+
+
+def _offer(publisher: Publisher, progress: Progress, admitted: bool, *records: RecordBlock) -> None:
+    if admitted:
+        publisher.offer(*records)
+    else:
+        progress.held += sum(len(block.vehicle) for block in records)
 
 
 def summary(progress: Progress, publisher: Publisher) -> dict[str, float]:
@@ -79,6 +93,7 @@ def summary(progress: Progress, publisher: Publisher) -> dict[str, float]:
         "unsettled": publisher.unsettled(),
         "rejected": sum(counts.rejected.values()),
         "dropped": publisher.dropped,
+        "held": progress.held,
         "behind": progress.behind,
         "blocks": progress.blocks,
         "lag_s": round(progress.lag_s, 3),

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -37,6 +37,9 @@ FLOOR: Final = {"radius": 0.0008, "ax": 0.10, "ay": 0.05, "yaw_rate": 0.0015, "s
 BIAS: Final = {"radius": 0.0007, "ax": 0.06, "ay": 0.25, "yaw_rate": 0.0005, "steer_offset": 0.0006,
                "steer_gain": 0.04, "understeer": 0.0010}  # fmt: skip
 
+DriveEstimates: TypeAlias = dict[str, float]
+"""Estimates of one drive, by quantity."""
+
 
 def learn(drives: Sequence[tuple[FloatArray, FloatArray]], vehicle: Vehicle) -> Calibration:
     """Calibration of a vehicle from its drives, (t (T,), signals (T, 18)) each.
@@ -44,16 +47,36 @@ def learn(drives: Sequence[tuple[FloatArray, FloatArray]], vehicle: Vehicle) -> 
     Raises:
         InputError: none of them is excited enough.
     """
-    estimates: dict[str, list[float]] = {}
-    for t, signals in drives:
-        for name, value in one_drive(prepare(t, signals, vehicle), vehicle).items():
-            estimates.setdefault(name, []).append(value)
-    if not estimates:
+    calibration = weighed([one_drive(prepare(t, signals, vehicle), vehicle) for t, signals in drives])
+    if calibration is None:
         raise InputError(
             "log", "no drive is excited enough to learn from", "give drives with turns, straights, braking"
         )
+    return calibration
+
+
+def weighed(drives: Sequence[DriveEstimates]) -> Calibration | None:
+    """Means over several drives with standard deviations; None where no drive was excited."""
+    estimates: dict[str, list[float]] = {}
+    for drive in drives:
+        for name, value in drive.items():
+            estimates.setdefault(name, []).append(value)
+    if not estimates:
+        return None
     learned = {name: _mean(name, np.array(values)) for name, values in estimates.items()}
     return Calibration.model_validate({"drives": len(drives), **learned})
+
+
+def surer(one: Calibration | None, other: Calibration | None) -> Calibration | None:
+    """Of each quantity, the value with the smaller standard deviation of two calibrations of a car."""
+    if one is None or other is None:
+        return one or other
+    better = {
+        name: mine for name in Calibration.model_fields
+        if isinstance(mine := getattr(one, name), tuple)
+        and ((its := getattr(other, name)) is None or mine[1] < its[1])
+    }  # fmt: skip
+    return other.model_copy(update={**better, "drives": max(one.drives, other.drives)})
 
 
 def _mean(name: str, values: FloatArray) -> tuple[float, float]:
@@ -63,10 +86,10 @@ def _mean(name: str, values: FloatArray) -> tuple[float, float]:
     return round(centre, 6), round(float(np.hypot(spread / np.sqrt(len(values)), BIAS[kind])), 6)
 
 
-def one_drive(drive: EvenDrive, vehicle: Vehicle) -> dict[str, float]:
+def one_drive(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
     """Estimates of one drive, by quantity; those it was not excited for are left out."""
     moving, axle = drive.moving > 0, fits(drive)["axle"]
-    quantities: dict[str, float] = {}
+    quantities: DriveEstimates = {}
     if axle.known and axle.error < 0.1:
         quantities["yaw_rate"] = -axle.offset / axle.gain
         drive = replace(drive, r=drive.r - quantities["yaw_rate"])  # else taken for offsets of steering and a_y

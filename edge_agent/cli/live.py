@@ -37,8 +37,14 @@ def drive_live(
     estimator: str | None,
     duration_s: float,
     at_end: Callable[[], None] = lambda: None,
+    *,
+    admitted: Callable[[], bool] = lambda: True,
+    troubled: Callable[[], list[str]] = list,
 ) -> int:
-    """Drive in real time, do what is due `at_end`, take leave; prints a line of counts and returns 0."""
+    """Drive in real time, do what is due `at_end`, take leave; prints a line of counts and returns 0.
+
+    What is learned while not `admitted` is not published; `troubled` tells what is wrong with the sources.
+    """
     chosen = estimator or config.estimator
     log_as(config.log, sys.stderr)
     _warm_up(chosen, vehicles[0], config)
@@ -49,7 +55,7 @@ def drive_live(
             config.metrics_host,
             config.metrics_port,
             lambda: [metric for publisher in running for metric in metrics(publisher, progress)],
-            lambda: troubles(running[0], progress) if running else ["the agent is starting"],
+            lambda: [*troubles(running[0], progress), *troubled()] if running else ["the agent is starting"],
         ) as address,
     ):
         if address:
@@ -58,7 +64,9 @@ def drive_live(
         publisher = publisher_of(names, config, chosen)
         running.append(publisher)
         report = partial(status, publisher=publisher, log_line=line_logger(config.log, sys.stderr))
-        drive(blocks, pipeline, publisher, stop, report, duration_s=duration_s, progress=progress)
+        drive(
+            blocks, pipeline, publisher, stop, report, duration_s=duration_s, progress=progress, admitted=admitted
+        )  # fmt: skip
         at_end()
         leave(publisher, progress, STOPPED_DRAIN_S if stop.is_set() else ENDED_DRAIN_S)
     return 0

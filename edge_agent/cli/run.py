@@ -1,4 +1,4 @@
-"""`edge-agent run`: one vehicle, live; its signals are simulated or a log paced in real time."""
+"""`edge-agent run`: one vehicle, live; its signals come from its buses, a simulation, or a log paced in real time."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from edge_agent.inputs.block import Block
+    from schemas.config import AgentConfig
     from schemas.vehicle import Vehicle
 
 SIMULATED = "simulated"
@@ -19,9 +20,15 @@ LIVE_ROWS = 10  # of a replayed log per block: a tenth of a second at 100 Hz
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--source", default=SIMULATED, help="'simulated' (default) or a signal log (Parquet)")
-    parser.add_argument("--trust", action="store_true", help="publish a log that the signal doctor did not pass")
-    parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON); needed with a log")
+    parser.add_argument(
+        "--source", action="append",
+        help="'simulated' (default), a signal log (Parquet), or live ones, as often as there are sources: "
+        "can:INTERFACE/CHANNEL, ros2:ENDPOINT, vss:HOST:PORT, gpsd:HOST:PORT",
+    )  # fmt: skip
+    parser.add_argument("--profile", help="which live signal is which channel: a file, or a shipped one")
+    parser.add_argument("--dbc", type=Path, help="CAN database (default: the profile's)")
+    parser.add_argument("--trust", action="store_true", help="publish what the signal doctor did not pass")
+    parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON); needed but with simulated")
     parser.add_argument("--estimator", help="estimator by name (default: the configuration's)")
     parser.add_argument("--name", help="name to publish under (default: the vehicle's)")
     parser.add_argument("--config", type=Path, help="agent configuration (JSON)")
@@ -35,11 +42,50 @@ def run(args: argparse.Namespace) -> int:
     """Drive until the source ends, the duration has passed, or a signal comes."""
     from edge_agent.cli.common import checked_name
     from edge_agent.cli.live import drive_live
+    from edge_agent.inputs.live.sources import is_live
     from schemas.config import AgentConfig, load
+    from schemas.errors import InputError
 
     config = load(args.config, AgentConfig)
-    vehicle, name, blocks = _simulated(args) if args.source == SIMULATED else _logged(args)
+    sources = args.source or [SIMULATED]
+    if all(is_live(source) for source in sources):
+        return _live(args, sources, config)
+    if len(sources) > 1:
+        raise InputError("source", f"{', '.join(sources)} do not go together", "name live ones, or one log")
+    vehicle, name, blocks = _simulated(args) if sources[0] == SIMULATED else _logged(args, Path(sources[0]))
     return drive_live([vehicle], [checked_name(name)], blocks, config, args.estimator, args.duration)
+
+
+def _live(args: argparse.Namespace, sources: list[str], config: AgentConfig) -> int:
+    from edge_agent.app.trip import Trip, beside
+    from edge_agent.cli.common import checked_name
+    from edge_agent.cli.live import drive_live
+    from edge_agent.inputs.live.rows import LiveRows
+    from edge_agent.inputs.live.sources import open_sources
+    from schemas.vehicle import load_vehicle
+
+    vehicle = load_vehicle(_vehicle_file(args))
+    name = checked_name(args.name or vehicle.name)
+    feeds, profile, clock = open_sources(sources, args.profile, args.dbc)
+    rows = LiveRows(feeds, profile, vehicle, clock)
+    trip = Trip(vehicle, profile, beside(config.spool, name), trusted=args.trust)
+    blocks = trip.blocks(rows.blocks(), lambda: rows.ground)
+    try:
+        return drive_live(
+            [trip.vehicle], [name], blocks, config, args.estimator, args.duration, trip.end,
+            admitted=trip.admitted, troubled=lambda: [*rows.troubles(), *trip.troubles()],
+        )  # fmt: skip
+    finally:
+        blocks.close()
+        trip.close()
+
+
+def _vehicle_file(args: argparse.Namespace) -> Path:
+    from schemas.errors import InputError
+
+    if args.vehicle is None:
+        raise InputError("vehicle", "is not given", "name the vehicle file with --vehicle")
+    return Path(args.vehicle)
 
 
 def _simulated(args: argparse.Namespace) -> tuple[Vehicle, str, Iterator[Block]]:
@@ -50,18 +96,15 @@ def _simulated(args: argparse.Namespace) -> tuple[Vehicle, str, Iterator[Block]]
     return fleet.vehicles[0], args.name or fleet.names[0], blocks(fleet, args.rate)
 
 
-def _logged(args: argparse.Namespace) -> tuple[Vehicle, str, Iterator[Block]]:
+def _logged(args: argparse.Namespace, source: Path) -> tuple[Vehicle, str, Iterator[Block]]:
     from edge_agent.cli.common import insist_on_sound
     from edge_agent.inputs.correct import corrected
     from edge_agent.inputs.signal_log import read_log
-    from schemas.errors import InputError
     from schemas.thresholds import NS
     from schemas.vehicle import load_vehicle
 
-    if args.vehicle is None:
-        raise InputError("vehicle", "is not given", "name the vehicle file of the log with --vehicle")
-    vehicle = load_vehicle(args.vehicle)
-    log = read_log(Path(args.source))
+    vehicle = load_vehicle(_vehicle_file(args))
+    log = read_log(source)
     log = replace(log, signals=corrected(log.signals, vehicle))
     if not args.trust:
         insist_on_sound(log, vehicle)

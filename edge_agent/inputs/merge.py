@@ -26,8 +26,9 @@ from schemas.thresholds import NS
 
 GNSS: Final = {  # channels that a receiver's recording fills by itself
     "latitude": Channel(signal="latitude"), "longitude": Channel(signal="longitude"),
-    "yaw": Channel(signal="course", unit="deg", course=True),
+    "yaw": Channel(signal="course", unit="deg", course=True), GROUND: Channel(signal="speed"),
 }  # fmt: skip
+RECEIVED: Final = {"latitude", "longitude", "speed", "course"}  # signals of a receiver's recording
 SPARSE: Final = ("latitude", "longitude", "yaw", GROUND)
 COURSE_SPEED: Final = 3.0  # [m/s] below it a receiver's course is noise
 RATES: Final = (10.0, 20.0, 25.0, 50.0, 100.0)
@@ -71,23 +72,21 @@ def merge(
     """
     radius, ratio = wheel_radius or profile.wheel_radius, steering_ratio or profile.steering_ratio
     notes = [note for recording in recordings for note in recording.notes]
-    found = _found(recordings, profile)
+    found = found_in(recordings, profile)
     if not found:
         names = ", ".join(sorted(profile.needs())[:6])
         raise InputError("profile", f"no recording has any of its signals ({names}, …)", "choose another profile")
-    reference = next((place for name, place in found.items() if name.startswith("omega")), next(iter(found.values())))
+    reference = next(
+        (place for name, (place, _) in found.items() if name.startswith("omega")), next(iter(found.values()))[0]
+    )
     offsets, start_ns = _clocks(recordings, reference, shifts or {}, notes)
     series: dict[str, Series] = {}
     origins: dict[str, dict[str, object]] = {}
-    for name, place in found.items():
-        channel = profile.channels.get(name, GNSS.get(name, Channel(signal="speed", unit="m/s")))
-        recording = recordings[place]
-        try:
-            made, jitter = _made(name, channel, recording, radius, ratio)
-        except _MissingError as error:
-            raise InputError(f"{name} ({', '.join(channel.signals)})", str(error), error.fix) from None
-        series[name] = Series(made.t + offsets[place] - channel.delay_s, made.values)
-        origins[name] = {"source": recording.name, "signals": channel.signals, **_rates(made), "jitter_s": jitter}
+    for name, (place, channel) in found.items():
+        one, jitter = made(name, channel, recordings[place], radius, ratio)
+        series[name] = Series(one.t + offsets[place] - channel.delay_s, one.values)
+        source = recordings[place].name
+        origins[name] = {"source": source, "signals": channel.signals, **_rates(one), "jitter_s": jitter}
     _still_courses(series)
     merged = _rows(series, profile, recordings, found)
     shift = merged.t[0]
@@ -97,28 +96,20 @@ def merge(
     return merged
 
 
-class _MissingError(Exception):
-    """A number of the car that a unit needs."""
-
-    def __init__(self, problem: str, fix: str) -> None:
-        super().__init__(problem)
-        self.fix = fix
-
-
-def _found(recordings: Sequence[Recording], profile: Profile) -> dict[str, int]:
-    """Channel -> the recording that has its signals."""
-    found: dict[str, int] = {}
-    wanted = {name: GNSS[name] for name in GNSS} | {GROUND: Channel(signal="speed")} | profile.channels
+def found_in(recordings: Sequence[Recording], profile: Profile) -> dict[str, tuple[int, Channel]]:
+    """Channel -> the recording that has its signals, and how; a receiver fills what the profile's signals do not."""
+    found: dict[str, tuple[int, Channel]] = {}
     for name in (*CHANNELS, GROUND):
-        if name not in wanted:
-            continue
+        asked = profile.channels.get(name)
         for place, recording in enumerate(recordings):
-            channel = wanted[name]
-            if name not in profile.channels and not {"latitude", "speed"} <= recording.signals.keys():
-                continue  # a receiver's recording fills what the profile leaves out
-            if channel.source in (None, recording.name) and set(channel.signals) <= recording.signals.keys():
-                found[name] = place
+            if asked and asked.source in (None, recording.name) and set(asked.signals) <= recording.signals.keys():
+                found[name] = place, asked
                 break
+        else:
+            for place, recording in enumerate(recordings):
+                if name in GNSS and recording.signals.keys() >= RECEIVED:
+                    found[name] = place, GNSS[name]
+                    break
     return found
 
 
@@ -167,10 +158,15 @@ def _meet(span: tuple[float, float], shift: float, other: tuple[float, float]) -
     return common > 0.5 * min(span[1] - span[0], other[1] - other[0])
 
 
-def _made(
+def made(
     name: str, channel: Channel, recording: Recording, radius: float | None, ratio: float | None
 ) -> tuple[Series, float]:
-    """A channel in SI on its own times, and how unsteady its stamps were [s]."""
+    """A channel in SI on its own times, and how unsteady its stamps were [s].
+
+    Raises:
+        InputError: a number of the car is not known that its unit needs.
+    """
+    where = f"{name} ({', '.join(channel.signals)})"
     parts = [recording.signals[signal] for signal in channel.signals]
     first = parts[0]
     values = first.values.copy()
@@ -181,23 +177,23 @@ def _made(
     factor = 1.0
     if name != GROUND:
         unit = channel.unit or understood(name, first.unit) or next(iter(QUANTITY[name]))
-        made = to_si(name, unit, radius)
-        if made is None:
-            raise _MissingError(
-                f"is a speed in {unit}", "give the wheel's radius: --vehicle, or wheel_radius in the profile"
+        known = to_si(name, unit, radius)
+        if known is None:
+            raise InputError(
+                where, f"is a speed in {unit}", "give the wheel's radius: --vehicle, or wheel_radius in the profile"
             )
-        factor = made
+        factor = known
     if channel.at == "steering wheel":
         if ratio is None:
-            raise _MissingError(
-                "is the steering wheel's angle", "give steering_ratio in the profile or the vehicle file"
+            raise InputError(
+                where, "is the steering wheel's angle", "give steering_ratio in the profile or the vehicle file"
             )
         factor /= ratio
     values = values * (factor * channel.scale)
     if channel.sign is not None:
         flag = recording.signals.get(channel.whole(channel.sign.signal))
         if flag is None:
-            raise _MissingError(f"its sign {channel.sign.signal} is not there", "name the signal of the sign")
+            raise InputError(where, f"its sign {channel.sign.signal} is not there", "name the signal of the sign")
         values = np.where(_held(flag, first.t) == channel.sign.negative, -values, values)
     values = values + channel.offset
     for gate, good in channel.gates.items():
@@ -248,9 +244,12 @@ def _still_courses(series: dict[str, Series]) -> None:
 
 
 def _rows(
-    series: dict[str, Series], profile: Profile, recordings: Sequence[Recording], found: Mapping[str, int]
+    series: dict[str, Series],
+    profile: Profile,
+    recordings: Sequence[Recording],
+    found: Mapping[str, tuple[int, Channel]],
 ) -> Merged:
-    sources = set(found.values())
+    sources = {place for place, _ in found.values()}
     late = {profile.channels[name].delay_s for name in found if name in profile.channels}
     if len(sources) == 1 and recordings[min(sources)].rows and len(late) == 1 and profile.rate_hz is None:
         t = next(iter(series.values())).t
@@ -263,7 +262,7 @@ def _rows(
     if not last - first > 1.0 / rate:
         raise InputError("source", "its channels have no common time", "record them together, or give --clock")
     t = first + np.arange(int((last - first) * rate + 1e-6) + 1) / rate
-    return Merged(t, {name: _sampled(one, t, name in SPARSE) for name, one in series.items()}, None)
+    return Merged(t, {name: sampled(one, t, sparse=name in SPARSE) for name, one in series.items()}, None)
 
 
 def _rate(dense: Mapping[str, Series]) -> float:
@@ -272,7 +271,7 @@ def _rate(dense: Mapping[str, Series]) -> float:
     return next((rate for rate in RATES if rate >= 0.95 * fastest), RATES[-1])
 
 
-def _sampled(series: Series, t: FloatArray, sparse: bool) -> FloatArray:
+def sampled(series: Series, t: FloatArray, *, sparse: bool) -> FloatArray:
     """The series at the rows' times; NaN where no reading is near enough."""
     good = np.isfinite(series.values)
     known, values = series.t[good], series.values[good]

@@ -9,7 +9,7 @@ Time may stand still (the estimator says so in `health`) but not go back.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -65,7 +65,7 @@ def read_log(path: Path) -> SignalLog:
             signals[:, index] = _numbers(table, name)
     signals[np.isinf(signals)] = np.nan
     _check(table, signals)
-    _steering(table, signals)
+    fill_steering(signals, [name not in table.column_names for name in (*FRONT_STEERING, *REAR_STEERING)])
     ground = _numbers(table, GROUND) if GROUND in table.column_names else None
     return SignalLog(t, signals, start_ns, ground)
 
@@ -139,9 +139,8 @@ def _check(table: pa.Table, signals: FloatArray) -> None:
         raise InputError(front[0], "has no reading in any row", "record the channel, or mend its conversion")
 
 
-def _steering(table: pa.Table, signals: FloatArray) -> None:
-    """Fill the steering angles that have no column (not those that have one without readings)."""
-    missing = [name not in table.column_names for name in (*FRONT_STEERING, *REAR_STEERING)]
+def fill_steering(signals: FloatArray, missing: Sequence[bool]) -> None:
+    """Fill the steering angles of wheels (4,) that have no channel (not of those that have one without readings)."""
     if missing[0]:
         signals[:, S.DELTA] = signals[:, S.DELTA + 1]
     if missing[1]:

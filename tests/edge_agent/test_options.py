@@ -47,7 +47,7 @@ USUAL = {
 }  # fmt: skip
 LOGGED = ["--source", "{0}.parquet", "--vehicle", "{0}.json", "--trust"]
 CHANGED: dict[tuple[str, str], list[str]] = {
-    ("run", "--source"): LOGGED, ("run", "--vehicle"): [*LOGGED[:2], "--vehicle", "{1}.json", "--trust"],
+    ("run", "--source"): LOGGED, ("run", "--vehicle"): ["--vehicle", "{1}.json"],
     **{(command, option): [option, value] for command in ("run", "fleet") for option, value in (
         ("--estimator", "ckf"), ("--config", "{0}.agent"), ("--scenario", "hills"), ("--rate", "50"), ("--seed", "1"),
         ("--duration", "7"),
@@ -67,6 +67,7 @@ CAMPAIGN = "test_the_quick_campaign_writes_figures_report_and_plots"
 SEEDS = "test_more_seeds_are_driven_and_no_plots_drawn_where_so_asked"
 UNFIT = "test_what_has_not_passed_is_not_published_unless_it_is_trusted"
 LEARNED = "test_a_calibrated_file_is_written_read_and_heeded"
+LIVE = "test_a_live_car_is_driven_by_its_bus_and_its_receiver"
 FIX = "test_a_fix_makes_the_drive_pass"
 ELSEWHERE = {
     "simulate": {"--list": "test_simulate_lists_the_manoeuvres",
@@ -81,7 +82,7 @@ ELSEWHERE = {
                "--jobs": "test_so_many_drives_are_under_way_at_once"},
     "check": {"log": FIX, "--vehicle": FIX, "--out": FIX, "--fix": FIX},
     "calibrate": {"log": LEARNED, "--vehicle": LEARNED, "--out": LEARNED, "--trust": LEARNED},
-    "run": {"--trust": UNFIT}, "fleet": {},
+    "run": {"--trust": UNFIT, "--profile": LIVE, "--dbc": LIVE}, "fleet": {},
     "tune": {"--quick": "test_quick_tuning_writes_a_valid_file_and_says_what_it_does",
              "--study": "test_the_quick_study_writes_figures_table_plot_and_a_tuned_file"},
     "evaluate": {"--out": CAMPAIGN, "--quick": CAMPAIGN, "--seeds": SEEDS, "--no-plots": SEEDS,

@@ -1,0 +1,188 @@
+"""A live trip: vouched for by the signal doctor, and learned from; what is known of the car lies beside the outbox.
+
+Nothing is published before the doctor has passed the signals, in this trip or in one before with the same vehicle file
+and profile. A trip is looked over in parts of PART_S; each part that passes teaches, one that shows a fault takes the
+doctor's word back. What was learned holds from the next trip on: an estimator's vehicle does not change under way.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+from collections.abc import Callable, Generator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Final, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from edge_agent.calibration.learn import DriveEstimates, one_drive, surer, weighed
+from edge_agent.inputs.block import Block
+from edge_agent.inputs.correct import corrected
+from edge_agent.inputs.doctor.drive import prepare
+from edge_agent.inputs.doctor.findings import diagnose
+from edge_agent.inputs.profile import Profile
+from schemas.numeric import FloatArray
+from schemas.vehicle import Vehicle
+
+PART_S: Final = 600.0  # 9 MB of signals
+LOOK_S: Final = 30.0  # between two examinations until one has passed
+LEAST_S: Final = 60.0  # of a part that teaches
+MOST_DRIVES: Final = 50  # parts that are remembered: tyres wear, and are changed
+LEAVE_S: Final = 1.0
+
+log = logging.getLogger(__name__)
+
+
+class Known(BaseModel):
+    """What is remembered of a car: whether its signals passed, and the estimates of each part of a trip."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    version: Literal[1] = 1
+    of: Annotated[str, Field(description="hash of vehicle file and profile; with others all begins anew")]
+    passed: bool = False
+    drives: list[DriveEstimates] = []
+
+
+class Trip:
+    """One trip of one car.
+
+    Args:
+        vehicle: its file.
+        profile: by which its signals are read.
+        path: of what is known; it need not exist.
+        trusted: publish whatever the doctor says.
+    """
+
+    def __init__(self, vehicle: Vehicle, profile: Profile, path: Path, *, trusted: bool = False) -> None:
+        self._plain = vehicle.model_copy(update={"calibration": None})
+        self._path, self._trusted = path, trusted
+        self._known = _read(path, _identity(self._plain, profile))
+        learned = weighed(self._known.drives)
+        self.vehicle = vehicle.model_copy(update={"calibration": surer(vehicle.calibration, learned)})
+        self._blocks: list[tuple[FloatArray, FloatArray, FloatArray]] = []  # of this part: t, signals, ground
+        self._since = self._looked = 0.0
+        self._faults: list[str] = []
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="doctor")
+        self._looking: Future[None] | None = None
+
+    def admitted(self) -> bool:
+        """Whether the signals are vouched for."""
+        return self._trusted or self._known.passed
+
+    def troubles(self) -> list[str]:
+        """Why nothing is published, if so."""
+        if self.admitted():
+            return []
+        return [f"the signal doctor: {', '.join(self._faults) or 'has not passed the signals yet'}"]
+
+    def blocks(self, source: Generator[Block], ground: Callable[[], FloatArray]) -> Generator[Block]:
+        """The blocks of a source, less what is known of its devices; they are kept for the doctor as they came.
+
+        `ground` tells the speed over ground (T,) of the last block.
+        """
+        if not self.admitted():
+            log.info("nothing is published until the signal doctor has passed half a minute of turns and braking")
+        with closing(source):
+            for block in source:
+                self._keep(block, ground())
+                yield replace(block, signals=corrected(block.signals, self.vehicle))
+
+    def end(self) -> None:
+        """Begin to learn from what is left."""
+        self._look(final=True)
+
+    def close(self) -> None:
+        """Wait a moment for what is being learned."""
+        if self._looking is not None:
+            try:
+                self._looking.result(LEAVE_S)
+            except TimeoutError:
+                log.warning("the end of this trip is not learned from: no time left")
+        self._worker.shutdown(wait=False, cancel_futures=True)
+
+    def _keep(self, block: Block, ground: FloatArray) -> None:
+        now = float(block.t[-1, 0])
+        if not self._blocks:
+            self._since = self._looked = float(block.t[0, 0])
+        self._blocks.append((block.t[:, 0], block.signals[:, 0], ground))
+        if now - self._since >= PART_S:
+            self._look(final=True)
+        elif not self.admitted() and now - self._looked >= LOOK_S:
+            self._looked = now
+            self._look(final=False)
+
+    def _look(self, *, final: bool) -> None:
+        """Have the part examined beside the loop; the last look at a part ends it."""
+        if not self._blocks:
+            return
+        if not final and self._looking is not None and not self._looking.done():
+            return
+        part = list(self._blocks)
+        if final:
+            self._blocks = []
+        self._looking = self._worker.submit(self._examine, part, final)
+
+    def _examine(self, part: list[tuple[FloatArray, FloatArray, FloatArray]], final: bool) -> None:
+        t, signals, ground = (np.concatenate(columns) for columns in zip(*part, strict=True))
+        try:
+            said = diagnose(t, signals, self._plain, ground)
+            self._faults = [f"{fault.channel} {fault.kind}" for fault in said.findings]
+            if self._faults:
+                log.warning("the signal doctor: %s", ", ".join(self._faults))
+            estimates: DriveEstimates = {}
+            if said.passed and final and t[-1] - t[0] >= LEAST_S:
+                estimates = one_drive(prepare(t, signals, self._plain), self._plain)
+        except (ValueError, FloatingPointError, np.linalg.LinAlgError) as error:
+            log.warning("a part of this trip cannot be examined: %s", error)
+            return
+        if said.passed and not self._known.passed:
+            log.info("the signal doctor has passed: units, signs, clocks and offsets agree with each other")
+        passed = said.passed or (self._known.passed and not self._faults)
+        if estimates or passed != self._known.passed:
+            drives = [*self._known.drives, estimates][-MOST_DRIVES:] if estimates else self._known.drives
+            self._known = self._known.model_copy(update={"passed": passed, "drives": drives})
+            _write(self._path, self._known)
+
+
+def beside(spool: Path, name: str) -> Path:
+    """Where what is known of a car lies: beside its outbox."""
+    return spool.with_name(f"{spool.stem}.{name}.json")
+
+
+def _identity(vehicle: Vehicle, profile: Profile) -> str:
+    text = vehicle.model_dump_json(exclude_none=True) + profile.text()
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _read(path: Path, identity: str) -> Known:
+    """What is known of the car; nothing where the file is missing, broken, or of another car."""
+    try:
+        known = Known.model_validate_json(path.read_bytes())
+    except FileNotFoundError:
+        return Known(of=identity)
+    except (OSError, ValidationError) as error:
+        log.warning("%s cannot be read (%s): the car is learned anew", path, str(error).splitlines()[0])
+        return Known(of=identity)
+    if known.of != identity:
+        log.warning("%s is of another vehicle file or profile: the car is learned anew", path)
+        return Known(of=identity)
+    return known
+
+
+def _write(path: Path, known: Known) -> None:
+    """Whole or not at all."""
+    part = path.with_suffix(".part")
+    try:
+        with part.open("w", encoding="utf-8") as file:
+            file.write(known.model_dump_json(indent=1) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as error:
+        log.warning("%s cannot be written (%s): this part of the trip is forgotten", path, error)

@@ -1,0 +1,73 @@
+"""A CAN bus by python-can; the interface takes only the identifiers that the profile reads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+from edge_agent.inputs.live.feed import TICK_S, Feed, Heard, HostClock
+from edge_agent.inputs.profile import Profile
+from edge_agent.inputs.readers.can_log import Frames, Log, decoded
+from edge_agent.inputs.readers.dbc import Database
+from edge_agent.inputs.recording import Series, library
+from schemas.thresholds import NS
+
+EXTENDED_MASK, STANDARD_MASK = 0x1FFFFFFF, 0x7FF
+OWN: Final = "gripmap"
+
+
+class Decoder:
+    """Frames to signals, by the database; of a message that the profile puts on another bus, nothing."""
+
+    def __init__(self, profile: Profile, database: Database, bus: int | None = None) -> None:
+        elsewhere = {
+            c.message for c in profile.channels.values() if c.message and bus is not None and c.bus not in (None, bus)
+        }
+        self.database = {name: message for name, message in database.items() if name not in elsewhere}
+        self.wanted = {name for name in profile.needs() if name.partition(".")[0] in self.database}
+        messages = {name.partition(".")[0] for name in self.wanted}
+        self.identifiers = {(self.database[name].identifier, self.database[name].extended) for name in messages}
+
+    def series(self, heard: list[Heard]) -> dict[str, Series]:
+        """The signals of (time, (identifier, extended, data))."""
+        log: Log = {}
+        for time, (identifier, extended, data) in heard:
+            log.setdefault((0, identifier, extended), Frames()).add(time, data)
+        return decoded(lambda _: (log, 0.0), OWN, self.database, self.wanted).signals
+
+
+class CanFeed(Feed):
+    """One bus of python-can.
+
+    Args:
+        name: of the source.
+        clock: the host's.
+        decoder: which frames, and what is in them.
+        options: of `can.Bus`: interface, channel and whatever the interface takes.
+
+    Raises:
+        InputError: python-can is not installed.
+    """
+
+    def __init__(self, name: str, clock: HostClock, decoder: Decoder, options: Mapping[str, Any]) -> None:
+        super().__init__(name, clock)
+        self._can, self._decoder, self._options = library("can"), decoder, dict(options)
+
+    def listen(self) -> None:
+        """Hear frames until the bus fails."""
+        filters = [
+            {"can_id": identifier, "can_mask": EXTENDED_MASK if extended else STANDARD_MASK, "extended": extended}
+            for identifier, extended in sorted(self._decoder.identifiers)
+        ]
+        with self._can.Bus(can_filters=filters, **self._options) as bus:
+            self.openings += 1
+            while not self.stopping.is_set():
+                message = bus.recv(TICK_S)
+                if message is None or message.is_error_frame or message.is_remote_frame:
+                    continue
+                frame = message.arbitration_id, message.is_extended_id, bytes(message.data)
+                self.hear(round(message.timestamp * NS), frame)
+
+    def series(self, heard: list[Heard]) -> dict[str, Series]:
+        """The profile's signals in the frames."""
+        return self._decoder.series(heard)

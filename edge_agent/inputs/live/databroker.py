@@ -1,0 +1,125 @@
+"""Signals of a Kuksa databroker, by gRPC (kuksa.val.v2): paths of the vehicle signal specification (COVESA VSS)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from edge_agent.inputs.live.feed import Feed, Heard, HostClock
+from edge_agent.inputs.recording import Series, library
+from schemas.errors import InputError
+from schemas.thresholds import NS
+
+SERVICE: Final = "/kuksa.val.v2.VAL/"
+BUFFER: Final = 1000  # updates that the broker keeps for a slow subscriber, the most it allows
+ASK_S: Final = 5.0
+NUMBERS: Final = ("bool", "int32", "int64", "uint32", "uint64", "float", "double")
+
+
+class DatabrokerFeed(Feed):
+    """The paths of a broker.
+
+    Args:
+        name: of the source.
+        clock: the host's.
+        address: host and port.
+        paths: that the profile reads; those which the broker does not know are left out.
+        files: `ca`, the authority of its certificate, without which no TLS is spoken, and `token`, a JSON web token.
+
+    Raises:
+        InputError: grpc is not installed, or a file cannot be read.
+    """
+
+    def __init__(
+        self, name: str, clock: HostClock, address: str, paths: Sequence[str], files: Mapping[str, str]
+    ) -> None:  # fmt: skip
+        super().__init__(name, clock)
+        self._grpc, self._address, self._paths = library("grpc"), address, sorted(paths)
+        # protobuf's runtime is there with the core; the messages are made when a broker is asked for
+        self._messages = library("edge_agent.inputs.live.kuksa.broker_pb2")
+        try:
+            read = {option: Path(file).read_bytes() for option, file in files.items()}
+        except OSError as error:
+            raise InputError(
+                "source", f"{name!r}: cannot read {error.filename} ({error.strerror})", "correct the path"
+            ) from error
+        self._authority = read.get("ca")
+        token = read.get("token", b"").decode("ascii", errors="replace").strip()
+        self._metadata = (("authorization", f"Bearer {token}"),) if token else ()
+        self._call: Any = None
+
+    def listen(self) -> None:
+        """Hear updates until the broker goes.
+
+        Its first answer holds what it knew before, however old: not readings.
+        """
+        with self._channel() as channel:
+            known = self._known(channel)
+            if not known:
+                raise ConnectionError("it knows none of the profile's signals")
+            m = self._messages
+            self._call = self._method(channel.unary_stream, "Subscribe", m.SubscribeResponse)(
+                m.SubscribeRequest(signal_paths=known, buffer_size=BUFFER), metadata=self._metadata
+            )
+            try:
+                for place, update in enumerate(self._call):
+                    self.openings += not place
+                    if place:
+                        self._hear(update)
+                    if self.stopping.is_set():
+                        return
+            finally:
+                self._call.cancel()
+
+    def close(self) -> None:
+        """Stop listening."""
+        self.stopping.set()
+        if self._call is not None:
+            self._call.cancel()
+        super().close()
+
+    def series(self, heard: list[Heard]) -> dict[str, Series]:
+        """Values by path."""
+        times: dict[str, list[float]] = {}
+        values: dict[str, list[float]] = {}
+        for time, (path, value) in heard:
+            times.setdefault(path, []).append(time)
+            values.setdefault(path, []).append(value)
+        return {path: Series(np.array(times[path]), np.array(values[path])) for path in times}
+
+    def _channel(self) -> Any:  # noqa: ANN401 grpc has no types
+        if self._authority is None:
+            return self._grpc.insecure_channel(self._address)
+        return self._grpc.secure_channel(self._address, self._grpc.ssl_channel_credentials(self._authority))
+
+    def _method(self, kind: Any, name: str, answer: Any) -> Any:  # noqa: ANN401
+        return kind(
+            f"{SERVICE}{name}", request_serializer=lambda request: request.SerializeToString(),
+            response_deserializer=answer.FromString,
+        )  # fmt: skip
+
+    def _known(self, channel: Any) -> list[str]:  # noqa: ANN401
+        """The paths that the broker knows: a subscription with an unknown one is refused as a whole."""
+        m = self._messages
+        ask = self._method(channel.unary_unary, "GetValue", m.GetValueResponse)
+        known = []
+        for path in self._paths:
+            try:
+                request = m.GetValueRequest(signal_id=m.SignalID(path=path))
+                ask(request, timeout=ASK_S, metadata=self._metadata, wait_for_ready=False)
+                known.append(path)
+            except self._grpc.RpcError as error:
+                if error.code() != self._grpc.StatusCode.NOT_FOUND:
+                    raise ConnectionError(f"{error.code().name}: {error.details()}") from None
+                self.say(f"does not know {path}")
+        return known
+
+    def _hear(self, update: Any) -> None:  # noqa: ANN401
+        for path, point in update.entries.items():
+            kind = point.value.WhichOneof("typed_value")
+            if kind in NUMBERS:
+                stamp = point.timestamp
+                self.hear(stamp.seconds * NS + stamp.nanos, (path, float(getattr(point.value, kind))))

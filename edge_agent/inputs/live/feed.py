@@ -1,0 +1,151 @@
+"""A live source: a thread that listens, opens anew what was lost, and hands over what it heard.
+
+Times are the host's: seconds since its start, by a clock that never steps. A source whose stamps are up to BELIEVED_S
+old when they arrive has the host's date and is believed. Any other has a clock of its own: its fastest message within
+WHILE_S to 2 WHILE_S is taken to have come at once (Cristian, Distrib. Comput. 3 (1989): the minimum of the delays).
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any, Final, TypeAlias
+
+from edge_agent.inputs.recording import Series
+from schemas.thresholds import NS
+
+BELIEVED_S: Final = 1.0
+EARLY_S: Final = 0.01  # that a stamp of the host's own clock may lie ahead
+WHILE_S: Final = 10.0
+RETRY_S: Final = 0.5
+TICK_S: Final = 0.1  # within which a thread sees that it is to stop
+SILENT_S: Final = 2.0  # after which a source counts as lost
+MOST_WAITING: Final = 200_000  # messages that wait for the loop, minutes of a bus
+LEAVE_S: Final = 2.0
+
+Heard: TypeAlias = tuple[float, Any]
+"""When [s of the host], and what."""
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class HostClock:
+    """The host's clock from its start on: ns UTC of then, and what a steady clock showed."""
+
+    start_ns: int = field(default_factory=time.time_ns)
+    steady_s: float = field(default_factory=time.monotonic)
+
+    def now(self) -> float:
+        """Seconds since the start."""
+        return time.monotonic() - self.steady_s
+
+    def of(self, stamp_ns: int) -> float:
+        """Seconds since the start of a date in ns UTC."""
+        return (stamp_ns - self.start_ns) / NS
+
+
+class Stamps:
+    """Puts a source's stamps on the host's clock."""
+
+    def __init__(self) -> None:
+        self._before = self._lately = float("inf")
+        self._turned = 0.0
+
+    @property
+    def lead(self) -> float:
+        """Seconds to add to its stamps, 0 where they are believed."""
+        least = min(self._before, self._lately)
+        return 0.0 if -EARLY_S <= least < BELIEVED_S or least == float("inf") else least
+
+    def place(self, stamp: float, arrival: float) -> float:
+        """The host's time of a stamp that arrived now."""
+        if arrival - self._turned > WHILE_S:
+            self._before, self._lately, self._turned = self._lately, float("inf"), arrival
+        self._lately = min(self._lately, arrival - stamp)
+        return stamp + self.lead
+
+
+class Feed(ABC):
+    """One live source. `start` once, `take` again and again, `close` once.
+
+    Attributes:
+        name: how it was asked for.
+        heard: messages so far; lost: those known to be missing; broken: those that could not be read.
+        openings, losses: how often the source was opened, and lost.
+    """
+
+    def __init__(self, name: str, clock: HostClock) -> None:
+        self.name, self.clock = name, clock
+        self.heard = self.lost = self.broken = self.openings = self.losses = 0
+        self.stopping = threading.Event()
+        self.stamps = Stamps()
+        self.last = 0.0  # host's time of the last message
+        self._reasons: set[str] = set()
+        self._waiting: deque[Heard] = deque()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    @abstractmethod
+    def listen(self) -> None:
+        """Open the source, count that, and `hear` until `stopping` is set; to return or raise earlier is to lose it."""
+
+    @abstractmethod
+    def series(self, heard: list[Heard]) -> dict[str, Series]:
+        """The signals in what was heard."""
+
+    def start(self) -> None:
+        """Begin to listen."""
+        self.last = self.clock.now()
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop listening; a thread that hangs in a driver is left behind."""
+        self.stopping.set()
+        self._thread.join(LEAVE_S)
+
+    def hear(self, stamp_ns: int, what: object) -> None:
+        """Keep a message with the source's own date [ns UTC]."""
+        self.last = self.clock.now()
+        self.heard += 1
+        if len(self._waiting) >= MOST_WAITING:
+            self._waiting.popleft()
+            self.lost += 1
+        self._waiting.append((self.stamps.place(self.clock.of(stamp_ns), self.last), what))
+
+    def unreadable(self, reason: str) -> None:
+        """Count a message that makes no sense; the first of its kind is logged."""
+        self.broken += 1
+        self.say(reason)
+
+    def take(self) -> dict[str, Series]:
+        """The signals heard since the last call."""
+        heard = [self._waiting.popleft() for _ in range(len(self._waiting))]
+        return self.series(heard) if heard else {}
+
+    @property
+    def trouble(self) -> str | None:
+        """Why nothing comes, None while something does."""
+        silent = self.clock.now() - self.last
+        return f"{self.name} is silent for {silent:.0f} s" if silent > SILENT_S else None
+
+    def _run(self) -> None:
+        while not self.stopping.is_set():
+            reason = "it ended"
+            try:
+                self.listen()
+            except Exception as error:  # noqa: BLE001 a driver or a peer may raise anything; a lost source is no crash
+                reason = (str(error) or type(error).__name__).splitlines()[0][:200]
+            if not self.stopping.is_set():
+                self.losses += 1
+                self.say(f"lost ({reason}); trying again")
+            self.stopping.wait(RETRY_S)
+
+    def say(self, reason: str) -> None:
+        """Log what it met, once."""
+        if reason not in self._reasons and len(self._reasons) < 50:
+            self._reasons.add(reason)
+            log.warning("%s: %s", self.name, reason)

@@ -1,0 +1,58 @@
+"""Positions of a running gpsd: its JSON over TCP."""
+
+from __future__ import annotations
+
+import json
+import socket
+from typing import Final
+
+import numpy as np
+
+from edge_agent.inputs.live.feed import TICK_S, Feed, Heard, HostClock
+from edge_agent.inputs.readers.gnss import LONGEST_LINE, UNITS, parse_gpsd
+from edge_agent.inputs.recording import Series
+
+WATCH: Final = b'?WATCH={"enable":true,"json":true};\n'
+CONNECT_S: Final = 5.0
+
+
+class GpsdFeed(Feed):
+    """The TPV reports of a gpsd at (host, port)."""
+
+    def __init__(self, name: str, clock: HostClock, address: tuple[str, int]) -> None:
+        super().__init__(name, clock)
+        self._address = address
+
+    def listen(self) -> None:
+        """Hear reports until the connection ends."""
+        with socket.create_connection(self._address, CONNECT_S) as connection:
+            connection.sendall(WATCH)
+            connection.settimeout(TICK_S)
+            self.openings += 1
+            rest = b""
+            while not self.stopping.is_set():
+                try:
+                    part = connection.recv(65_536)
+                except TimeoutError:
+                    continue
+                if not part:
+                    return
+                *lines, rest = (rest + part).split(b"\n")
+                if len(rest) > LONGEST_LINE:
+                    raise ValueError("a line without an end")
+                for line in lines:
+                    self._line(line)
+
+    def _line(self, line: bytes) -> None:
+        try:
+            fix = parse_gpsd(line.decode("ascii", errors="replace")) if line.strip() else None
+        except (json.JSONDecodeError, ValueError, RecursionError, OverflowError, TypeError) as error:
+            self.unreadable(f"a report that cannot be read ({type(error).__name__})")
+            return
+        if fix is not None:
+            self.hear(fix.time, fix)
+
+    def series(self, heard: list[Heard]) -> dict[str, Series]:
+        """Signals latitude, longitude, speed and course."""
+        t = np.array([time for time, _ in heard])
+        return {name: Series(t, np.array([getattr(fix, name) for _, fix in heard]), UNITS[name]) for name in UNITS}

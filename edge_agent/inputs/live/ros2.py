@@ -1,0 +1,156 @@
+"""Topics of ROS 2 over rmw_zenoh, no ROS installed: a subscriber at a Zenoh router, messages decoded by rosbags.
+
+A topic's key is DOMAIN/TOPIC/PACKAGE::msg::dds_::TYPE_/HASH, its payload CDR. The attachment begins with a sequence
+number and the time of publication (int64 each, little endian; rmw_zenoh_cpp, design.md): so what was lost is known.
+Signals are called as in a bag, /topic.field.field; topics of can_msgs/Frame are buses.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from edge_agent.inputs.live.can_bus import Decoder
+from edge_agent.inputs.live.feed import Feed, Heard, HostClock
+from edge_agent.inputs.readers.rosbag import FRAME, Leaf, leaves_of, stamp_of
+from edge_agent.inputs.recording import Series, library
+from schemas.config import ZenohSettings
+from schemas.errors import InputError
+from schemas.runtime.zenoh_session import open_session
+from schemas.thresholds import NS
+
+DDS: Final = "::dds_::"
+ATTACHMENT: Final = struct.Struct("<qq")  # sequence number, ns; the publisher's identity follows
+OLDEST_NS: Final = 946_684_800 * NS  # the year 2000: an earlier stamp counts from the start of a simulation
+CAN_FRAME: Final = (
+    "std_msgs/Header header\nuint32 id\nbool is_rtr\nbool is_extended\nbool is_error\nuint8 dlc\nuint8[8] data\n"
+)
+
+
+class Ros2Feed(Feed):
+    """Topics of one domain.
+
+    Args:
+        name: of the source.
+        clock: the host's.
+        settings: how to reach the router.
+        domain: ROS_DOMAIN_ID.
+        signals: that the profile reads; each begins with its topic.
+        decoder: of topics of CAN frames, where there is a database.
+        types: a folder of PACKAGE/NAME.msg, for messages that no distribution has.
+
+    Raises:
+        InputError: rosbags is not installed, no signal names a topic, or a type makes no sense.
+    """
+
+    def __init__(
+        self, name: str, clock: HostClock, settings: ZenohSettings, *, domain: int, signals: Sequence[str],
+        decoder: Decoder | None = None, buses: Sequence[str] = (), types: Path | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__(name, clock)
+        self._settings, self._domain, self._decoder = settings, domain, decoder
+        self._wanted = {signal for signal in signals if signal.startswith("/")}
+        self._topics = sorted({signal.partition(".")[0] for signal in self._wanted} | set(buses))
+        if not self._topics:
+            raise InputError(
+                "profile", "names no topic", "call its signals /topic.field, as import drafts them from a bag"
+            )
+        self._store = _typestore(types)
+        self._leaves: dict[str, list[Leaf]] = {}
+        self._after: dict[bytes, int] = {}  # publisher -> the sequence number that is next
+
+    def listen(self) -> None:
+        """Hear samples; Zenoh itself looks for a router that was lost."""
+        session = open_session(self._settings, self.stopping)
+        if session is None:
+            return
+        with session:
+            held = [
+                session.declare_subscriber(f"{self._domain}/{topic.strip('/')}/*/*", self._hearing(topic))
+                for topic in self._topics
+            ]
+            self.openings += 1
+            self.stopping.wait()
+            for subscriber in held:
+                subscriber.undeclare()
+
+    def series(self, heard: list[Heard]) -> dict[str, Series]:
+        """Values by name; frames by the database."""
+        frames = [(time, what) for time, what in heard if isinstance(what, tuple)]
+        found = self._decoder.series(frames) if self._decoder and frames else {}
+        times: dict[str, list[float]] = {}
+        values: dict[str, list[float]] = {}
+        for time, what in heard:
+            if isinstance(what, dict):
+                for name, value in what.items():
+                    times.setdefault(name, []).append(time)
+                    values.setdefault(name, []).append(value)
+        return found | {name: Series(np.array(times[name]), np.array(values[name])) for name in times}
+
+    def _hearing(self, topic: str) -> Any:  # noqa: ANN401
+        def heard(sample: Any) -> None:  # noqa: ANN401 the session's type is its library's own
+            try:
+                self._sample(topic, sample)
+            except Exception as error:  # noqa: BLE001 hostile bytes may raise anything, and Zenoh would swallow it
+                self.unreadable(f"{topic}: a message that cannot be read ({type(error).__name__})")
+
+        return heard
+
+    def _sample(self, topic: str, sample: Any) -> None:  # noqa: ANN401
+        kind = type_of(str(sample.key_expr))
+        published = self._published(sample.attachment.to_bytes() if sample.attachment is not None else b"")
+        message = self._store.deserialize_cdr(sample.payload.to_bytes(), kind)
+        stamp = stamp_of(message)
+        at = stamp if stamp > OLDEST_NS or not published else published
+        if kind == FRAME:
+            if not (message.is_error or message.is_rtr):
+                data = bytes(message.data)[: message.dlc]
+                self.hear(at, (int(message.id), bool(message.is_extended), data))
+            return
+        if topic not in self._leaves:
+            named = [(f"{topic}{name}", take) for name, take in leaves_of(message)]
+            self._leaves[topic] = [leaf for leaf in named if leaf[0] in self._wanted]
+        self.hear(at, {name: float(take(message)) for name, take in self._leaves[topic]})
+
+    def _published(self, attachment: bytes) -> int:
+        """Time of publication [ns], 0 where it is not told; counts what is missing before it."""
+        if len(attachment) < ATTACHMENT.size:
+            return 0
+        number, at = ATTACHMENT.unpack_from(attachment)
+        publisher = attachment[ATTACHMENT.size :]
+        expected = self._after.get(publisher, number)
+        self.lost += max(number - expected, 0)
+        self._after[publisher] = max(number + 1, expected)
+        return int(at)
+
+
+def type_of(key: str) -> str:
+    """The message type that a key tells: `sensor_msgs::msg::dds_::Imu_` is sensor_msgs/msg/Imu.
+
+    Raises:
+        ValueError: it tells none.
+    """
+    place, mark, name = key.split("/")[-2].partition(DDS)
+    if not mark or not name.endswith("_"):
+        raise ValueError("no type in the key")
+    return f"{place.replace('::', '/')}/{name[:-1]}"
+
+
+def _typestore(folder: Path | None) -> Any:  # noqa: ANN401
+    typesys = library("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+    texts = {FRAME: CAN_FRAME}
+    for file in sorted(folder.glob("*/*.msg")) if folder else ():
+        texts[f"{file.parent.name}/msg/{file.stem}"] = file.read_text(encoding="utf-8")
+    if folder and len(texts) == 1:
+        raise InputError("source", f"{folder} holds no PACKAGE/NAME.msg", "name a folder of message definitions")
+    try:
+        for kind, text in texts.items():
+            store.register(typesys.get_types_from_msg(text, kind))
+    except Exception as error:  # what a parser of others raises
+        raise InputError("source", f"a message definition makes no sense ({error})", "correct it") from error
+    return store

@@ -1,0 +1,184 @@
+"""Rows at a fixed rate of what live sources heard: the importer's profile and merging, a tenth of a second at a time.
+
+A row is made DELAY_S after its time, so that readings to either side of it are there: what comes later is missing in it
+and not waited for. The clock makes the rows: where all sources are silent they are empty, and the estimator widens.
+A fix that comes after its row is moved along its own course to the first row that is left.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from edge_agent.inputs.block import Block
+from edge_agent.inputs.live.feed import Feed, HostClock
+from edge_agent.inputs.merge import COURSE_SPEED, SPARSE, found_in, made, sampled
+from edge_agent.inputs.profile import Profile
+from edge_agent.inputs.recording import Recording, Series
+from edge_agent.inputs.signal_log import GROUND, fill_steering
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+from schemas.signals import CHANNELS, per_wheel
+from schemas.thresholds import EARTH_RADIUS_M, NS
+from schemas.vehicle import Vehicle
+
+RATE_HZ: Final = 100.0
+BLOCK_S: Final = 0.1
+DELAY_S: Final = 0.3  # a channel of 10 Hz has its next reading by then
+KEPT_S: Final = 3.0  # of readings before a row: bursts are straightened over a second
+MOST_BEHIND_S: Final = 5.0  # rows of a host that slept are left out: the estimator is told of a gap
+OLDEST_FIX_S: Final = 2.0
+STEERING: Final = per_wheel("delta")
+UNSTEERED: Final = STEERING[2:]
+
+
+class LiveRows:
+    """Blocks of one vehicle's samples from its sources.
+
+    Args:
+        feeds: the sources; they are started by `blocks`.
+        profile: which signal is which channel.
+        vehicle: its wheel radius and steering ratio go before the profile's.
+        clock: the host's, the same as that of the feeds.
+        wait: sleeps so many seconds.
+
+    Raises:
+        InputError: the profile reads the steering wheel, and nobody says its ratio.
+    """
+
+    def __init__(
+        self, feeds: Sequence[Feed], profile: Profile, vehicle: Vehicle, clock: HostClock,
+        wait: Callable[[float], None] = time.sleep,
+    ) -> None:  # fmt: skip
+        self.feeds, self._profile, self._clock, self._wait = feeds, profile, clock, wait
+        self._radius = vehicle.wheel_radius
+        self._ratio = vehicle.steering_ratio or profile.steering_ratio
+        if self._ratio is None and any(channel.at == "steering wheel" for channel in profile.channels.values()):
+            raise InputError("steering_ratio", "is not known", "give it in the profile or the vehicle file")
+        self.rate_hz = profile.rate_hz or RATE_HZ
+        self._readings: list[dict[str, Series]] = [{} for _ in feeds]
+        self._used = dict.fromkeys(SPARSE, -math.inf)  # time of the last fix that has its row
+        self._next = 0  # row
+        self._date_ns: int | None = None
+        self.skipped = 0
+        self.ground: FloatArray = np.zeros(0)  # speed over ground of the last block's rows (T,) [m/s]
+
+    def blocks(self) -> Generator[Block]:
+        """Blocks as time goes, until the caller stops; the sources are closed then."""
+        size = max(1, round(BLOCK_S * self.rate_hz))
+        self._next = math.ceil(self._clock.now() * self.rate_hz)
+        for feed in self.feeds:
+            feed.start()
+        try:
+            while True:
+                due = (self._next + size) / self.rate_hz + DELAY_S
+                self._wait(max(0.0, due - self._clock.now()))
+                behind = int((self._clock.now() - due) * self.rate_hz)
+                if behind > MOST_BEHIND_S * self.rate_hz:
+                    self._next += behind
+                    self.skipped += behind
+                yield self._block(size)
+        finally:
+            for feed in self.feeds:
+                feed.stopping.set()
+            for feed in self.feeds:
+                feed.close()
+
+    def troubles(self) -> list[str]:
+        """Sources that are silent."""
+        return [trouble for feed in self.feeds if (trouble := feed.trouble)]
+
+    def _block(self, size: int) -> Block:
+        t = np.arange(self._next, self._next + size) / self.rate_hz
+        self._next += size
+        recordings = [self._recording(place, feed, t[0] - KEPT_S) for place, feed in enumerate(self.feeds)]
+        signals = np.full((size, len(CHANNELS)), np.nan)
+        self.ground = np.full(size, np.nan)
+        fixes: dict[str, Series] = {}
+        for name, (place, channel) in found_in(recordings, self._profile).items():
+            sparse = name in SPARSE  # a fix has its own date, all else the time at which it came
+            try:
+                series, _ = made(name, channel, replace(recordings[place], rows=sparse), self._radius, self._ratio)
+            except InputError:  # what says its sign has not come yet
+                continue
+            series = Series(series.t - channel.delay_s, series.values)
+            if sparse:
+                fixes[name] = series
+            else:
+                signals[:, CHANNELS.index(name)] = sampled(series, t, sparse=False)
+        self._place(fixes, t, signals)
+        self._steer(signals)
+        time = self._start_ns() + np.rint(t * NS).astype(np.int64)
+        return Block(t[:, None], time[:, None], signals[:, None])
+
+    def _recording(self, place: int, feed: Feed, oldest: float) -> Recording:
+        """What a source told lately."""
+        kept = self._readings[place]
+        for name, fresh in feed.take().items():
+            before = kept.get(name)
+            t, values = fresh.t, fresh.values
+            if before is not None:
+                t, values = np.concatenate([before.t, t]), np.concatenate([before.values, values])
+            order = np.argsort(t, kind="stable")
+            kept[name] = Series(t[order], values[order], fresh.unit)
+        for name, series in list(kept.items()):
+            first = int(np.searchsorted(series.t, oldest))
+            if first == len(series.t):
+                del kept[name]
+            elif first:
+                kept[name] = Series(series.t[first:], series.values[first:], series.unit)
+        return Recording(feed.name, dict(kept))
+
+    def _place(self, fixes: dict[str, Series], t: FloatArray, signals: FloatArray) -> None:
+        """Each fix in the row next to it, or, moved, in the first one where that has gone."""
+        half = 0.5 / self.rate_hz
+        speed, course = fixes.get(GROUND), fixes.get("yaw")
+        for name, series in fixes.items():
+            fresh = (series.t > self._used[name]) & (series.t < t[-1] + half) & np.isfinite(series.values)
+            fresh &= series.t > t[0] - OLDEST_FIX_S
+            times, values = series.t[fresh], series.values[fresh]
+            if not len(times):
+                continue
+            self._used[name] = float(times[-1])
+            v, yaw = (_at(other, times) for other in (speed, course))
+            if name == "yaw":
+                values = np.where(np.isnan(v) | (v > COURSE_SPEED), values, np.nan)
+            elif name in ("latitude", "longitude") and speed is not None and course is not None:
+                late = np.maximum(t[0] - half - times, 0.0)
+                along = np.nan_to_num(v * late * (np.sin(yaw) if name == "latitude" else np.cos(yaw)))
+                if name == "longitude":
+                    along /= math.cos(math.radians(float(np.mean(_at(fixes.get("latitude"), times)))))
+                values = values + np.degrees(along / EARTH_RADIUS_M)
+            rows = np.clip(np.searchsorted(t, times - half), 0, len(t) - 1)
+            if name == GROUND:
+                self.ground[rows] = values
+            else:
+                signals[rows, CHANNELS.index(name)] = values
+
+    def _steer(self, signals: FloatArray) -> None:
+        """As in a log: a front wheel that no profile names is as the other, rear wheels do not steer."""
+        fill_steering(signals, [name not in self._profile.channels for name in STEERING])
+
+    def _start_ns(self) -> int:
+        """The date of the host's start: by a receiver's clock where the host's is off, settled by the first fix."""
+        if self._date_ns is None and self._used["latitude"] > -math.inf:
+            leads = [
+                feed.stamps.lead for feed, kept in zip(self.feeds, self._readings, strict=True) if "course" in kept
+            ]
+            self._date_ns = self._clock.start_ns - round(leads[0] * NS) if leads else self._clock.start_ns
+        return self._clock.start_ns if self._date_ns is None else self._date_ns
+
+
+def _at(series: Series | None, times: FloatArray) -> FloatArray:
+    """The readings at just these times, NaN where there are none."""
+    found = np.full(len(times), np.nan)
+    if series is not None and len(series.t):
+        place = np.clip(np.searchsorted(series.t, times), 0, len(series.t) - 1)
+        same = series.t[place] == times
+        found[same] = series.values[place[same]]
+    return found

@@ -1,0 +1,141 @@
+"""Live sources as they are asked for on a command line: `kind:address?option=value`.
+
+source                                   is
+can:socketcan/can0, can:virtual/bench    a bus of python-can: interface, channel; `bus` is its number in the profile
+                                         (else that in the channel's name), other options are those of the interface
+ros2:tcp/127.0.0.1:7447                  topics of rmw_zenoh at a router, of `domain` (0); `frames=/can0` is one of
+                                         can_msgs/Frame; `messages=FOLDER` holds PACKAGE/NAME.msg of types of one's own
+vss:127.0.0.1:55555                      a Kuksa databroker; with `ca=FILE` by TLS, with `token=FILE` as somebody
+gpsd:127.0.0.1:2947                      a gpsd
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+from urllib.parse import parse_qsl
+
+from edge_agent.inputs.bring_in import database_of
+from edge_agent.inputs.live.can_bus import CanFeed, Decoder
+from edge_agent.inputs.live.databroker import DatabrokerFeed
+from edge_agent.inputs.live.feed import Feed, HostClock
+from edge_agent.inputs.live.gpsd import GpsdFeed
+from edge_agent.inputs.live.ros2 import Ros2Feed
+from edge_agent.inputs.profile import Profile, load_profile
+from edge_agent.inputs.readers.can_log import no_database
+from edge_agent.inputs.readers.dbc import Database
+from schemas.config import ZenohSettings
+from schemas.errors import InputError
+
+KINDS: Final = ("can", "gpsd", "ros2", "vss")
+PORTS: Final = {"gpsd": 2947, "vss": 55555}
+VSS_PROFILE: Final = "vss"
+
+
+def is_live(source: str) -> bool:
+    """Whether a source of `run` is a live one."""
+    return source.partition(":")[0] in KINDS
+
+
+def open_sources(
+    sources: Sequence[str], profile_name: str | None, dbc: Path | None = None
+) -> tuple[list[Feed], Profile, HostClock]:
+    """The sources, the profile that they are read by, and the clock that they share.
+
+    Args:
+        sources: as they are asked for.
+        profile_name: a file, or the name of a shipped one; a databroker alone needs none.
+        dbc: CAN database; else the profile's.
+
+    Raises:
+        InputError: a source, its profile or its library is missing or makes no sense.
+    """
+    kinds = [source.partition(":")[0] for source in sources]
+    if profile_name is None and "vss" in kinds:
+        profile_name = VSS_PROFILE
+    if profile_name is None:
+        raise InputError(
+            "profile", "is not given", "say which signal is which channel with --profile (import drafts one)"
+        )
+    profile, folder = load_profile(profile_name)
+    database = database_of(profile, folder, dbc)
+    clock = HostClock()
+    return [_open(source, profile, database, clock) for source in sources], profile, clock
+
+
+def _open(source: str, profile: Profile, database: Database | None, clock: HostClock) -> Feed:
+    kind, _, rest = source.partition(":")
+    address, _, query = rest.partition("?")
+    try:
+        options = dict(parse_qsl(query, strict_parsing=True)) if query else {}
+    except ValueError as error:
+        raise InputError("source", f"{source!r} has odd options ({error})", "write them like ?bus=1&fd=true") from error
+    if kind == "can":
+        if database is None:
+            raise no_database(Path(source))
+        return _can(source, address, options, profile, database, clock)
+    if kind == "gpsd":
+        return GpsdFeed(source, clock, _host(source, address, PORTS[kind]))
+    if kind == "vss":
+        return DatabrokerFeed(source, clock, address or f"127.0.0.1:{PORTS[kind]}", sorted(profile.needs()), options)
+    if kind == "ros2":
+        return _ros2(
+            source,
+            address,
+            options,
+            profile,
+            database,
+            clock,
+        )
+    raise InputError(
+        "source", f"{source!r} is of no known kind", f"begin it with one of {', '.join(KINDS)} and a colon"
+    )
+
+
+def _can(
+    source: str, address: str, options: dict[str, str], profile: Profile, database: Database, clock: HostClock
+) -> Feed:
+    interface, slash, channel = address.partition("/")
+    if not slash or not channel:
+        raise InputError("source", f"{source!r} has no channel", "write it like can:socketcan/can0")
+    number = re.fullmatch(r"[a-zA-Z]+(\d{1,3})", channel)  # can1 tells its number, an address does not
+    given_bus = options.pop("bus", number[1] if number else "")
+    bus = int(given_bus) if given_bus.isdigit() else None
+    given = {name: _typed(value) for name, value in options.items()}
+    return CanFeed(source, clock, Decoder(profile, database, bus), {"interface": interface, "channel": channel} | given)
+
+
+def _ros2(
+    source: str, address: str, options: dict[str, str], profile: Profile, database: Database | None, clock: HostClock
+) -> Feed:
+    settings = ZenohSettings(connect=[address]) if address else ZenohSettings()
+    domain, folder = options.get("domain", "0"), options.get("messages")
+    if not domain.isdigit():
+        raise InputError("source", f"{source!r}: a domain is a number", "write it like ?domain=0")
+    return Ros2Feed(
+        source, clock, settings, domain=int(domain), signals=sorted(profile.needs()),
+        decoder=None if database is None else Decoder(profile, database), buses=options.get("frames", "").split(),
+        types=Path(folder) if folder else None,
+    )  # fmt: skip
+
+
+def _typed(text: str) -> int | float | bool | str:
+    """An option as python-can wants it."""
+    if text in ("true", "false"):
+        return text == "true"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+def _host(source: str, address: str, port: int) -> tuple[str, int]:
+    host, _, number = address.rpartition(":") if ":" in address else (address or "127.0.0.1", "", str(port))
+    try:
+        return host, int(number)
+    except ValueError as error:
+        raise InputError("source", f"{source!r} has no port", f"write it like gpsd:127.0.0.1:{port}") from error

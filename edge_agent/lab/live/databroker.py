@@ -1,0 +1,114 @@
+"""The interface kuksa.val.v2 served by gRPC: what the specification says of GetValue, Subscribe and PublishValue.
+
+Unknown paths are NOT_FOUND; a subscription answers at once with all that is known, and then with each update; what a
+slow subscriber does not fetch is buffered up to its `buffer_size`, and then the oldest is dropped.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Self
+
+from edge_agent.inputs.live.kuksa import broker_pb2 as messages
+from edge_agent.inputs.recording import library
+from schemas.thresholds import NS
+
+LONGEST_BUFFER = 1000
+
+
+class Databroker:
+    """A server at host:port with some paths, without a value at first."""
+
+    def __init__(self, address: str, paths: Sequence[str]) -> None:
+        self._grpc = library("grpc")
+        self._values = {path: messages.Datapoint() for path in paths}
+        self._changed = threading.Condition()
+        self._subscribers: list[deque[Any]] = []
+        self._open = True
+        grpc = self._grpc
+        self._server = grpc.server(ThreadPoolExecutor(8))
+        asked = {
+            "GetValue": grpc.unary_unary_rpc_method_handler(
+                self._get, messages.GetValueRequest.FromString, messages.GetValueResponse.SerializeToString
+            ),
+            "PublishValue": grpc.unary_unary_rpc_method_handler(
+                self._take, messages.PublishValueRequest.FromString, messages.PublishValueResponse.SerializeToString
+            ),
+            "Subscribe": grpc.unary_stream_rpc_method_handler(
+                self._subscribe, messages.SubscribeRequest.FromString, messages.SubscribeResponse.SerializeToString
+            ),
+        }
+        self._server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler("kuksa.val.v2.VAL", asked),))
+        self.port = self._server.add_insecure_port(address)
+
+    def __enter__(self) -> Self:
+        self._server.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with self._changed:
+            self._open = False
+            self._changed.notify_all()
+        self._server.stop(0.5).wait()
+
+    @property
+    def subscribers(self) -> int:
+        """How many listen."""
+        return len(self._subscribers)
+
+    def publish(self, values: Mapping[str, float], time_ns: int) -> None:
+        """Tell new values of one moment."""
+        update = {}
+        for path, value in values.items():
+            point = messages.Datapoint(value=messages.Value(double=value))
+            point.timestamp.seconds, point.timestamp.nanos = divmod(time_ns, NS)
+            update[path] = point
+        self._tell(update)
+
+    def _tell(self, update: dict[str, Any]) -> None:
+        with self._changed:
+            self._values |= update
+            for waiting in self._subscribers:
+                waiting.append(update)
+            self._changed.notify_all()
+
+    def _get(self, request: Any, context: Any) -> Any:  # noqa: ANN401 grpc has no types
+        path = request.signal_id.path
+        if path not in self._values:
+            context.abort(self._grpc.StatusCode.NOT_FOUND, path)
+        return messages.GetValueResponse(data_point=self._values[path])
+
+    def _take(self, request: Any, context: Any) -> Any:  # noqa: ANN401
+        path = request.signal_id.path
+        if path not in self._values:
+            context.abort(self._grpc.StatusCode.NOT_FOUND, path)
+        self._tell({path: request.data_point})
+        return messages.PublishValueResponse()
+
+    def _subscribe(self, request: Any, context: Any) -> Iterator[Any]:  # noqa: ANN401
+        paths = set(request.signal_paths)
+        if not paths or request.buffer_size > LONGEST_BUFFER:
+            context.abort(self._grpc.StatusCode.INVALID_ARGUMENT, "no path, or too long a buffer")
+        if unknown := paths - self._values.keys():
+            context.abort(self._grpc.StatusCode.NOT_FOUND, ", ".join(sorted(unknown)))
+        waiting: deque[Any] = deque(maxlen=request.buffer_size + 1)
+        with self._changed:
+            known = {path: self._values[path] for path in paths}
+            self._subscribers.append(waiting)
+        yield messages.SubscribeResponse(entries=known)
+        try:
+            while context.is_active() and self._open:
+                with self._changed:
+                    if not self._changed.wait_for(lambda: waiting or not self._open, timeout=0.5):
+                        continue
+                    updates = [waiting.popleft() for _ in range(len(waiting))]
+                for update in updates:
+                    mine = {path: point for path, point in update.items() if path in paths}
+                    if mine:
+                        yield messages.SubscribeResponse(entries=mine)
+        finally:
+            with self._changed:
+                self._subscribers.remove(waiting)

@@ -1,0 +1,194 @@
+"""What live sources lose: samples at 100 Hz for a minute, and the agent itself when a source is killed."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Final
+
+import numpy as np
+
+from edge_agent.inputs.live.rows import LiveRows
+from edge_agent.inputs.live.sources import open_sources
+from edge_agent.lab.live.peers import CHANNELS, DBC, profile_of
+from edge_agent.lab.simulation.presets import PRESETS
+from schemas.numeric import BoolArray
+from schemas.runtime.figures import Figure
+from schemas.signals import CHANNELS as ALL
+from schemas.vehicle import Vehicle
+
+RATE_HZ: Final = 100.0
+MULTICAST: Final = "239.74.163.2"
+COUNTED: Final = ("can", "ros2", "vss")
+PATIENCE_S: Final = 60.0
+SETTLED_S: Final = 2.0  # after the last sample: rows come late by design
+KILLED: Final = 3  # times that each source is killed while an agent drives
+
+
+@dataclass
+class Peer:
+    """A running peer."""
+
+    process: subprocess.Popen[str]
+
+    def until(self, word: str) -> None:
+        """Wait for a line."""
+        for line in _lines(self.process.stdout):
+            if line == word:
+                return
+        raise RuntimeError(f"the peer ended before it was {word}")
+
+    def go(self) -> None:
+        """Tell it to begin, or to leave."""
+        assert self.process.stdin is not None
+        self.process.stdin.write("\n")
+        self.process.stdin.flush()
+
+    def kill(self) -> None:
+        """End it as a lost battery does."""
+        self.process.kill()
+        self.process.wait()
+
+
+def _lines(stream: IO[str] | None) -> Iterator[str]:
+    assert stream is not None
+    for line in stream:
+        yield line.strip()
+
+
+@contextmanager
+def peer(kind: str, address: str, samples: int, rate: float = RATE_HZ) -> Iterator[Peer]:
+    """A peer in a process of its own, ended at the end."""
+    words = [sys.executable, "-m", "edge_agent.lab.live.peers", kind, address, str(samples), str(rate)]
+    process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    running = Peer(process)
+    try:
+        yield running
+    finally:
+        running.kill()
+        for pipe in (process.stdin, process.stdout):
+            if pipe is not None:
+                pipe.close()
+
+
+def free_port() -> int:
+    """A port that nobody has now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def addresses(kind: str) -> tuple[str, str]:
+    """Where the peer is, and the source that listens to it."""
+    port = free_port()
+    if kind == "can":
+        return f"udp_multicast/{MULTICAST}/{port}", f"can:udp_multicast/{MULTICAST}?port={port}"
+    if kind == "ros2":
+        return f"tcp/127.0.0.1:{port}", f"ros2:tcp/127.0.0.1:{port}"
+    return f"127.0.0.1:{port}", f"{kind}:127.0.0.1:{port}"
+
+
+def written(kind: str, folder: Path) -> tuple[str, Path | None]:
+    """The peer's profile and database as files."""
+    if kind == "vss":
+        return "vss", None
+    profile, dbc = folder / f"{kind}.json", folder / "peer.dbc"
+    profile.write_text(profile_of(kind).text(), encoding="utf-8")
+    dbc.write_text(DBC, encoding="utf-8")
+    return str(profile), dbc
+
+
+def lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
+    """Samples lost between a source and the rows, and how many were sent.
+
+    Lost are messages that were not heard, and rows between the first and the last sample without a reading.
+    """
+    samples = round(seconds * RATE_HZ)
+    place, source = addresses(kind)
+    name, dbc = written(kind, folder)
+    vehicle = PRESETS["sedan"].vehicle
+    feeds, profile, clock = open_sources([source], name, dbc)
+    rows = LiveRows(feeds, profile, vehicle, clock)
+    parts, sent, quiet_since = [], 0, float("inf")
+    with peer(kind, place, samples) as running:
+        running.until("ready")
+        blocks = rows.blocks()
+        while not feeds[0].openings:
+            next(blocks)
+        running.go()
+        began = time.monotonic()
+        heard = 0
+        for block in blocks:
+            parts.append(block.signals[:, 0])
+            if feeds[0].heard > heard:
+                heard, quiet_since = feeds[0].heard, time.monotonic()
+            if time.monotonic() > quiet_since + SETTLED_S or time.monotonic() > began + seconds + PATIENCE_S:
+                break
+        blocks.close()
+        running.go()
+        for line in _lines(running.process.stdout):
+            if line.startswith("{"):
+                sent = json.loads(line)["sent"]
+                break
+    table = np.concatenate(parts)[:, [ALL.index(channel) for channel in CHANNELS]]
+    full: BoolArray = np.asarray(np.isfinite(table).all(axis=1))
+    here = np.flatnonzero(np.isfinite(table).any(axis=1))
+    inside = full[here[0] : here[-1] + 1] if len(here) else np.zeros(samples, bool)
+    short = max(samples - 2 - int(full.sum()), 0)
+    missing = -(-(sent - heard) * samples // max(sent, 1))
+    return max(missing, 0) + feeds[0].lost + max(int((~inside[2:-2]).sum()), short), samples
+
+
+def crashes(folder: Path, estimator: str = "aco-fckf") -> tuple[int, int]:
+    """Agents that did not end as they should although their sources were killed and came back, and how often."""
+    vehicle = folder / "car.json"
+    vehicle.write_text(Vehicle.model_validate(PRESETS["sedan"].vehicle).model_dump_json(exclude_none=True))
+    bad = tries = 0
+    for kind in (*COUNTED, "gpsd"):
+        place, source = addresses(kind)
+        name, dbc = written("can" if kind == "gpsd" else kind, folder)
+        config = folder / f"{kind}.agent.json"
+        spool = {"spool": str(folder / f"{kind}.sqlite"), "estimator": estimator}
+        config.write_text(json.dumps({"zenoh": {"connect": ["tcp/127.0.0.1:9"]}, **spool}), encoding="utf-8")
+        words = ["run", "--source", source, "--profile", name, "--vehicle", str(vehicle), "--name", "car-one"]
+        words += ["--config", str(config), "--trust", *(["--dbc", str(dbc)] if dbc else [])]
+        if kind == "gpsd":  # positions beside a bus
+            words += ["--source", addresses("can")[1]]
+        command = [sys.executable, "-c", "import sys; from edge_agent.cli import main; sys.exit(main(sys.argv[1:]))"]
+        agent = subprocess.Popen([*command, *words], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
+        for _ in range(KILLED):
+            with peer(kind, place, 100_000) as running:
+                running.go()
+                running.until("ready")
+                running.go()
+                time.sleep(SETTLED_S)
+            tries += 1
+            bad += agent.poll() is not None
+        time.sleep(SETTLED_S)
+        agent.terminate()
+        said, _ = agent.communicate(timeout=PATIENCE_S)
+        bad += agent.returncode != 0 or not said.strip().endswith("}")
+    return bad, tries
+
+
+def figures(folder: Path, seconds: float, kinds: Sequence[str] = COUNTED) -> list[Figure]:
+    """Samples lost by kind, and crashes."""
+    found = []
+    for kind in kinds:
+        missing, sent = lost(kind, folder, seconds)
+        found += [
+            Figure(f"live.{kind}.samples_lost", float(missing), "samples", 0.0),
+            Figure(f"live.{kind}.samples", float(sent), "samples"),
+        ]
+    bad, tries = crashes(folder)
+    return [
+        *found, Figure("live.source_loss.crashes", float(bad), "crashes", 0.0),
+        Figure("live.source_loss.losses", float(tries), "losses"),
+    ]  # fmt: skip

@@ -1,0 +1,182 @@
+"""What live sources listen to, as processes: `python -m edge_agent.lab.live.peers KIND ADDRESS SAMPLES RATE`.
+
+A peer says `ready`, waits for a line on its input, sends SAMPLES samples at RATE a second and says how many messages
+that were. It ends with its input; so it can be killed and started anew at the same address.
+Of a databroker it is the interface kuksa.val.v2 as published, not the broker itself.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import sys
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from typing import Any, Final
+
+import numpy as np
+
+from edge_agent.inputs.profile import Channel, Profile
+from edge_agent.inputs.recording import library
+from edge_agent.inputs.units import DEG
+from edge_agent.lab.live.databroker import Databroker
+from schemas.config import ZenohSettings
+from schemas.runtime.zenoh_session import open_session
+from schemas.signals import per_wheel
+from schemas.thresholds import NS
+
+SPEED, RADIUS = 15.0, 0.3  # [m/s], [m]
+CHANNELS: Final = ("ax", "ay", "yaw_rate", "delta_fl", *per_wheel("omega"))
+STEP: Final = 1e-6  # of a number on the bus
+DBC: Final = "".join(
+    f"BO_ {256 + k} M{k}: 8 X\n"
+    + "".join(f' SG_ {name} : {32 * n}|32@1- ({STEP},0) [0|0] "" X\n' for n, name in enumerate(CHANNELS[2 * k :][:2]))
+    for k in range(len(CHANNELS) // 2)
+)
+TOPIC: Final = "/car/imu"
+HASH: Final = "RIHS01_" + "0" * 64
+
+
+def drive_at(t: float) -> dict[str, float]:
+    """What the channels read at time t [s] of a gentle slalom."""
+    rate = 0.2 * np.sin(1.5 * t)
+    return {
+        "ax": 0.0, "ay": SPEED * rate, "yaw_rate": rate, "delta_fl": 2.7 * rate / SPEED,
+        **dict.fromkeys(per_wheel("omega"), SPEED / RADIUS),
+    }  # fmt: skip
+
+
+def profile_of(kind: str) -> Profile:
+    """The profile of a peer; a databroker's is the shipped one."""
+    if kind == "can":
+        return Profile(name=kind, channels={n: Channel(signal=n, message=f"M{k // 2}") for k, n in enumerate(CHANNELS)})
+    fields = {"ax": ".linear_acceleration.x", "ay": ".linear_acceleration.y", "yaw_rate": ".angular_velocity.z"}
+    wheels = {name: f"/car/joints.velocity[{name}]" for name in CHANNELS if name not in fields}
+    named = {name: f"{TOPIC}{field}" for name, field in fields.items()} | wheels
+    return Profile(name=kind, channels={name: Channel(signal=signal) for name, signal in named.items()})
+
+
+def paced(samples: int, rate: float) -> Iterator[float]:
+    """Times of samples [s], each when it is due."""
+    began = time.monotonic()
+    for k in range(samples):
+        time.sleep(max(0.0, began + k / rate - time.monotonic()))
+        yield k / rate
+
+
+def can(address: str, samples: int, rate: float) -> int:
+    """Four messages a sample onto a bus; the address is interface/channel/port."""
+    interface, channel, port = address.split("/")
+    made = library("can")
+    with made.Bus(interface=interface, channel=channel, port=int(port)) as bus:
+        ready()
+        for t in paced(samples, rate):
+            values = [round(value / STEP) for value in drive_at(t).values()]
+            for k in range(0, len(values), 2):
+                data = struct.pack("<ii", *values[k : k + 2])
+                bus.send(made.Message(arbitration_id=256 + k // 2, is_extended_id=False, data=data))
+    return samples * len(CHANNELS) // 2
+
+
+def ros2(address: str, samples: int, rate: float) -> int:
+    """An Imu and a JointState a sample, as rmw_zenoh publishes them; the address is where a router is opened."""
+    session = open_session(ZenohSettings(connect=[], config={"mode": "router", "listen/endpoints": [address]}))
+    assert session is not None
+    typesys = library("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+    of = store.types
+    header, stamp, vector, turned, imu, joints = (
+        of[name] for name in (
+            "std_msgs/msg/Header", "builtin_interfaces/msg/Time", "geometry_msgs/msg/Vector3",
+            "geometry_msgs/msg/Quaternion", "sensor_msgs/msg/Imu", "sensor_msgs/msg/JointState",
+        )
+    )  # fmt: skip
+    names = [name for name in CHANNELS if name not in ("ax", "ay", "yaw_rate")]
+    none = np.zeros(9)
+    with session:
+        put = [
+            session.declare_publisher(
+                f"0/{topic}/sensor_msgs::msg::dds_::{kind}_/{HASH}",
+                congestion_control=library("zenoh").CongestionControl.BLOCK,
+            )
+            for topic, kind in (("car/imu", "Imu"), ("car/joints", "JointState"))
+        ]
+        ready()
+        # the stubs call a matching status a bool
+        while not all(publisher.matching_status.matching for publisher in put):  # type: ignore[attr-defined]
+            time.sleep(0.01)
+        for k, t in enumerate(paced(samples, rate)):
+            now, values = time.time_ns(), drive_at(t)
+            head = header(stamp(now // NS, now % NS), "")
+            turn, pull = vector(0.0, 0.0, values["yaw_rate"]), vector(values["ax"], values["ay"], 9.8)
+            speeds = np.array([values[name] for name in names])
+            messages = (
+                imu(head, turned(0, 0, 0, 1), none, turn, none, pull, none),
+                joints(head, names, np.zeros(0), speeds, np.zeros(0)),
+            )
+            for number, (publisher, message) in enumerate(zip(put, messages, strict=True)):
+                attachment = struct.pack("<qqB", k, now, 16) + bytes([number] * 16)
+                publisher.put(bytes(store.serialize_cdr(message, message.__msgtype__)), attachment=attachment)
+        wait()  # what is under way arrives before the session closes
+    return 2 * samples
+
+
+def vss(address: str, samples: int, rate: float) -> int:
+    """A databroker, and its provider; the address is host:port."""
+    from edge_agent.inputs.live.sources import VSS_PROFILE
+    from edge_agent.inputs.profile import load_profile
+
+    paths = {name: channel.signals[0] for name, channel in load_profile(VSS_PROFILE)[0].channels.items()}
+    published = [name for name in CHANNELS if name in paths]
+    degrees = [name for name in published if name not in ("ax", "ay")]
+    with Databroker(address, [paths[name] for name in published]) as broker:
+        ready()
+        for t in paced(samples, rate):
+            now, values = time.time_ns(), drive_at(t)
+            broker.publish({paths[n]: values[n] / (DEG if n in degrees else 1.0) for n in published}, now)
+        wait()
+    return samples * len(published)
+
+
+def gpsd(address: str, samples: int, rate: float) -> int:
+    """Fixes of a car that goes east; the address is host:port."""
+    import socket
+
+    host, port = address.split(":")
+    with socket.create_server((host, int(port))) as server:
+        print("listening", flush=True)
+        connection, _ = server.accept()
+        with connection:
+            ready()
+            for t in paced(samples, rate):
+                place = {"lat": 57.7, "lon": 11.9 + t * SPEED / 59_500.0, "speed": SPEED, "track": 90.0}
+                report = {"class": "TPV", "mode": 3, "time": datetime.now(UTC).isoformat(), **place}
+                connection.sendall(json.dumps(report).encode() + b"\n")
+            wait()
+    return samples
+
+
+def ready() -> None:
+    """Say that it is, and wait to be told to begin."""
+    print("ready", flush=True)
+    wait()
+
+
+def wait() -> None:
+    """Until a line comes, or the input ends."""
+    sys.stdin.readline()
+
+
+PEERS: Final[dict[str, Callable[[str, int, float], int]]] = {"can": can, "ros2": ros2, "vss": vss, "gpsd": gpsd}
+
+
+def main(words: Any) -> None:  # noqa: ANN401
+    """Be a peer."""
+    kind, address, samples, rate = words
+    print(json.dumps({"sent": PEERS[kind](address, int(samples), float(rate))}), flush=True)
+    wait()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

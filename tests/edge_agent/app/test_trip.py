@@ -1,0 +1,136 @@
+"""A live trip: nothing is published before the doctor has passed, and what a trip teaches holds in the next."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Generator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edge_agent.app.trip import LEAST_S, LOOK_S, Trip, beside
+from edge_agent.inputs.block import Block
+from edge_agent.inputs.profile import Profile
+from edge_agent.lab.evaluation.planted import Recorded, drives, moved, scaled
+from schemas.signals import S
+from tests.waiting import until
+
+PROFILE = Profile(name="p", channels={})
+ROWS = 10
+
+
+@pytest.fixture(scope="module")
+def smooth() -> Recorded:
+    return drives(1, 31, rough=False, seconds=150)[0]
+
+
+def source(drive: Recorded) -> Generator[Block]:
+    for first in range(0, len(drive.t), ROWS):
+        t = drive.t[first : first + ROWS, None]
+        yield Block(t, np.rint(t * 1e9).astype(np.int64), drive.signals[first : first + ROWS, None])
+
+
+def driven(trip: Trip, drive: Recorded) -> tuple[list[bool], list[Block]]:
+    """Whether each block was admitted, and what the estimator would have got; the doctor is waited for."""
+    admitted, blocks = [], []
+    for block in trip.blocks(source(drive), lambda: np.full(ROWS, np.nan)):
+        if trip._looking is not None:
+            trip._looking.result()
+        admitted.append(trip.admitted())
+        blocks.append(block)
+    trip.end()
+    trip.close()
+    return admitted, blocks
+
+
+def test_nothing_is_admitted_before_the_doctor_has_passed(smooth: Recorded, tmp_path: Path) -> None:
+    trip = Trip(smooth.vehicle, PROFILE, tmp_path / "car.json")
+    assert trip.troubles()
+    admitted, blocks = driven(trip, smooth)
+    first = admitted.index(True)
+    assert LOOK_S - 1.0 <= blocks[first].t[0, 0] <= 4.0 * LOOK_S
+    assert all(admitted[first:])
+    assert not trip.troubles()
+
+
+def test_a_fault_is_never_admitted_and_teaches_nothing(
+    smooth: Recorded, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "car.json"
+    trip = Trip(smooth.vehicle, PROFILE, path)
+    admitted, _ = driven(trip, scaled([S.AY], -1.0)(smooth))
+    assert not any(admitted)
+    assert "ay sign" in trip.troubles()[0]
+    assert "ay sign" in caplog.text
+    assert not path.exists()
+    trusted = Trip(smooth.vehicle, PROFILE, path, trusted=True)
+    assert all(driven(trusted, scaled([S.AY], -1.0)(smooth))[0])
+    assert not path.exists(), "what is trusted is not for that reason learned from"
+
+
+def test_what_trips_teach_holds_from_the_next_one_on(smooth: Recorded, tmp_path: Path) -> None:
+    path, bad = tmp_path / "car.json", moved([S.YAW_RATE], 0.012)(smooth)
+    for count in range(1, 4):
+        trip = Trip(bad.vehicle, PROFILE, path)
+        assert trip.admitted() == (count > 1), "the doctor's word is remembered"
+        known = trip.vehicle.calibration
+        assert (0 if known is None else known.drives) == count - 1
+        _, blocks = driven(trip, bad)
+        taken = bad.signals[:, S.YAW_RATE] - np.concatenate([block.signals[:, 0, S.YAW_RATE] for block in blocks])
+        assert np.nanmax(np.abs(taken - (0.0 if count == 1 else np.nanmedian(taken)))) < 1e-12
+    assert np.nanmedian(taken) == pytest.approx(0.012, abs=0.004)
+
+
+def test_a_fault_that_comes_up_takes_the_doctors_word_back(smooth: Recorded, tmp_path: Path) -> None:
+    path = tmp_path / "car.json"
+    driven(Trip(smooth.vehicle, PROFILE, path), smooth)
+    broken = Trip(smooth.vehicle, PROFILE, path)
+    assert broken.admitted()
+    driven(broken, scaled([S.AY], -1.0)(smooth))
+    assert not Trip(smooth.vehicle, PROFILE, path).admitted()
+
+
+def test_another_car_or_a_broken_file_begins_anew(
+    smooth: Recorded, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "car.json"
+    driven(Trip(smooth.vehicle, PROFILE, path), smooth)
+    assert Trip(smooth.vehicle, PROFILE, path).admitted()
+    heavier = smooth.vehicle.model_copy(update={"mass": 2.0 * smooth.vehicle.mass})
+    assert not Trip(heavier, PROFILE, path).admitted()
+    assert not Trip(smooth.vehicle, PROFILE.model_copy(update={"name": "q"}), path).admitted()
+    for text in ("", "{}", "[" * 100_000, '{"version": 9}', path.read_text()[:-20]):
+        path.write_text(text)
+        caplog.clear()
+        assert not Trip(smooth.vehicle, PROFILE, path).admitted()
+        assert "learned anew" in caplog.text
+
+
+def test_a_short_trip_teaches_nothing_and_a_disk_that_refuses_is_no_crash(
+    smooth: Recorded, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path, rows = tmp_path / "car.json", round(0.9 * LEAST_S * 100)
+    driven(Trip(smooth.vehicle, PROFILE, path), replace_rows(smooth, rows))
+    assert Trip(smooth.vehicle, PROFILE, path).vehicle.calibration is None
+    with caplog.at_level(logging.WARNING):
+        driven(Trip(smooth.vehicle, PROFILE, tmp_path / "nowhere" / "car.json"), smooth)
+    assert "cannot be written" in caplog.text
+
+
+def replace_rows(drive: Recorded, rows: int) -> Recorded:
+    return drive._replace(t=drive.t[:rows], signals=drive.signals[:rows])
+
+
+def test_the_doctor_looks_beside_the_loop(smooth: Recorded, tmp_path: Path) -> None:
+    trip = Trip(smooth.vehicle, PROFILE, tmp_path / "car.json")
+    for block in trip.blocks(source(smooth), lambda: np.full(ROWS, np.nan)):
+        replace(block)  # the loop does not wait
+    until(lambda: trip._looking is not None and trip._looking.done())
+    assert trip.admitted()
+    trip.close()
+
+
+def test_what_is_known_lies_beside_the_outbox() -> None:
+    assert beside(Path("/var/lib/gripmap/spool.sqlite"), "car-one") == Path("/var/lib/gripmap/spool.car-one.json")

@@ -1,0 +1,392 @@
+"""Live sources: what they send comes in, on one clock; what they lose is told, and nothing falls over."""
+
+from __future__ import annotations
+
+import json
+import logging
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edge_agent.cli import main
+from edge_agent.inputs import live
+from edge_agent.inputs.live.feed import BELIEVED_S, WHILE_S, Feed, Heard, HostClock, Stamps
+from edge_agent.inputs.live.gpsd import GpsdFeed
+from edge_agent.inputs.live.ros2 import Ros2Feed, type_of
+from edge_agent.inputs.live.rows import DELAY_S, LiveRows
+from edge_agent.inputs.live.sources import is_live, open_sources
+from edge_agent.inputs.profile import Channel, Profile
+from edge_agent.inputs.recording import Series
+from edge_agent.lab.live.databroker import Databroker
+from edge_agent.lab.live.judge import COUNTED, addresses, free_port, lost, peer, written
+from edge_agent.lab.live.peers import CHANNELS, RADIUS, SPEED
+from edge_agent.lab.simulation.presets import PRESETS
+from schemas.errors import InputError
+from schemas.signals import CHANNELS as ALL
+from schemas.signals import S
+from schemas.thresholds import EARTH_RADIUS_M, NS
+from schemas.wire import Kind
+from tests.edge_agent.service import Router, Service
+from tests.waiting import until
+
+CAR = PRESETS["sedan"].vehicle
+
+
+class Steered(HostClock):
+    """A host's clock that stands until it is moved."""
+
+    def __init__(self) -> None:
+        super().__init__(start_ns=1_700_000_000 * NS)
+        object.__setattr__(self, "at", [0.0])
+
+    def now(self) -> float:
+        return float(self.__dict__["at"][0])
+
+    def move(self, seconds: float) -> None:
+        self.__dict__["at"][0] += seconds
+
+
+class Scripted(Feed):
+    """A source that says what it is told to say."""
+
+    def listen(self) -> None:
+        self.stopping.wait()
+
+    def series(self, heard: list[Heard]) -> dict[str, Series]:
+        names = {name for _, values in heard for name in values}
+        found = {name: [(t, values[name]) for t, values in heard if name in values] for name in names}
+        return {name: Series(*np.array(pairs).T) for name, pairs in found.items()}
+
+    def tell(self, t: float, **values: float) -> None:
+        self.hear(self.clock.start_ns + round(t * NS), values)
+
+
+@pytest.fixture
+def clock() -> Steered:
+    return Steered()
+
+
+def rows_of(clock: Steered, *feeds: Feed, wait: Callable[[float], None] | None = None) -> LiveRows:
+    profile = Profile(name="p", channels={name: Channel(signal=name) for name in ("ax", "omega_fl")})
+    return LiveRows(feeds, profile, CAR, clock, wait=wait or clock.move)
+
+
+def test_stamps_of_the_hosts_clock_are_believed_and_those_of_another_are_moved_by_the_least_delay() -> None:
+    own, other = Stamps(), Stamps()
+    delays = [0.3, 0.05, 0.2, 0.11]
+    assert [own.place(10.0 + k, 10.0 + k + delay) for k, delay in enumerate(delays)] == [10.0, 11.0, 12.0, 13.0]
+    places = [other.place(k - 5000.0, k + delay) for k, delay in enumerate(delays)]
+    assert places[1:] == pytest.approx([1.05, 2.05, 3.05])
+    early = Stamps()
+    assert early.place(10.5, 10.1) == pytest.approx(10.1), "from the future: another clock"
+    assert own.lead == 0.0
+    assert max(delays) < BELIEVED_S
+
+
+def test_a_clock_that_is_set_under_way_is_followed() -> None:
+    stamps = Stamps()
+    for k in range(20):
+        stamps.place(k * 1.0, k + 0.02)
+    for k in range(20, 20 + round(2.5 * WHILE_S)):
+        placed = stamps.place(k - 3600.0, k + 0.02)
+    assert placed == pytest.approx(k + 0.02)
+
+
+def test_rows_are_linear_between_readings_and_empty_where_a_source_is_silent(clock: Steered) -> None:
+    feed, last = Scripted("bus", clock), 4.0
+    ticks = iter(np.arange(0.0, last + 0.01, 0.02).tolist())  # 50 Hz
+    due = [next(ticks)]
+
+    def wait(seconds: float) -> None:
+        until_then = clock.now() + seconds
+        while due and due[0] <= until_then:
+            clock.move(due[0] - clock.now())
+            feed.tell(due[0], ax=5.0 * due[0], omega_fl=7.0)
+            due[:] = [tick for tick in [next(ticks, None)] if tick is not None]
+        clock.move(until_then - clock.now())
+
+    rows = rows_of(clock, feed, wait=wait)
+    blocks = rows.blocks()
+    got = [next(blocks) for _ in range(60)]
+    t, signals = (np.concatenate([getattr(block, name)[:, 0] for block in got]) for name in ("t", "signals"))
+    told = t <= last + 1e-9
+    assert np.allclose(signals[told, S.AX], 5.0 * t[told], atol=1e-6)
+    assert np.isnan(signals[~told, S.AX]).all()
+    assert (~told).sum() > 100
+    assert (signals[:, S.DELTA + 2] == 0.0).all(), "rear wheels do not steer"
+    assert np.allclose(np.diff(t), 0.01)
+    assert (got[0].time[0] - clock.start_ns) / NS == pytest.approx(t[0], abs=1e-8)
+    assert rows.troubles() == ["bus is silent for 2 s"]
+    assert clock.now() == pytest.approx(t[-1] + 0.01 + DELAY_S)
+    blocks.close()
+    assert not feed._thread.is_alive()
+
+
+def test_a_host_that_slept_leaves_rows_out(clock: Steered) -> None:
+    feed = Scripted("bus", clock)
+    rows = rows_of(clock, feed)
+    blocks = rows.blocks()
+    before = next(blocks)
+    clock.move(60.0)
+    after = next(blocks)
+    assert after.t[0, 0] - before.t[-1, 0] > 59.0
+    assert rows.skipped == pytest.approx(6000, abs=20)
+    blocks.close()
+
+
+def test_a_late_fix_is_moved_along_its_course_and_used_once(clock: Steered) -> None:
+    bus, receiver = Scripted("bus", clock), Scripted("receiver", clock)
+    rows = rows_of(clock, bus, receiver)
+    blocks = rows.blocks()
+    for _ in range(8):
+        next(blocks)
+    now = clock.now()
+    receiver.tell(now - 0.8, latitude=50.0, longitude=10.0, speed=20.0, course=0.0)  # north, and its row has gone
+    block = next(blocks)
+    place = np.isfinite(block.signals[:, 0, S.LATITUDE])
+    assert np.flatnonzero(place).tolist() == [0]
+    moved = np.radians(block.signals[0, 0, S.LATITUDE] - 50.0) * EARTH_RADIUS_M
+    assert moved == pytest.approx(20.0 * (block.t[0, 0] - 0.005 - (now - 0.8)), rel=1e-3)
+    assert block.signals[0, 0, S.LONGITUDE] == pytest.approx(10.0, abs=1e-9)
+    assert block.signals[0, 0, S.YAW] == pytest.approx(np.pi / 2)
+    assert rows.ground[0] == 20.0
+    assert all(np.isnan(next(blocks).signals[:, 0, S.LATITUDE]).all() for _ in range(5))
+    blocks.close()
+
+
+def test_the_receivers_date_holds_where_the_hosts_is_wrong(clock: Steered) -> None:
+    bus, receiver = Scripted("bus", clock), Scripted("receiver", clock)
+    rows = rows_of(clock, bus, receiver)
+    blocks = rows.blocks()
+    next(blocks)
+    for _ in range(10):
+        receiver.tell(clock.now() + 86_400.0, latitude=50.0, longitude=10.0, speed=0.0, course=0.0)
+        block = next(blocks)
+    assert (block.time[0, 0] - clock.start_ns) / NS == pytest.approx(86_400.0 + block.t[0, 0], abs=0.01)
+    blocks.close()
+
+
+class Failing(Scripted):
+    """A driver that raises, then ends, then works."""
+
+    tries = 0
+
+    def listen(self) -> None:
+        self.tries += 1
+        if self.tries == 1:
+            raise OSError("no such device")
+        if self.tries > 2:
+            self.tell(self.clock.now(), ax=1.0)
+            self.stopping.wait()
+
+
+def test_a_source_that_raises_or_ends_is_opened_again_and_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    feed = Failing("bus", HostClock())
+    with caplog.at_level(logging.WARNING):
+        feed.start()
+        until(lambda: feed.heard)
+    feed.close()
+    assert feed.losses == 2
+    assert [record.getMessage() for record in caplog.records] == [
+        "bus: lost (no such device); trying again", "bus: lost (it ended); trying again",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", COUNTED)
+def test_what_a_peer_sends_comes_in_without_a_sample_lost(kind: str, tmp_path: Path) -> None:
+    assert lost(kind, tmp_path, 1.0) == (0, 100)
+
+
+def test_the_values_of_every_peer_are_those_that_were_sent(tmp_path: Path) -> None:
+    for kind in COUNTED:
+        place, source = addresses(kind)
+        name, dbc = written(kind, tmp_path)
+        feeds, profile, clock = open_sources([source], name, dbc)
+        rows = LiveRows(feeds, profile, CAR, clock)
+        with peer(kind, place, 100_000) as running:
+            running.until("ready")
+            blocks = rows.blocks()
+            got = next(blocks).signals
+            running.go()
+            patience = iter(range(200))
+            while not np.isfinite(got[..., [ALL.index(name) for name in CHANNELS]]).all():
+                got = next(blocks).signals
+                next(patience)
+            blocks.close()
+        assert got[..., S.OMEGA : S.OMEGA + 4] == pytest.approx(SPEED / RADIUS, rel=1e-6)
+        assert got[..., S.AY] == pytest.approx(SPEED * got[..., S.YAW_RATE], abs=1e-2)  # arrivals are unsteady
+        assert got[..., S.DELTA] == pytest.approx(2.7 * got[..., S.YAW_RATE] / SPEED, abs=1e-3)
+
+
+@pytest.mark.parametrize("kind", [*COUNTED, "gpsd"])
+def test_a_source_that_was_killed_is_heard_again_when_it_is_back(kind: str, tmp_path: Path) -> None:
+    place, source = addresses(kind)
+    name, dbc = written("can" if kind == "gpsd" else kind, tmp_path)
+    feeds, _, _ = open_sources([source], name, dbc)
+    feed = feeds[0]
+    feed.start()
+    try:
+        for _ in range(2):
+            with peer(kind, place, 100_000) as running:
+                running.go()
+                running.until("ready")
+                running.go()
+                before = feed.heard
+                until(lambda: feed.heard > before + 20)  # noqa: B023 waited for here
+            until(lambda: feed.trouble is not None)
+    finally:
+        feed.close()
+    assert feed.broken == 0
+
+
+def test_hostile_bytes_on_a_topic_are_counted_and_the_next_message_is_read(tmp_path: Path) -> None:
+    from schemas.config import ZenohSettings
+    from schemas.runtime.zenoh_session import open_session
+
+    router = Router()
+    feed = Ros2Feed("ros2:", HostClock(), router.settings, domain=0, signals=["/imu.angular_velocity.z"])
+    feed.start()
+    session = open_session(ZenohSettings(connect=[router.endpoint]))
+    assert session is not None
+    key = "0/imu/sensor_msgs::msg::dds_::Imu_/RIHS01_0"
+    rng = np.random.default_rng(3)
+
+    def hears(payload: bytes, heard: Callable[[], bool]) -> None:
+        def sent() -> bool:
+            session.put(key, payload)
+            return heard()
+
+        until(sent)
+
+    hears(b"\x00\x01\x00\x00", lambda: feed.broken > 0)
+    for _ in range(200):
+        session.put(key, rng.bytes(int(rng.integers(400))))
+    good = b"\x00\x01\x00\x00" + bytes(8) + b"\x01\x00\x00\x00" + bytes(300)
+    hears(good, lambda: feed.heard > 0)
+    assert list(feed.take()) == ["/imu.angular_velocity.z"]
+    session.put("0/imu/nonsense/RIHS01_0", good)
+    session.close()
+    feed.close()
+    router.stop()
+    with pytest.raises(ValueError, match="no type"):
+        type_of("0/imu/nonsense/RIHS01_0")
+    assert type_of(key) == "sensor_msgs/msg/Imu"
+
+
+def test_hostile_lines_of_a_receiver_are_counted() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        feed = GpsdFeed("gpsd:", HostClock(), ("127.0.0.1", server.getsockname()[1]))
+        feed.start()
+        connection, _ = server.accept()
+        fix = {"class": "TPV", "mode": 3, "lat": 50.0, "lon": 10.0}
+        bad = [
+            b"\xff\xfe{",
+            b"{" * 90_000,
+            b"[1]",
+            json.dumps(fix | {"lat": 1e9, "time": "2026-01-01T00:00:00Z"}).encode(),
+        ]
+        with connection:
+            connection.sendall(b"\n".join([*bad, b'{"class":"TPV","mode":3,"time":"soon"}', b""]))
+            now = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+            connection.sendall(json.dumps(fix | {"time": now}).encode() + b"\n")
+            until(lambda: feed.heard)
+            assert feed.broken == 5
+            assert set(feed.take()) == {"latitude", "longitude", "speed", "course"}
+            connection.sendall(b"x" * 200_000)  # a line without an end is no receiver
+            until(lambda: feed.losses)
+        feed.close()
+
+
+def test_a_databroker_is_asked_for_what_it_knows_and_old_values_are_no_readings(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    port = free_port()
+    paths = ["Vehicle.Acceleration.Longitudinal", "Vehicle.Acceleration.Lateral"]
+    with Databroker(f"127.0.0.1:{port}", paths) as broker:
+        broker.publish({paths[0]: 5.0}, time.time_ns() - 3600 * NS)
+        (feed,), _, _ = open_sources([f"vss:127.0.0.1:{port}"], None)
+        feed.start()
+        until(lambda: broker.subscribers)
+        broker.publish({paths[1]: 2.0}, time.time_ns())
+        until(lambda: feed.heard)
+        assert {name: series.values.tolist() for name, series in feed.take().items()} == {paths[1]: [2.0]}
+        feed.close()
+    assert "does not know Vehicle.AngularVelocity.Yaw" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("source", "profile", "named"),
+    [
+        ("can:socketcan", "toyota", "channel"), ("can:virtual/a", "vss", "dbc"), ("gpsd:here:there", "toyota", "port"),
+        ("can:virtual/a", None, "profile"), ("ros2:?domain=x", "vss", "domain"), ("ros2:", "vss", "topic"),
+        ("can:virtual/a?bus", "toyota", "options"), ("vss:?token=/nowhere", None, "token|nowhere"),
+        ("can:virtual/a", "no such profile", "profile"), ("ros2:?messages=/nowhere", "vss", "topic"),
+    ],
+)  # fmt: skip
+def test_a_source_that_makes_no_sense_is_one_clear_error(source: str, profile: str | None, named: str) -> None:
+    assert is_live(source)
+    with pytest.raises(InputError, match=named):
+        open_sources([source], profile)
+
+
+def test_a_bus_tells_its_number_and_the_profile_which_it_reads() -> None:
+    from edge_agent.inputs.live.can_bus import Decoder
+    from edge_agent.inputs.profile import FOLDER
+    from edge_agent.inputs.readers.dbc import read_dbc
+
+    database = read_dbc(FOLDER / "toyota.dbc")
+    on = Profile(name="p", channels={"ax": Channel(signal="ACCEL_X", message="KINEMATICS", bus=1)})
+    assert [len(Decoder(on, database, bus).identifiers) for bus in (None, 0, 1)] == [1, 0, 1]
+
+
+@pytest.mark.timeout(600)  # kernels may have to be compiled
+def test_a_live_car_is_driven_by_its_bus_and_its_receiver(service: Service, tmp_path: Path) -> None:
+    (bus, can), (receiver, gpsd) = addresses("can"), addresses("gpsd")
+    name, dbc = written("can", tmp_path)
+    (tmp_path / "car.json").write_text(CAR.model_dump_json(exclude_none=True))
+    config = {"zenoh": service.router.settings.model_dump(), "spool": str(tmp_path / "s.sqlite"), "flush_s": 0.1}
+    (tmp_path / "agent.json").write_text(json.dumps(config))
+    words = ["run", "--source", can, "--source", gpsd, "--profile", name, "--dbc", str(dbc), "--trust"]
+    words += ["--vehicle", str(tmp_path / "car.json"), "--config", str(tmp_path / "agent.json"), "--estimator", "ckf"]
+    command = [sys.executable, "-c", "import sys; from edge_agent.cli import main; sys.exit(main(sys.argv[1:]))"]
+    agent = subprocess.Popen([*command, *words, "--name", "car-one"], stdout=subprocess.PIPE, text=True)
+    with peer("can", bus, 100_000) as one, peer("gpsd", receiver, 100_000, 5.0) as other:
+        for running in (one, other):
+            running.until("ready")
+            running.go()
+        service.wait(lambda batches: sum(batch.kind == Kind.OBSERVATION for batch in batches) >= 2)
+        agent.terminate()
+        said, _ = agent.communicate(timeout=60)
+    assert agent.returncode == 0
+    assert json.loads(said.splitlines()[-1])["acknowledged"] > 0
+    assert {batch.vehicle for batch in service.batches} == {"car-one"}
+
+
+def test_live_sources_and_a_log_do_not_go_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "car.json").write_text(CAR.model_dump_json(exclude_none=True))
+    assert main(["run", "--source", "gpsd:", "--source", "simulated", "--vehicle", str(tmp_path / "car.json")]) == 2
+    assert "together" in capsys.readouterr().err
+    assert main(["run", "--source", "gpsd:", "--profile", "toyota"]) == 2
+    assert "--vehicle" in capsys.readouterr().err
+
+
+def test_the_module_of_the_messages_is_the_one_that_the_proto_gives(tmp_path: Path) -> None:
+    from tests.schemas.test_documents import descriptor
+
+    folder = Path(live.__file__).parent / "kuksa"
+    words = ["-m", "grpc_tools.protoc", "-I", str(folder), f"--python_out={tmp_path}", "broker.proto"]
+    subprocess.run([sys.executable, *words], check=True)
+    made, kept = ((place / "broker_pb2.py").read_text() for place in (tmp_path, folder))
+    assert descriptor(made) == descriptor(kept)
+
+
+def test_nothing_is_left_running() -> None:
+    names = {thread.name for thread in threading.enumerate()}
+    assert not [name for name in names if is_live(name)]
