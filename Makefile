@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: setup demo test test-shuffled check lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test
+.PHONY: setup demo test test-shuffled check package lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test
 
 setup: $(STAMP)  ## make .venv and install everything, pinned
 
@@ -28,7 +28,10 @@ lint: setup
 types: setup
 	$(BIN)/mypy
 
-check: lint types test faults-quick  ## what CI runs
+check: lint types test package faults-quick  ## what CI runs
+
+package: setup  ## wheel and sdist, installed in a fresh environment outside the repository and used there
+	$(BIN)/python -m tests.packaging
 
 faults: setup  ## the fault campaigns, half an hour; writes .faults/figures.json
 	$(BIN)/python -m tests.faults

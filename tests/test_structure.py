@@ -86,7 +86,8 @@ PURE_SCHEMAS = {
 # Top-level entries of the design, section 2; dot files and lock files may lie beside them.
 TOP_LEVEL = {
     "pyproject.toml", "README.md", "edge_agent", "fleet_service", "schemas", "deploy", "tests",
-    "Makefile", "LICENSE", "CONTRIBUTING.md", "constraints.txt",
+    "Makefile", "LICENSE", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md", "CITATION.cff", "constraints.txt",
+    "gripmap.py",  # the one import name of the four packages
 }  # fmt: skip
 # What Python's own tools leave behind in a working copy; never part of a commit.
 LEFT_BEHIND = ("__pycache__", "gripmap.egg-info", "build", "dist")

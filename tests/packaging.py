@@ -1,0 +1,91 @@
+"""`make package`: builds sdist and wheel, tries the wheel in a fresh environment, far from here.
+
+The wheel is built from the sdist, so that what is missing in the one is missed in the other. `--python` names other
+interpreters to try it with.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from tests.house import ROOT
+
+FIRST_USE = """
+import gripmap
+assert {"schemas", "edge_agent", "fleet_service", "deploy"} == set(gripmap.PACKAGES)
+import edge_agent, fleet_service, schemas
+from importlib.metadata import metadata
+about = metadata("gripmap")
+assert about["License-Expression"] == "Apache-2.0" and about["Summary"] and about["Description"], about
+from pathlib import Path
+for package in (schemas, edge_agent, fleet_service):
+    assert (Path(package.__file__).parent / "py.typed").is_file(), package
+"""
+HIDING = "import gripmap"
+
+
+def main() -> int:
+    """Build, install, use; exit code 1 with what went wrong."""
+    parser = argparse.ArgumentParser(prog="python -m tests.packaging", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--python", nargs="*", default=[sys.executable], help="interpreters (default: this one)")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        built = Path(folder) / "dist"
+        run([sys.executable, "-m", "build", "--outdir", built, ROOT], ROOT)
+        (wheel,) = built.glob("*.whl")
+        for number, python in enumerate(args.python):
+            use(python, wheel, Path(folder) / f"use{number}")
+    return 0
+
+
+def use(python: str, wheel: Path, folder: Path) -> None:
+    """Install the wheel for an interpreter and do in an empty folder what a new user does first."""
+    folder.mkdir()
+    run([python, "-m", "venv", folder / "venv"], folder)
+    scripts = folder / "venv" / "bin"
+    install: list[str | Path] = [
+        "install",
+        "--quiet",
+        "--disable-pip-version-check",
+        "--constraint",
+        ROOT / "constraints.txt",
+        wheel,
+    ]
+    run([scripts / "python", "-m", "pip", *install], folder)
+    run([scripts / "python", "-c", FIRST_USE], folder)
+    log: list[str | Path] = ["--out", "drive.parquet", "--vehicle-out", "car.json"]
+    run([scripts / "edge-agent", "simulate", "slalom", "--mu", ".6", *log], folder)
+    run(
+        [scripts / "edge-agent", "replay", "drive.parquet", "--vehicle", "car.json", "--out", "estimates.parquet"],
+        folder,
+    )
+    run([scripts / "fleet-service", "--help"], folder)
+    own = folder / "own"
+    (own / "schemas").mkdir(parents=True)
+    (own / "schemas" / "__init__.py").touch()
+    hidden = subprocess.run(
+        [scripts / "python", "-c", HIDING], cwd=own, capture_output=True, text=True, check=False, timeout=60
+    )
+    if hidden.returncode == 0 or str(own / "schemas") not in hidden.stderr or "rename it" not in hidden.stderr:
+        raise SystemExit(f"a package `schemas` of the user's own is not named: {hidden.stderr}")
+
+
+def run(command: list[str | Path], folder: Path) -> None:
+    """Run a command in a folder, with the seconds it took; SystemExit with its output where it fails."""
+    began = time.monotonic()
+    done = subprocess.run(
+        [str(part) for part in command], cwd=folder, capture_output=True, text=True, check=False, timeout=600
+    )
+    line = " ".join(Path(str(part)).name if "/" in str(part) else str(part) for part in command).split("\n")[0]
+    print(f"{time.monotonic() - began:6.1f} s  {line[:100]}", flush=True)
+    if done.returncode != 0:
+        raise SystemExit(f"{done.stdout}\n{done.stderr}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
