@@ -28,6 +28,7 @@ REGION_ZOOM: Final = 10
 ZONE_ZOOM: Final = 7
 MAX_LATITUDE: Final = 85.05112877980659
 SECTORS: Final = 4
+HEADINGS: Final = ("east", "north", "west", "south")  # of the sectors
 SECTOR_MARGIN: Final = np.radians(15.0)  # a heading this near to a sector's edge belongs to both sectors
 
 # spreading the bits of a 32-bit number to the even places of a 64-bit one: shift, then keep

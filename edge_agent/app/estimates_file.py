@@ -6,10 +6,11 @@ import os
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 
 from schemas.errors import InputError
@@ -21,6 +22,7 @@ from schemas.tables import ESTIMATES_SCHEMA
 if TYPE_CHECKING:
     from edge_agent.estimators import Estimates
 
+ENDINGS: Final[dict[str, Any]] = {"": pq.ParquetWriter, ".parquet": pq.ParquetWriter, ".csv": pacsv.CSVWriter}
 WHEEL_COLUMNS = tuple(f"{wheel}{end}" for wheel in per_wheel("mu") for end in ("", "_lower", "_upper"))
 
 
@@ -40,13 +42,35 @@ def writable(field: str, path: Path) -> Path:
     return path
 
 
+def write_table(field: str, path: Path, table: pa.Table) -> None:
+    """Write a table as the ending of the path says, whole or not at all.
+
+    Raises:
+        InputError: the path cannot be written, or has an ending that is none of ENDINGS.
+    """
+    with written(writable(field, path)) as file, _table_writer(path, field)(file, table.schema) as writer:
+        writer.write_table(table)
+
+
+def _table_writer(path: Path, field: str = "out") -> Any:  # noqa: ANN401 a class of Arrow
+    if path.suffix not in ENDINGS:
+        problem, fix = f"{path.name} has no known ending", f"use one of {', '.join(name for name in ENDINGS if name)}"
+        raise InputError(field, problem, fix)
+    return ENDINGS[path.suffix]
+
+
 class EstimatesFile:
-    """Writes estimates block by block; the file appears under its name when it is whole."""
+    """Writes estimates block by block, as the ending says; the file appears under its name when it is whole.
+
+    Raises:
+        InputError: the path cannot be written, or has an ending that is none of ENDINGS.
+    """
 
     def __init__(self, path: Path) -> None:
         with ExitStack() as opened:
+            writer = _table_writer(path)
             file = opened.enter_context(written(writable("out", path)))
-            self._writer = opened.enter_context(pq.ParquetWriter(file, ESTIMATES_SCHEMA))
+            self._writer = opened.enter_context(writer(file, ESTIMATES_SCHEMA))
             self._opened = opened.pop_all()
 
     def __enter__(self) -> Self:

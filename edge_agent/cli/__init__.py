@@ -1,4 +1,4 @@
-"""`edge-agent`: simulate, import, check, calibrate, replay, run, fleet, tune, evaluate.
+"""`edge-agent`: simulate, import, check, calibrate, replay, run, fleet, tune, evaluate, completion.
 
 Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. What a command needs is imported when
 it is chosen, so that help is quick.
@@ -12,10 +12,13 @@ import logging
 import sys
 import traceback
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import Final, NamedTuple
 
-FAILED: Final = 1
-BAD_INPUT: Final = 2
+from schemas.runtime import commandline, talk
+
+FAILED: Final = commandline.FAILED
+BAD_INPUT: Final = commandline.BAD_INPUT
 LIVE: Final = ("run", "fleet")  # commands that drive for hours
 
 
@@ -25,37 +28,41 @@ class Command(NamedTuple):
     name: str
     module: str
     help: str
+    example: str
 
 
 COMMANDS: Final = (
-    Command("simulate", "edge_agent.cli.simulate", "write the signal log of a manoeuvre, with truth"),
-    Command("import", "edge_agent.cli.import_", "any car's recording to a signal log: CAN, MDF, ROS, CSV, GNSS"),
-    Command("check", "edge_agent.cli.check", "the signal doctor: units, signs, clocks, offsets, by physics"),
-    Command("calibrate", "edge_agent.cli.calibrate", "a vehicle file learned from a car's own drives"),
-    Command("replay", "edge_agent.cli.replay", "estimate a recorded drive, and publish it on request"),
-    Command("run", "edge_agent.cli.run", "one vehicle, live, in real time"),
-    Command("fleet", "edge_agent.cli.fleet", "many simulated vehicles in real time, each with its own session"),
-    Command("tune", "edge_agent.cli.tune", "tune the fuzzy memberships by ant colony"),
-    Command("evaluate", "edge_agent.cli.evaluate", "the papers' manoeuvres for every estimator, with figures"),
-)
+    Command("simulate", "edge_agent.cli.simulate", "write the signal log of a manoeuvre, with truth",
+            "edge-agent simulate double-lane-change --mu 0.5 --seed 1 --out drive.parquet --vehicle-out drive.json"),
+    Command("import", "edge_agent.cli.import_", "any car's recording to a signal log: CAN, MDF, ROS, CSV, GNSS",
+            "edge-agent import drive.blf drive.nmea --profile toyota --vehicle car.json --out drive.parquet"),
+    Command("check", "edge_agent.cli.check", "the signal doctor: units, signs, clocks, offsets, by physics",
+            "edge-agent check drive.parquet --vehicle car.json --out check.html"),
+    Command("calibrate", "edge_agent.cli.calibrate", "a vehicle file learned from a car's own drives",
+            "edge-agent calibrate monday.parquet tuesday.parquet --vehicle car.json --out better.json"),
+    Command("replay", "edge_agent.cli.replay", "estimate a recorded drive, and publish it on request",
+            "edge-agent replay drive.parquet --vehicle car.json --out estimates.parquet"),
+    Command("run", "edge_agent.cli.run", "one vehicle, live, in real time",
+            "edge-agent run --source simulated --name car-one --config agent.json"),
+    Command("fleet", "edge_agent.cli.fleet", "many simulated vehicles in real time, each with its own session",
+            "edge-agent fleet --vehicles 36 --duration 150 --config agent.json"),
+    Command("tune", "edge_agent.cli.tune", "tune the fuzzy memberships by ant colony",
+            "edge-agent tune --seed 1 --out memberships.json"),
+    Command("evaluate", "edge_agent.cli.evaluate", "the papers' manoeuvres for every estimator, with figures",
+            "edge-agent evaluate --quick --out evaluation"),
+    Command("completion", "edge_agent.cli.completion", "print what completes these commands in a shell",
+            "edge-agent completion bash > ~/.local/share/bash-completion/completions/edge-agent"),
+)  # fmt: skip
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line; returns the exit code."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    parser = argparse.ArgumentParser(
-        prog="edge-agent", description="Friction and motion of a vehicle from its sensors."
-    )
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    arguments = commandline.joined(sys.argv[1:] if argv is None else argv)
     chosen = next((argument for argument in arguments if not argument.startswith("-")), None)
-    for command in COMMANDS:
-        sub = commands.add_parser(command.name, help=command.help, description=command.help)
-        if command.name == chosen:
-            module = importlib.import_module(command.module)
-            module.add_arguments(sub)
-            sub.set_defaults(run=module.run)
-    args = parser.parse_args(arguments)
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    args = parser_of(chosen).parse_args(arguments)
+    level = logging.DEBUG if args.verbose else logging.ERROR if args.quiet else logging.INFO
+    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    talk.speak(quiet=args.quiet)
     from edge_agent.cli.common import left_behind
     from schemas.runtime.process import end_now, limit_memory
 
@@ -63,7 +70,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         limit_memory()
     code = FAILED
     try:
-        code = _code(args)
+        with nullcontext() if chosen in LIVE else talk.busy(str(chosen)):
+            code = commandline.guarded(lambda: int(args.run(args)))
     except Exception:
         if not left_behind.is_set():
             raise
@@ -73,11 +81,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     return code
 
 
-def _code(args: argparse.Namespace) -> int:
-    from schemas.errors import InputError
-
-    try:
-        return int(args.run(args))
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return BAD_INPUT
+def parser_of(*chosen: str | None) -> argparse.ArgumentParser:
+    """All commands by name, and the options of those chosen."""
+    parser = argparse.ArgumentParser(
+        prog="edge-agent", description="Friction and motion of a vehicle from its sensors."
+    )
+    parser.add_argument("--version", action=commandline.VersionAction)
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for command in COMMANDS:
+        sub = commandline.add_command(commands, command.name, command.help, command.example)
+        if command.name in chosen:
+            module = importlib.import_module(command.module)
+            module.add_arguments(sub)
+            sub.set_defaults(run=module.run)
+    return parser

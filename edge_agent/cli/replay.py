@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from schemas.runtime import commandline
 from schemas.thresholds import NS
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON) (default: LOG.json beside LOG.parquet)")
     parser.add_argument("--estimator", help="estimator by name (default: the configuration's, aco-fckf)")
     parser.add_argument(
-        "--out", type=Path, required=True, help="estimates to write (Parquet); of several logs, a folder"
+        "--out", type=Path, required=True, help="estimates to write (.parquet, .csv); of several logs, a folder"
     )
     parser.add_argument("--jobs", type=int, default=1, help="logs at a time (default 1)")
     parser.add_argument("--publish", action="store_true", help="send observations and states, wait for acknowledgement")
@@ -61,9 +62,10 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(
                 "publish", f"{len(args.log)} logs into a folder", "publish one log, to one file, at a time"
             )
-        tasks = tasks_of(args.log, args.vehicle, args.out)
+        tasks = tasks_of(args.log, args.vehicle, args.out)  # refuses to write over a log
         return _print_outcomes(backfill(tasks, estimator, args.jobs), len(tasks))
     path = args.log[0]
+    commandline.not_an_input("out", args.out, [path, args.vehicle or beside(path)])
     vehicle = load_vehicle(args.vehicle or beside(path))
     bank = bank_of(estimator, [vehicle])
     log = read_log(path)

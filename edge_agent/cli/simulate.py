@@ -22,15 +22,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-torque", action="store_true", help="no wheel torque is recorded, as by most cars")
     parser.add_argument("--road", choices=ROADS, default="level", help="relief, drawn by the seed (default level)")
     parser.add_argument("--slope", type=float, default=0.0, help="metres up per metre ahead, added to it (default 0)")
-    parser.add_argument("--out", type=Path, help="signal log to write (Parquet)")
+    parser.add_argument("--out", type=Path, help="signal log to write (.parquet, .csv)")
     parser.add_argument("--vehicle-out", type=Path, help="vehicle file to write (JSON)")
 
 
 def run(args: argparse.Namespace) -> int:
     """Simulate, or list the manoeuvres."""
-    import pyarrow.parquet as pq
-
-    from edge_agent.app.estimates_file import writable
+    from edge_agent.app.estimates_file import writable, write_table
     from edge_agent.lab.simulation import MANOEUVRES, Fault, simulate_manoeuvre
     from schemas.errors import InputError
 
@@ -54,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         road=args.road,
         slope=args.slope,
     )
-    pq.write_table(log, writable("out", args.out))
+    write_table("out", args.out, log)
     if args.vehicle_out is not None:
         writable("vehicle-out", args.vehicle_out).write_text(
             vehicle.model_dump_json(indent=1, exclude_none=True) + "\n"

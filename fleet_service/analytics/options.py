@@ -15,7 +15,7 @@ class Options:
         at: moment of a treatment, or of a replay [ns].
         stations: table of station readings, CSV or Parquet.
         least_vehicles: distinct vehicles behind a slippery stretch or spell.
-        step_s: time between the frames of an animated replay; 0 for one map.
+        step_s: time between the frames of an animated replay; None for one map.
         lateness_s: of the service whose map is replayed.
         report: takes lines of progress.
     """
@@ -23,6 +23,6 @@ class Options:
     at: int | None = None
     stations: Path | None = None
     least_vehicles: int = 2
-    step_s: float = 0.0
+    step_s: float | None = None
     lateness_s: float = 120.0
     report: Callable[[str], None] = print

@@ -11,15 +11,19 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from fleet_service.analytics.page import GRIP_SCALE, DrawnCells, Scale, Value, render
 from fleet_service.analytics.questions import Question
 from fleet_service.archive import export, geo
 from schemas import grid
 from schemas.errors import InputError
+from schemas.runtime.durable import written
 
 SHOWN_ROWS: Final = 20
+PLOTS: Final = (".png", ".svg", ".pdf")
 MAP_CELLS: Final = 200_000  # of a page; more make browsers slow
+PARTS: Final = "members"  # of a row that stands for several cells
+HIDDEN: Final = ("west", "south", "east", "north", "cell")  # of the page: who points at a place sees where it is
 TIMES: Final = ("onset", "last", "end", "time")  # seconds since 1970
-_PAGE: Final = Path(__file__).with_name("map.html")
 
 
 def text(table: pa.Table, question: Question) -> str:
@@ -33,6 +37,20 @@ def text(table: pa.Table, question: Question) -> str:
     return "\n".join([*lines, f"{table.num_rows} rows" + (f", {rest} not shown (--out writes all)" if rest else "")])
 
 
+def lines(table: pa.Table, question: Question) -> str:
+    """All rows, in the question's order, as JSON, one a line; times are ISO 8601, UTC."""
+    return "\n".join(json.dumps({name: _json(name, v) for name, v in row.items()}, allow_nan=False)
+                     for row in ordered(table, question).to_pylist())  # fmt: skip
+
+
+def _json(name: str, value: object) -> object:
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    if name in TIMES and isinstance(value, int):
+        return f"{datetime.fromtimestamp(value, UTC):%Y-%m-%dT%H:%M:%SZ}"
+    return value.isoformat() if isinstance(value, date) else value  # a datetime is a date
+
+
 def ordered(table: pa.Table, question: Question) -> pa.Table:
     """Rows in the question's order; what it does not decide, the other columns do."""
     name = question.order.removeprefix("-")
@@ -42,8 +60,10 @@ def ordered(table: pa.Table, question: Question) -> pa.Table:
 
 
 def _text(name: str, value: object) -> str:
-    if value is None:
+    if value is None or value != value:  # NaN
         return "-"
+    if name == "sector":
+        return grid.HEADINGS[int(str(value))]
     if name in TIMES and isinstance(value, int):
         return f"{datetime.fromtimestamp(value, UTC):%Y-%m-%d %H:%M:%S}"
     if isinstance(value, float):
@@ -62,11 +82,13 @@ def write(table: pa.Table, question: Question, path: Path) -> None:
     table = ordered(table, question)
     try:
         if path.suffix == ".parquet" and not path.name.endswith(".geo.parquet"):
-            pq.write_table(table, path, compression="zstd")
-        elif path.suffix in (".png", ".svg"):
+            with written(path) as file:
+                pq.write_table(table, file, compression="zstd")
+        elif path.suffix in PLOTS:
             plot(table, question, path)
         elif path.suffix == ".html":
-            path.write_text(page(table, question), encoding="utf-8")
+            with written(path) as file:
+                file.write(page(table, question).encode())
         elif path.name.endswith(".geo.parquet") or path.suffix == ".geojson":
             export.write(placed(table, question), path)
         else:
@@ -79,64 +101,67 @@ def placed(table: pa.Table, question: Question) -> pa.Table:
     """An answer with the polygons of its cells, or of its boxes."""
     if "cell" not in table.schema.names:
         raise InputError("out", f"the answer of {question.name} has no place", "write .parquet, .csv or .png")
-    if "west" in table.schema.names:
-        return geo.with_boxes(table, *(table[side].to_numpy() for side in ("west", "south", "east", "north")))
-    return geo.with_cells(table)
+    return geo.with_stretches(table, _members(table)) if PARTS in table.schema.names else geo.with_cells(table)
+
+
+def _members(table: pa.Table) -> list[list[int]]:
+    """Cells of each row."""
+    found: list[Any] = table[PARTS].to_pylist()
+    return found
 
 
 def plot(table: pa.Table, question: Question, path: Path) -> None:
-    """Two columns of an answer against each other.
+    """An answer as a picture.
 
     Raises:
         InputError: matplotlib is not installed.
     """
     try:
-        from matplotlib.figure import Figure
+        from fleet_service.analytics.plots import draw
     except ImportError as error:
-        raise InputError("out", "matplotlib is not installed", "pip install 'gripmap[analytics]'") from error
-    canvas = Figure(figsize=(7.0, 4.2), layout="constrained")
-    axes = canvas.subplots()
-    x, y = (_numbers(table, name) for name in question.plot)
-    axes.plot(x, y, marker="o", markersize=3, linestyle="none" if len(set(x)) < len(x) or len(x) > 50 else "-")
-    axes.set(xlabel=question.plot[0], ylabel=question.plot[1], title=question.about)
-    axes.grid(visible=True, alpha=0.3)
-    canvas.savefig(path, dpi=130)
-
-
-def _numbers(table: pa.Table, name: str) -> list[Any]:
-    values = table[name].to_pylist()
-    if name in TIMES:
-        return [datetime.fromtimestamp(value, UTC) for value in values if value is not None]
-    return [float("nan") if value is None else value for value in values]
+        raise InputError("out", "matplotlib is not installed", "pip install '.[analytics]'") from error
+    draw(table, question.name, question.about, path)
 
 
 def page(table: pa.Table, question: Question) -> str:
     """A page that draws the answer's cells in colour, frame by frame where it has frames; it needs no network."""
     if question.colour is None or "cell" not in table.schema.names:
         raise InputError("out", f"the answer of {question.name} has no place", "write .parquet, .csv or .png")
-    table = table.slice(0, MAP_CELLS)
-    sides = (
-        [table[side].to_numpy() for side in ("west", "south", "east", "north")]
-        if "west" in table.schema.names
-        else list(grid.bounds(table["cell"].to_numpy()))
-    )
-    boxes = np.stack(sides, axis=1).round(7).tolist()
+    rest, table = max(table.num_rows - MAP_CELLS, 0), table.slice(0, MAP_CELLS)
+    part = None
+    cells = table["cell"].to_numpy()
+    if PARTS in table.schema.names:
+        parts = _members(table)
+        part = [row for row, own in enumerate(parts) for _ in own]
+        cells = np.array([cell for own in parts for cell in own], np.int64)
+    boxes = np.stack(list(grid.bounds(cells)), axis=1).round(7).tolist()
     frames = _frames(table)
-    names = [f.name for f in table.schema if f.name not in ("west", "south", "east", "north")]
+    known = sorted(set(frames))
+    number = {name: k for k, name in enumerate(known)}
+    names = [f.name for f in table.schema if f.name not in HIDDEN and not pa.types.is_nested(f.type)]
     rows = [[_text(name, row[name]) for name in names] for row in table.select(names).to_pylist()]
-    colours = [None if v is None or np.isnan(v) else round(float(v), 4) for v in table[question.colour].to_pylist()]
-    data = {
-        "title": question.about, "colour": question.colour, "boxes": boxes, "values": colours, "names": names,
-        "rows": rows, "frames": sorted(set(frames)), "frame": frames,
-        "sector": table["sector"].to_pylist(),
-    }  # fmt: skip
-    return _PAGE.read_text(encoding="utf-8").replace("/*DATA*/null", json.dumps(data).replace("</", "<\\/"))
+    values = [None if v is None or np.isnan(v) else round(float(v), 4) for v in table[question.colour].to_pylist()]
+    lasting: Any = table["lasts"].to_pylist() if "lasts" in table.schema.names else None
+    sector: Any = table["sector"].to_pylist()
+    frame = [number[name] for name in frames]
+    drawn = DrawnCells(boxes, sector, {"": values}, names, rows, part, known or [""], frame, lasting)
+    about = f"{rest:,} rows more are not drawn: ask for a smaller box or fewer days." if rest else ""
+    return render(question.about, drawn, _scale(question, values), about=about)
+
+
+def _scale(question: Question, values: list[Value]) -> Scale:
+    if question.colour is not None and question.colour.startswith("mu"):
+        return GRIP_SCALE
+    top = max((v for v in values if v is not None), default=1.0) or 1.0
+    label = f"{question.colour}, the darker the longer" if question.colour == "duration_s" else str(question.colour)
+    ticks = [(share * top, f"{share * top:,.0f} s") for share in (0.0, 0.5, 1.0)]
+    return Scale(label, 0.0, top, ticks, dark_is_high=True, unknown="not measured")
 
 
 def _frames(table: pa.Table) -> list[str]:
     for name in ("frame", "day"):
         if name in table.schema.names:
-            return [f"{v:%Y-%m-%d %H:%M}" if isinstance(v, datetime) else _day(v) for v in table[name].to_pylist()]
+            return [f"{v:%Y-%m-%d %H:%M:%S}" if isinstance(v, datetime) else _day(v) for v in table[name].to_pylist()]
     return [""] * table.num_rows
 
 

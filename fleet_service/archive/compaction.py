@@ -25,7 +25,6 @@ from fleet_service.archive import layout, reading, readme, segments
 from fleet_service.archive.files import COMPACTED, exclusive, sync_tree, write_table
 from fleet_service.archive.load import conformed, content, set_aside
 from fleet_service.archive.version import KEY, VERSION
-from schemas.errors import InputError
 from schemas.runtime.durable import sync_directory
 from schemas.wire import Kind
 
@@ -46,10 +45,9 @@ def compacting(root: Path) -> Iterator[None]:
     """Be the only one that adds to, or rewrites, the compacted files.
 
     Raises:
-        InputError: another process does.
+        InputError: it is no archive, or another process does.
     """
-    if not root.is_dir():
-        raise InputError("archive", f"{root} is no folder", "give the archive of a service")
+    layout.insist_on_archive(root)
     with exclusive(root / "compaction.lock", f"{root} is being compacted", "wait until that has ended"):
         drafts = root / "drafts"
         drafts.mkdir(exist_ok=True)

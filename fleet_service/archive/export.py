@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -17,6 +18,7 @@ from fleet_service.archive.files import MAP, write_table
 from fleet_service.archive.load import load
 from schemas import grid, tables
 from schemas.errors import InputError
+from schemas.runtime.durable import written
 from schemas.wire import Kind
 
 Box = tuple[float, float, float, float]
@@ -43,11 +45,26 @@ def observations(root: Path, part: Extract) -> pa.Table:
     return geo.with_points(table, table["longitude"].to_numpy(), table["latitude"].to_numpy())
 
 
-def map_then(root: Path, part: Extract) -> pa.Table:
-    """The last snapshot of the map before `until`."""
+def snapshot_time(root: Path, part: Extract) -> int:
+    """When the last snapshot of the map before `until` was taken [ns]."""
+    return snapshots.time_of(_snapshot(root, part))
+
+
+def _snapshot(root: Path, part: Extract) -> Path:
     path = snapshots.newest(root, part.until)
     if path is None:
         raise InputError("to", "there is no snapshot of the map so early", "give a later time")
+    return path
+
+
+def seen_by(table: pa.Table, vehicles: int) -> pa.Table:
+    """Cells of so many vehicles or more."""
+    return table.filter(pc.greater_equal(table["vehicles"], pa.scalar(vehicles, pa.int32())))
+
+
+def map_then(root: Path, part: Extract) -> pa.Table:
+    """The last snapshot of the map before `until`."""
+    path = _snapshot(root, part)
     table = load(path, tables.MAP_ARCHIVE)
     if table is None:
         raise InputError("to", f"the snapshot {path} is damaged", "give an earlier time")
@@ -99,24 +116,16 @@ def write(table: pa.Table, path: Path) -> None:
 
 def _geojson(table: pa.Table, path: Path) -> None:
     flat = _flat(table)
-    with path.open("w") as file:
+    with written(path) as raw:
+        file = io.TextIOWrapper(raw, encoding="utf-8")
         file.write('{"type": "FeatureCollection", "features": [\n')
-        rows = zip(_geometries(table), *(_texts(flat, name) for name in flat.schema.names), strict=True)
+        rows = zip(geo.shapes(table), *(_texts(flat, name) for name in flat.schema.names), strict=True)
         for place, (geometry, *values) in enumerate(rows):
             feature = {"type": "Feature", "geometry": geometry}
             feature["properties"] = dict(zip(flat.schema.names, values, strict=True))
             file.write((",\n" if place else "") + json.dumps(feature, allow_nan=False))
         file.write("\n]}\n")
-
-
-def _geometries(table: pa.Table) -> Iterator[dict[str, Any]]:
-    sides = [pc.struct_field(table[geo.BBOX], side).to_pylist() for side in geo.SIDES]
-    for west, south, east, north in zip(*sides, strict=True):
-        if (west, south) == (east, north):
-            yield {"type": "Point", "coordinates": [west, south]}
-        else:
-            ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
-            yield {"type": "Polygon", "coordinates": [ring]}
+        file.detach()  # flushes it; `written` closes it
 
 
 def _texts(table: pa.Table, name: str) -> list[Any]:
@@ -125,6 +134,8 @@ def _texts(table: pa.Table, name: str) -> list[Any]:
     if pa.types.is_timestamp(column.type):
         us = column.cast(tables.US).cast(pa.int64()).to_numpy().astype("datetime64[us]")
         return list(np.datetime_as_string(us, "ms", "UTC").tolist())
+    if pa.types.is_date(column.type):
+        return [None if day is None else day.isoformat() for day in column.to_pylist()]
     if pa.types.is_floating(column.type):
         values = column.to_numpy().astype(np.float64).round(6 if column.type == pa.float32() else 9)
         return [value if np.isfinite(value) else None for value in values.tolist()]
@@ -136,8 +147,13 @@ def _flat(table: pa.Table) -> pa.Table:
     return table.select(plain)
 
 
+def _csv(table: pa.Table, path: Path) -> None:
+    with written(path) as file:
+        pacsv.write_csv(_flat(table), file)
+
+
 _WRITERS: Final[dict[str, Callable[[pa.Table, Path], None]]] = {
     ".parquet": lambda table, path: write_table(table, path, MAP),
     ".geojson": _geojson,
-    ".csv": lambda table, path: pacsv.write_csv(_flat(table), path),
+    ".csv": _csv,
 }

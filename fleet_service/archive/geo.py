@@ -7,6 +7,8 @@ Axis order is longitude, latitude; a file without `crs` is OGC:CRS84 by the spec
 from __future__ import annotations
 
 import json
+import struct
+from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -19,8 +21,10 @@ GEO: Final = b"geo"
 GEOMETRY, BBOX = "geometry", "bbox"
 SIDES: Final = ("xmin", "ymin", "xmax", "ymax")
 _POINT: Final = np.dtype([("order", "u1"), ("type", "<u4"), ("xy", "<f8", 2)])
-_BOX: Final = np.dtype([("order", "u1"), ("type", "<u4"), ("rings", "<u4"), ("points", "<u4"), ("xy", "<f8", (5, 2))])
-_LITTLE_ENDIAN, _TYPE_POINT, _TYPE_POLYGON = 1, 1, 3
+_RING: Final = np.dtype([("order", "u1"), ("type", "<u4"), ("rings", "<u4"), ("points", "<u4")])
+_BOX: Final = np.dtype([*_RING.descr, ("xy", "<f8", (5, 2))])
+_LITTLE_ENDIAN, _TYPE_POINT, _TYPE_POLYGON, _TYPE_MULTIPOLYGON = 1, 1, 3, 6
+Pieces = Sequence[Sequence[int]]
 
 
 def with_cells(table: pa.Table) -> pa.Table:
@@ -29,13 +33,25 @@ def with_cells(table: pa.Table) -> pa.Table:
     return with_boxes(table, west, south, east, north)
 
 
+def with_stretches(table: pa.Table, cells: Pieces) -> pa.Table:
+    """A table of which each row is made of several cells, with these as one multi-polygon, as a GeoParquet table."""
+    count = np.array([len(own) for own in cells], np.int64)
+    first = np.concatenate([[0], np.cumsum(count)])
+    sides = grid.bounds(np.array([cell for own in cells for cell in own], np.int64))
+    boxes = _boxes(*sides)
+    head = struct.Struct("<BII")
+    wkb = [
+        head.pack(_LITTLE_ENDIAN, _TYPE_MULTIPOLYGON, n) + boxes[begin : begin + n].tobytes()
+        for n, begin in zip(count.tolist(), first.tolist(), strict=False)
+    ]
+    extreme = (np.minimum, np.minimum, np.maximum, np.maximum)
+    whole = tuple(f.reduceat(side, first[:-1]) if len(count) else side for f, side in zip(extreme, sides, strict=True))
+    return _marked(table, pa.array(wkb, pa.binary()), "MultiPolygon", whole)
+
+
 def with_boxes(table: pa.Table, west: FloatArray, south: FloatArray, east: FloatArray, north: FloatArray) -> pa.Table:
     """A table with the polygons of boxes [deg], (n,) each, as a GeoParquet table."""
-    wkb = np.zeros(len(west), _BOX)
-    wkb["order"], wkb["type"], wkb["rings"], wkb["points"] = _LITTLE_ENDIAN, _TYPE_POLYGON, 1, 5
-    x, y = np.stack([west, east, east, west, west], axis=1), np.stack([south, south, north, north, south], axis=1)
-    wkb["xy"] = np.stack([x, y], axis=2)
-    return _marked(table, wkb, "Polygon", (west, south, east, north))
+    return _marked(table, _binary(_boxes(west, south, east, north)), "Polygon", (west, south, east, north))
 
 
 def with_points(table: pa.Table, longitude: FloatArray, latitude: FloatArray) -> pa.Table:
@@ -43,22 +59,50 @@ def with_points(table: pa.Table, longitude: FloatArray, latitude: FloatArray) ->
     wkb = np.zeros(len(longitude), _POINT)
     wkb["order"], wkb["type"] = _LITTLE_ENDIAN, _TYPE_POINT
     wkb["xy"] = np.stack([longitude, latitude], axis=1)
-    return _marked(table, wkb, "Point", (longitude, latitude, longitude, latitude))
+    return _marked(table, _binary(wkb), "Point", (longitude, latitude, longitude, latitude))
 
 
-def _marked(table: pa.Table, wkb: np.ndarray[Any, Any], kind: str, sides: tuple[FloatArray, ...]) -> pa.Table:
-    size = wkb.dtype.itemsize
-    offsets: IntArray = np.arange(len(wkb) + 1, dtype=np.int64) * size
+def shapes(table: pa.Table) -> Iterator[dict[str, Any]]:
+    """The geometries of a GeoParquet table, as GeoJSON has them."""
+    written: list[Any] = table[GEOMETRY].to_pylist()
+    for wkb in written:
+        kind, count = struct.unpack_from("<II", wkb, 1) if len(wkb) > _POINT.itemsize else (_TYPE_POINT, 0)
+        if kind == _TYPE_POINT:
+            yield {"type": "Point", "coordinates": np.frombuffer(wkb, "<f8", 2, 5).tolist()}
+        elif kind == _TYPE_POLYGON:
+            yield {"type": "Polygon", "coordinates": _rings(np.frombuffer(wkb, _BOX))[0]}
+        else:
+            yield {"type": "MultiPolygon", "coordinates": _rings(np.frombuffer(wkb, _BOX, count, 9))}
+
+
+def _rings(boxes: np.ndarray[Any, Any]) -> list[Any]:
+    rings: list[Any] = boxes["xy"][:, None].tolist()
+    return rings
+
+
+def _boxes(west: FloatArray, south: FloatArray, east: FloatArray, north: FloatArray) -> np.ndarray[Any, Any]:
+    wkb = np.zeros(len(west), _BOX)
+    wkb["order"], wkb["type"], wkb["rings"], wkb["points"] = _LITTLE_ENDIAN, _TYPE_POLYGON, 1, 5
+    x, y = np.stack([west, east, east, west, west], axis=1), np.stack([south, south, north, north, south], axis=1)
+    wkb["xy"] = np.stack([x, y], axis=2)
+    return wkb
+
+
+def _binary(wkb: np.ndarray[Any, Any]) -> pa.Array[Any]:
+    offsets: IntArray = np.arange(len(wkb) + 1, dtype=np.int64) * wkb.dtype.itemsize
     buffers = [None, pa.py_buffer(offsets.astype(np.int32).tobytes()), pa.py_buffer(wkb.tobytes())]
-    geometry: pa.Array[Any] = pa.Array.from_buffers(pa.binary(), len(wkb), buffers)
+    return pa.Array.from_buffers(pa.binary(), len(wkb), buffers)
+
+
+def _marked(table: pa.Table, geometry: pa.Array[Any], kind: str, sides: tuple[FloatArray, ...]) -> pa.Table:
     box = pa.StructArray.from_arrays([pa.array(side) for side in sides], names=list(SIDES))
     column: dict[str, Any] = {
-        "encoding": "WKB", "geometry_types": [kind] if len(wkb) else [],
+        "encoding": "WKB", "geometry_types": [kind] if len(geometry) else [],
         "covering": {"bbox": {side: [BBOX, side] for side in SIDES}},
     }  # fmt: skip
-    if kind == "Polygon":
+    if kind != "Point":
         column["orientation"] = "counterclockwise"
-    if len(wkb):
+    if len(geometry):
         least, most = [float(side.min()) for side in sides[:2]], [float(side.max()) for side in sides[2:]]
         column["bbox"] = [*least, *most]
     geo = {"version": "1.1.0", "primary_column": GEOMETRY, "columns": {GEOMETRY: column}}

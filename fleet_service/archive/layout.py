@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from schemas import grid
+from schemas.errors import InputError
 from schemas.numeric import IntArray
 from schemas.wire import Kind
 
@@ -37,6 +38,22 @@ class Partition(NamedTuple):
         """Where its files lie. The letter before the zone keeps readers from taking it for a number."""
         zone = f"zone=q{grid.quadkey(self.zone, grid.ZONE_ZOOM)}"
         return root / table / f"date={date_of(self.day)}" / zone
+
+
+# What a service makes when it starts, and what compaction leaves: one of them is in every archive.
+MARKS: Final = ("inbox", "observations", "states", "keys", "rollup", "map")
+
+
+def insist_on_archive(root: Path) -> None:
+    """Let only an archive pass: who compacts another folder would write into it.
+
+    Raises:
+        InputError: it is no folder, or none that a service made.
+    """
+    if not root.is_dir():
+        raise InputError("archive", f"{root} is no folder", "give the archive of a service")
+    if not any((root / name).is_dir() for name in MARKS):
+        raise InputError("archive", f"{root} is no archive: it has no {MARKS[0]}", "give the archive of a service")
 
 
 def partitions_of(time: IntArray, cell: IntArray) -> tuple[IntArray, IntArray]:

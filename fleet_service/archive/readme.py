@@ -64,12 +64,13 @@ def _cell(value: str) -> str:
 
 
 def keep(root: Path) -> None:
-    """Write the page into an archive, if it is not there as it should be.
+    """Write the page into an archive, if it is not there as it should be. Somebody else's page of that name stays.
 
     Raises:
         OSError: it cannot be written.
     """
     path, page = root / NAME, text().encode()
-    if not path.exists() or path.read_bytes() != page:  # bytes: power loss may have left any
+    there = path.read_bytes() if path.exists() else b""  # bytes: power loss may have left any
+    if there != page and (not there.strip(b"\0") or there.startswith(_HEAD.splitlines()[0].encode())):
         with written(path) as file:
             file.write(page)

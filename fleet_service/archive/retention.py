@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_service.archive import layout, rollup
+from fleet_service.archive import layout, reading, rollup
 from fleet_service.archive.compaction import compact, compacting
 from fleet_service.archive.files import COMPACTED, lock, put_in_place
 from fleet_service.archive.layout import TABLES
@@ -43,13 +43,10 @@ def retire(root: Path, raw_days: int, today: date) -> Retired:
         InputError: too few days, or another process compacts the archive.
         OSError: a file cannot be read, written or removed.
     """
-    if raw_days < LEAST_DAYS:
-        raise InputError("raw-days", f"{raw_days} are too few to know a batch again", f"give {LEAST_DAYS} or more")
-    last = (today - timedelta(days=raw_days + 1) - date(1970, 1, 1)).days
     files = 0
     with compacting(root):
-        rollup.complete(root, until_day=last)
-        folders = [day for kind in Kind for day in layout.days(root, TABLES[kind], until_day=last)]
+        rollup.complete(root, until_day=_last_to_go(raw_days, today))
+        folders = due(root, raw_days, today)
         for folder in folders:
             for path in sorted(folder.glob("*/*"), reverse=True):
                 path.unlink()
@@ -61,6 +58,22 @@ def retire(root: Path, raw_days: int, today: date) -> Retired:
     return Retired(len(folders), files)
 
 
+def due(root: Path, raw_days: int, today: date) -> list[Path]:
+    """Folders of days whose raw rows `retire` removes.
+
+    Raises:
+        InputError: too few days.
+    """
+    last = _last_to_go(raw_days, today)
+    return [day for kind in Kind for day in layout.days(root, TABLES[kind], until_day=last)]
+
+
+def _last_to_go(raw_days: int, today: date) -> int:
+    if raw_days < LEAST_DAYS:
+        raise InputError("raw-days", f"{raw_days} are too few to know a batch again", f"give {LEAST_DAYS} or more")
+    return (today - timedelta(days=raw_days + 1) - date(1970, 1, 1)).days
+
+
 def forget_period(root: Path, month: str) -> None:
     """Destroy the key of a month (2026-01): nobody can tell any more whose its pseudonyms were.
 
@@ -68,7 +81,7 @@ def forget_period(root: Path, month: str) -> None:
         InputError: there is no such key, or a service runs on the archive.
     """
     with lock(root):
-        key = _key(root, month)
+        key = key_of(root, month)
         key.unlink()
         sync_directory(key.parent)
 
@@ -82,7 +95,7 @@ def forget_vehicle(root: Path, vehicle: str, month: str) -> int:
     """
     first = _month(month)
     with lock(root):
-        _key(root, month)
+        key_of(root, month)
         compact(root)
         noon = (first - date(1970, 1, 1)).days * layout.DAY_NS + layout.DAY_NS // 2
         pseudonym = Pseudonyms(root / _KEYS).of(vehicle, noon)
@@ -94,6 +107,21 @@ def forget_vehicle(root: Path, vehicle: str, month: str) -> int:
                 # a batch has the pseudonym of its first record and may end a day later
                 for path in layout.compacted(root, kind, (first - date(1970, 1, 1)).days, _last_day(first) + 1)
             )
+
+
+def rows_of_vehicle(root: Path, vehicle: str, month: str) -> int:
+    """How many rows `forget_vehicle` would remove; changes nothing.
+
+    Raises:
+        InputError: the month's key is gone.
+        OSError: a file cannot be read.
+    """
+    first = (_month(month) - date(1970, 1, 1)).days
+    key_of(root, month)
+    noon = first * layout.DAY_NS + layout.DAY_NS // 2
+    where = pc.field("vehicle") == Pseudonyms(root / _KEYS).of(vehicle, noon)
+    days = (first, _last_day(_month(month)) + 1)
+    return sum(table.num_rows for kind in Kind for table in reading.read(root, kind, ["vehicle"], where, days))
 
 
 def drop_checkpoints(root: Path) -> None:
@@ -123,7 +151,12 @@ def _unread(path: Path, problem: str) -> None:
     raise InputError("archive", f"{path} is damaged ({problem})", "remove it or bring it back, then forget again")
 
 
-def _key(root: Path, month: str) -> Path:
+def key_of(root: Path, month: str) -> Path:
+    """The key of a month.
+
+    Raises:
+        InputError: there is none.
+    """
     _month(month)
     path = root / _KEYS / f"{month}.key"
     if not path.exists():

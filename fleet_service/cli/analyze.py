@@ -8,35 +8,40 @@ from pathlib import Path
 from typing import Final
 
 from fleet_service.analytics.options import Options
-from fleet_service.analytics.questions import QUESTIONS
+from fleet_service.analytics.questions import QUESTIONS, Question
 from fleet_service.cli.common import add_part, span
 from schemas.config import moment
 from schemas.errors import InputError
+from schemas.runtime import commandline, talk
 
-ENDINGS: Final = (".parquet", ".geo.parquet", ".geojson", ".csv", ".png", ".svg", ".html")
+ENDINGS: Final = (".parquet", ".geo.parquet", ".geojson", ".csv", ".png", ".svg", ".pdf", ".html")
+# which questions an option is for; to the others it would be one that is passed over in silence
+FOR: Final = {
+    "at": ("before-after", "replay"), "stations": ("weather",), "step": ("replay",), "min_vehicles": ("worst", "spells")
+}  # fmt: skip
+USUAL_VEHICLES: Final = 2
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.description = "; ".join(f"{question.name}: {question.about}" for question in QUESTIONS.values())
     parser.add_argument("question", metavar="NAME", help=" | ".join(QUESTIONS))
-    parser.add_argument("--archive", metavar="DIR", type=Path, required=True, help="compacted files are read")
+    parser.add_argument("--archive", metavar="DIR", type=Path, required=True, help="what waits in its log is compacted")
     add_part(parser)
     parser.add_argument("--out", metavar="FILE", type=Path, help=f"ends in {', '.join(ENDINGS)}")
     parser.add_argument("--engine", default="duckdb", metavar="duckdb|spark", help="default %(default)s")
     parser.add_argument("--at", metavar="TIME", help="before-after: of the treatment; replay: of the map")
     parser.add_argument("--stations", metavar="FILE", type=Path, help="weather: readings, CSV or Parquet")
-    parser.add_argument("--step", metavar="SECONDS", type=float, default=0.0, help="replay: between frames")
-    parser.add_argument("--min-vehicles", metavar="K", type=int, default=2, help="worst, spells: default %(default)s")
+    parser.add_argument("--step", metavar="SECONDS", type=float, help="replay: between frames")
+    parser.add_argument("--min-vehicles", metavar="K", type=int, help=f"worst, spells: default {USUAL_VEHICLES}")
+    parser.add_argument("--as-it-lies", action="store_true", help="leave the log alone: only compacted files are read")
+    parser.add_argument("--json", action="store_true", help="print the rows as JSON, one a line")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask, print the answer, and write it on request."""
-    question = QUESTIONS.get(arguments.question)
-    if question is None:
-        raise InputError("question", f"{arguments.question!r} is none", f"use one of {', '.join(QUESTIONS)}")
-    if arguments.out is not None and arguments.out.suffix not in ENDINGS:
-        raise InputError("out", f"{arguments.out.name} has no known ending", f"use one of {', '.join(ENDINGS)}")
+    question = _checked(arguments)
+    talk.doing(f"{question.name}: loading DuckDB and Ibis")
     from fleet_service.analytics import engines, output
     from fleet_service.archive.export import Extract
     from schemas import query
@@ -45,20 +50,57 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError("engine", f"{arguments.engine!r} is none", f"use one of {', '.join(engines.ENGINES)}")
     bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
     part = Extract(*span(arguments), bbox)
-    engine = engines.QueryEngine(arguments.engine, arguments.archive, part, progress=sys.stderr.isatty())
+    if not arguments.as_it_lies:
+        _compact(arguments.archive)
+    engine = engines.QueryEngine(arguments.engine, arguments.archive, part, progress=False)
     at = None if arguments.at is None else moment(arguments.at, "at")
+    vehicles = USUAL_VEHICLES if arguments.min_vehicles is None else arguments.min_vehicles
     options = Options(
-        at=at, stations=arguments.stations, least_vehicles=arguments.min_vehicles,
-        step_s=arguments.step, report=_report,
-    )  # fmt: skip
+        at=at, stations=arguments.stations, least_vehicles=vehicles, step_s=arguments.step, report=_report
+    )
     _report(f"{question.name}: {len(engine.files('observations'))} files, {engine.rows():,} observations")
     found = question.ask(engine, options)
-    print(output.text(found, question))
+    print(output.lines(found, question) if arguments.json else output.text(found, question))
     if arguments.out is not None:
         output.write(found, question, arguments.out)
         _report(f"written: {arguments.out}")
     return 0
 
 
+def _checked(arguments: argparse.Namespace) -> Question:
+    """The question; all that can be said before anything is computed is said now."""
+    question = QUESTIONS.get(arguments.question)
+    if question is None:
+        raise InputError("question", f"{arguments.question!r} is none", f"use one of {', '.join(QUESTIONS)}")
+    if arguments.out is not None:
+        commandline.ending("out", commandline.out_folder("out", arguments.out), ENDINGS)
+        if question.colour is None and arguments.out.name.endswith((".html", ".geojson", ".geo.parquet")):
+            raise InputError("out", f"the answer of {question.name} has no place", "write .parquet, .csv or .png")
+    for name, takers in FOR.items():
+        if getattr(arguments, name) is not None and question.name not in takers:
+            raise InputError(name.replace("_", "-"), f"is not for {question.name}", f"it is for {', '.join(takers)}")
+    if arguments.min_vehicles is not None and arguments.min_vehicles < 1:
+        raise InputError("min-vehicles", f"{arguments.min_vehicles} is below 1", "give a whole number from 1")
+    return question
+
+
+def _compact(root: Path) -> None:
+    """Count what waits in the log too; where that cannot be done, say how much is left out."""
+    from fleet_service.archive import layout, segments
+    from fleet_service.archive.compaction import compact
+    from schemas.wire import Kind
+
+    layout.insist_on_archive(root)
+    waiting = len(segments.paths(root, Kind.OBSERVATION))
+    if not waiting:
+        return
+    talk.doing(f"compacting {waiting} segments of the log")
+    try:
+        done = compact(root)
+        _report(f"compacted first: {done.rows:,} rows of {done.segments} segments")
+    except (OSError, InputError) as error:
+        print(f"warning: {waiting} segments of the log are not counted: {error}", file=sys.stderr)
+
+
 def _report(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
+    talk.say(line)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import json
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 from schemas.config import moment
 from schemas.errors import InputError
@@ -35,30 +38,57 @@ def add_part(parser: argparse.ArgumentParser) -> None:
 
 
 def add_archive(parser: argparse.ArgumentParser) -> None:
-    """Declare the archive of a command that works on one."""
+    """Declare the archive of a command that works on one, and how it says what it did."""
     parser.add_argument("--archive", metavar="DIR", type=Path, required=True, help="of a service, running or not")
+    parser.add_argument("--json", action="store_true", help="say what was done as one line of JSON")
+
+
+def add_dry_run(parser: argparse.ArgumentParser) -> None:
+    """Declare the brakes of a command that destroys something."""
+    parser.add_argument("--dry-run", action="store_true", help="only say what would be done")
+    parser.add_argument("--yes", action="store_true", help="do not ask; on a terminal it asks")
+
+
+def confirmed(arguments: argparse.Namespace, what: str) -> bool:
+    """Whether a person on a terminal agrees; who is no terminal has decided already."""
+    if arguments.yes or not sys.stdin.isatty():
+        return True
+    print(f"{what}. This cannot be undone. Go on? [y/N] ", end="", file=sys.stderr, flush=True)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
 def span(arguments: argparse.Namespace) -> tuple[int, int]:
     """From when until when [ns], of the options of `add_part`.
 
     Raises:
-        InputError: one of them is no time.
+        InputError: one of them is no time, or they are the wrong way round.
     """
     since = 0 if arguments.since is None else moment(arguments.since, "from")
-    return since, time.time_ns() if arguments.until is None else moment(arguments.until, "to")
+    until = time.time_ns() if arguments.until is None else moment(arguments.until, "to")
+    if since >= until:
+        raise InputError("to", f"{arguments.until or 'now'} is not after --from {arguments.since}", "give a later time")
+    return since, until
 
 
-def on_archive(arguments: argparse.Namespace, command: Callable[[argparse.Namespace], str]) -> int:
-    """Run a command on its archive and print the line that it returns.
+class ArchiveReport(NamedTuple):
+    """What a command did: a line for people, values for programs."""
+
+    line: str
+    values: dict[str, object]
+
+
+def on_archive(arguments: argparse.Namespace, command: Callable[[argparse.Namespace], ArchiveReport]) -> int:
+    """Run a command on its archive and print what it did.
 
     Raises:
         InputError: there is no such archive, or it cannot be read or written.
     """
-    if not arguments.archive.is_dir():
-        raise InputError("archive", f"{arguments.archive} is no folder", "give the archive of a service")
+    from fleet_service.archive.layout import insist_on_archive
+
+    insist_on_archive(arguments.archive)
     try:
-        print(command(arguments))
+        done = command(arguments)
+        print(json.dumps({"command": arguments.command, **done.values}) if arguments.json else done.line)
     except OSError as error:
         raise InputError("archive", f"cannot use {error.filename} ({error.strerror})", "nothing is lost") from error
     return 0

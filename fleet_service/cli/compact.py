@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import argparse
 
-from fleet_service.cli.common import add_archive, on_archive
+from fleet_service.cli.common import ArchiveReport, add_archive, on_archive
 from schemas.errors import InputError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_archive(parser)
-    parser.add_argument("--to", metavar="URI", help="then put what is new there, e.g. s3://bucket/folder")
+    parser.add_argument(
+        "--put-to", "--to", dest="to", metavar="URI", help="then put what is new there, e.g. s3://bucket/folder"
+    )  # --to: its name until 0.2
     parser.add_argument(
         "--round-rows", metavar="N", type=int, help="rows in memory at once; default a million, half a gigabyte"
     )
@@ -22,7 +24,7 @@ def run(arguments: argparse.Namespace) -> int:
     return on_archive(arguments, _compact)
 
 
-def _compact(arguments: argparse.Namespace) -> str:
+def _compact(arguments: argparse.Namespace) -> ArchiveReport:
     from fleet_service.archive import mirror, rollup
     from fleet_service.archive.compaction import ROUND_ROWS, compact
 
@@ -32,4 +34,8 @@ def _compact(arguments: argparse.Namespace) -> str:
     done = compact(arguments.archive, rows)
     parts = rollup.complete(arguments.archive)
     said = f"{done.rows} rows of {done.segments} segments moved into {done.files} files, {parts} rolled up"
-    return said if arguments.to is None else f"{said}, {mirror.put(arguments.archive, arguments.to)} put"
+    values: dict[str, object] = {"rows": done.rows, "segments": done.segments, "files": done.files, "rolled_up": parts}
+    if arguments.to is not None:
+        put = mirror.put(arguments.archive, arguments.to)
+        said, values = f"{said}, {put} put", {**values, "put": put}
+    return ArchiveReport(said, values)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from fleet_service.cli.common import add_archive, on_archive
+from fleet_service.cli.common import ArchiveReport, add_archive, add_dry_run, confirmed, on_archive
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -12,6 +12,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_archive(parser)
     parser.add_argument("--period", metavar="MONTH", required=True, help="e.g. 2026-01")
     parser.add_argument("--vehicle", metavar="NAME", help="only this vehicle; its rows are removed")
+    add_dry_run(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -19,10 +20,20 @@ def run(arguments: argparse.Namespace) -> int:
     return on_archive(arguments, _forget)
 
 
-def _forget(arguments: argparse.Namespace) -> str:
-    from fleet_service.archive.retention import forget_period, forget_vehicle
+def _forget(arguments: argparse.Namespace) -> ArchiveReport:
+    from fleet_service.archive.retention import forget_period, forget_vehicle, key_of, rows_of_vehicle
 
-    if arguments.vehicle is None:
-        forget_period(arguments.archive, arguments.period)
-        return f"the key of {arguments.period} is destroyed"
-    return f"{forget_vehicle(arguments.archive, arguments.vehicle, arguments.period)} rows removed"
+    root, month, vehicle = arguments.archive, arguments.period, arguments.vehicle
+    key_of(root, month)
+    rows = 0 if vehicle is None else rows_of_vehicle(root, vehicle, month)
+    what = f"the key of {month} is destroyed" if vehicle is None else f"{rows} rows of {vehicle} are removed"
+    if arguments.dry_run:
+        return ArchiveReport(f"would be done: {what}", {"rows": 0, "key": False})
+    if not confirmed(arguments, what):
+        return ArchiveReport("nothing forgotten", {"rows": 0, "key": False})
+    if vehicle is None:
+        forget_period(root, month)
+        return ArchiveReport(what, {"rows": 0, "key": True})
+    rows = forget_vehicle(root, vehicle, month)
+    line = f"{rows} rows removed" if rows else f"no rows of {vehicle} in {month}: nothing removed"
+    return ArchiveReport(line, {"rows": rows, "key": False})

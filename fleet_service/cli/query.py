@@ -3,9 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
+from typing import Final
 
 from fleet_service.cli.common import add_connection
+from schemas.errors import InputError
+from schemas.runtime import commandline
+
+# The ending of a file decides what is asked for: a form of answer of the service.
+FORMS: Final = {".arrow": "arrow", ".parquet": "arrow", ".csv": "arrow", ".geojson": "geojson", ".json": "json"}
+NOBODY: Final = 1  # exit code where no service answers
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -16,19 +24,41 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--at", metavar="TIME", help="the map as it was, e.g. 2026-01-31T07:00:00Z; UTC without a zone")
     parser.add_argument("--basis", metavar="borrowed", help="also cells that only neighbours speak for")
     parser.add_argument("--format", metavar="arrow|geojson|json", help="arrow (default) prints a table")
-    parser.add_argument("--out", metavar="FILE", type=Path, help="write the answer there")
+    parser.add_argument(
+        "--out", metavar="FILE", type=Path, help=f"write it there, as the ending says: {', '.join(FORMS)}"
+    )
     add_connection(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Ask, and print or write the answer."""
+    """Ask, and print or write the answer; 1 where no service answers."""
+    form = _form(arguments.out, arguments.format)
     from fleet_service.client import map_client
 
-    asked = {name: getattr(arguments, name) for name in ("bbox", "route", "min_vehicles", "at", "basis", "format")}
-    parameters = {name: value for name, value in asked.items() if value is not None}
+    asked = {name: getattr(arguments, name) for name in ("bbox", "route", "min_vehicles", "at", "basis")}
+    parameters = {name: value for name, value in (*asked.items(), ("format", form)) if value is not None}
     answer = map_client.ask(map_client.settings(arguments.connect, arguments.config), parameters)
-    if arguments.out is not None:
-        map_client.write(answer, arguments.out)
-    else:
+    if not answer.served:
+        print("no service answers for the map: start one; that is not the same as an empty map", file=sys.stderr)
+        return NOBODY
+    if arguments.out is None:
         print(map_client.text(answer))
+    elif answer.table is not None and arguments.out.suffix in (".parquet", ".csv"):
+        from fleet_service.archive import export, geo
+
+        export.write(geo.with_cells(answer.table), arguments.out)
+    else:
+        map_client.write(answer, arguments.out)
     return 0
+
+
+def _form(out: Path | None, given: str | None) -> str | None:
+    if out is None:
+        return given
+    commandline.out_folder("out", out)
+    if not out.suffix:
+        return given
+    form = FORMS[commandline.ending("out", out, tuple(FORMS))]
+    if given not in (None, form):
+        raise InputError("format", f"{given} does not go into {out.name}", f"leave --format out: it is {form}")
+    return form

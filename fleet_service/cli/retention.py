@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 from datetime import UTC, datetime
 
-from fleet_service.cli.common import add_archive, on_archive
+from fleet_service.cli.common import ArchiveReport, add_archive, add_dry_run, confirmed, on_archive
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_archive(parser)
     parser.add_argument("--raw-days", metavar="N", type=int, required=True, help="days of raw rows that stay")
+    add_dry_run(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -19,8 +20,16 @@ def run(arguments: argparse.Namespace) -> int:
     return on_archive(arguments, _retention)
 
 
-def _retention(arguments: argparse.Namespace) -> str:
-    from fleet_service.archive.retention import retire
+def _retention(arguments: argparse.Namespace) -> ArchiveReport:
+    from fleet_service.archive.retention import due, retire
 
-    done = retire(arguments.archive, arguments.raw_days, datetime.now(UTC).date())
-    return f"raw rows of {done.days} days removed, {done.files} files; their roll-ups stay"
+    today = datetime.now(UTC).date()
+    folders = due(arguments.archive, arguments.raw_days, today)
+    what = f"raw rows of {len(folders)} days"
+    if arguments.dry_run:
+        return ArchiveReport(f"{what} would be removed", {"days": len(folders), "files": 0})
+    if folders and not confirmed(arguments, f"{what} are removed, {folders[0].name} the first"):
+        return ArchiveReport("nothing removed", {"days": 0, "files": 0})
+    done = retire(arguments.archive, arguments.raw_days, today)
+    line = f"raw rows of {done.days} days removed, {done.files} files; their roll-ups stay"
+    return ArchiveReport(line, {"days": done.days, "files": done.files})

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pyarrow as pa
 import zenoh
@@ -20,17 +21,18 @@ from schemas.runtime import zenoh_session
 from schemas.wire.tile import decode_tile
 
 TIMEOUT_S: Final = 10.0
+SERVED_S: Final = 1.0  # for a router to say who answers
 SHOWN: Final = ("latitude", "longitude", "sector", "mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehicles",
                 "observations", "age_s")  # fmt: skip
-_HEADING: Final = ("east", "north", "west", "south")
 
 
 @dataclass(frozen=True)
 class Answer:
-    """All replies to one query, joined; `table` for arrow, else `document`."""
+    """All replies to one query, joined; `table` for arrow, else `document`. `served`: whether a service was there."""
 
     table: pa.Table | None
     document: dict[str, object] | None
+    served: bool = True
 
 
 def settings(connect: str | None, config: Path | str | None) -> ZenohSettings:
@@ -55,7 +57,25 @@ def ask(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
                 field, _, rest = problem.partition(": ")
                 raise InputError(field if rest else "query", rest or problem, "see above")
             payloads.append((str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
-    return _joined(form, [payload for _, payload in sorted(payloads)])
+        served = bool(payloads) or _served(session, query.parse(parameters))
+    return replace(_joined(form, [payload for _, payload in sorted(payloads)]), served=served)
+
+
+def _served(session: zenoh.Session, asked: query.MapQuery) -> bool:
+    """Whether any service answers for the map: an empty answer of one is not the silence of none.
+
+    A service has a token, which not every reader may see; and it answers for the tiles of its regions.
+    """
+    point = asked.route[0] if asked.route else asked.bbox[:2] if asked.bbox else (0.0, 0.0)
+    tile = grid.tile_of(int(grid.cell_of(point[1], point[0])))
+    querier: Any = session.declare_querier(keys.map_key(int(tile)))
+    deadline = time.monotonic() + SERVED_S
+    while not querier.matching_status.matching:
+        if time.monotonic() > deadline:
+            tokens = session.liveliness().get(f"{keys.ROOT}/shard/*", timeout=SERVED_S)
+            return any(reply.ok is not None for reply in tokens)
+        time.sleep(0.02)
+    return True
 
 
 def _session(connection: ZenohSettings) -> zenoh.Session:
@@ -98,7 +118,7 @@ def text(answer: Answer) -> str:
         return json.dumps(answer.document, indent=1)
     lines = ["  ".join(f"{name:>12}" for name in SHOWN)]
     for row in answer.table.select(SHOWN).to_pylist():
-        row["sector"] = _HEADING[row["sector"]]
+        row["sector"] = grid.HEADINGS[row["sector"]]
         lines.append("  ".join(f"{_shown(name, row[name]):>12}" for name in SHOWN))
     return "\n".join([*lines, f"{answer.table.num_rows} cells"])
 
@@ -156,6 +176,6 @@ def _tile_line(tile: int, table: pa.Table) -> str:
 def _alert_line(alert: wire.Alert) -> str:
     word = "RAISED" if alert.raised else "cleared"
     return (
-        f"alert {word} at {alert.latitude:.6f}, {alert.longitude:.6f} heading {_HEADING[alert.sector]}: "
+        f"alert {word} at {alert.latitude:.6f}, {alert.longitude:.6f} heading {grid.HEADINGS[alert.sector]}: "
         f"mu {alert.mu:.2f} [{alert.mu_lower:.2f}, {alert.mu_upper:.2f}], {alert.vehicles} vehicles; {alert.reason}"
     )

@@ -5,18 +5,35 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar, cast
 
 import numba
 from llvmlite import ir  # type: ignore[import-untyped]
-from numba.core import cgutils, types
+from numba.core import cgutils, event, types
 from numba.core.caching import FunctionCache
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from schemas.runtime import talk
+
+
+class _Told(event.Listener):
+    """A compilation takes its time: whoever waits is told."""
+
+    def on_start(self, event: event.Event) -> None:
+        """Say it, once a process."""
+        talk.say_once(talk.COMPILING)
+        talk.doing(f"compiling {event.data['dispatcher'].__name__}")
+
+    def on_end(self, event: event.Event) -> None:
+        """It took as long as it took."""
+
+
+event.register("numba:compile", _Told())  # type: ignore[no-untyped-call]
 LINE: Final = 64  # bytes that a processor reads at once
 
 P = ParamSpec("P")
@@ -93,11 +110,13 @@ def entry_point(kernel: Callable[P, R]) -> Callable[P, R]:
 def _compile(
     function: Callable[P, R], *, nogil: bool = False, forceinline: bool = False, references: bool = True
 ) -> Callable[P, R]:  # fmt: skip
-    if "NUMBA_CACHE_DIR" not in os.environ:
+    kept = "NUMBA_CACHE_DIR" in os.environ or cache_root() is not None
+    if kept and "NUMBA_CACHE_DIR" not in os.environ:
         numba.config.CACHE_DIR = kernel_cache(function.__module__.partition(".")[0])  # type: ignore[attr-defined]
     options: dict[str, Any] = {"nogil": nogil, "forceinline": forceinline, "_nrt": references}
-    kernel = numba.njit(cache=True, error_model="numpy", **options)(function)
-    kernel._cache = _Cache(function)  # type: ignore[no-untyped-call] # no public way
+    kernel = numba.njit(cache=kept, error_model="numpy", **options)(function)
+    if kept:
+        kernel._cache = _Cache(function)  # type: ignore[no-untyped-call] # no public way
     return cast(Callable[P, R], kernel)
 
 
@@ -130,5 +149,30 @@ def kernel_cache(package: str) -> str:
     for folder in (root / "schemas", root / package):
         for path in sorted(folder.rglob("*.py")):
             digest.update(path.read_bytes())
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return str(cache / "gripmap" / f"{package}-{digest.hexdigest()}")
+    return str((cache_root() or Path()) / f"{package}-{digest.hexdigest()}")
+
+
+@functools.cache
+def cache_root() -> Path | None:
+    """Where compiled kernels may lie: the user's cache, else a folder of the user's own among the temporary files.
+
+    None where neither can be written (a service account without a home, a read-only container): kernels are then
+    compiled at each start.
+    """
+    for folder in _roots():
+        with suppress(OSError):
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            own = folder.stat()
+            # what lies there is executed: nobody else may be able to put it there
+            if os.access(folder, os.W_OK | os.X_OK) and own.st_uid == os.getuid() and not own.st_mode & 0o002:
+                return folder
+    return None
+
+
+def _roots() -> Iterator[Path]:
+    if given := os.environ.get("XDG_CACHE_HOME"):
+        yield Path(given) / "gripmap"
+    with suppress(RuntimeError):  # a user without a home
+        yield Path.home() / ".cache" / "gripmap"
+    with suppress(OSError):
+        yield Path(tempfile.gettempdir()) / f"gripmap-{os.getuid()}"

@@ -83,6 +83,7 @@ ELSEWHERE = {
     "check": {"log": FIX, "--vehicle": FIX, "--out": FIX, "--fix": FIX},
     "calibrate": {"log": LEARNED, "--vehicle": LEARNED, "--out": LEARNED, "--trust": LEARNED},
     "run": {"--trust": UNFIT, "--profile": LIVE, "--dbc": LIVE}, "fleet": {},
+    "completion": {"shell": "test_completion_is_a_script_of_the_shell"},
     "tune": {"--quick": "test_quick_tuning_writes_a_valid_file_and_says_what_it_does",
              "--study": "test_the_quick_study_writes_figures_table_plot_and_a_tuned_file"},
     "evaluate": {"--out": CAMPAIGN, "--quick": CAMPAIGN, "--seeds": SEEDS, "--no-plots": SEEDS,
@@ -118,6 +119,7 @@ def test_every_option_of_every_command_is_in_a_table() -> None:
 def test_the_tests_that_show_an_option_give_it_to_the_command() -> None:
     """In their module, with another value or with none elsewhere; that is read, not run."""
     texts = [path.read_text() for path in sorted(Path(__file__).parent.rglob("test_*.py")) if path != Path(__file__)]
+    texts.append((Path(__file__).parents[1] / "test_commands.py").read_text())
     texts.append(Path(__file__).read_text().partition("def options(")[2])  # behind the tables
     for command, shown in ELSEWHERE.items():
         for option, test in shown.items():

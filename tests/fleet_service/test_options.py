@@ -49,6 +49,7 @@ REPLAY: Final = [
     "--to",
     "2024-10-05",
 ]
+MAP: Final = ["export", "map", *ARCHIVE, "--out", "{out}/a.csv", "--to", "2024-10-04T23:59:50"]
 WEATHER: Final = ["analyze", "weather", *ARCHIVE, "--out", "{out}/a.csv"]
 CERTS: Final = ["certs", "--fleet", "{fleet}", "--out", "{out}/certs"]
 USUAL: Final = {
@@ -62,18 +63,20 @@ USUAL: Final = {
 BOX: Final = "11,57,13,59"  # around one of two towns
 # command -> option -> another value; or the words with which, and those without which, it is to be seen
 CHANGES: Final[dict[str, dict[str, str | tuple[list[str], list[str]]]]] = {
-    "compact": {"--archive": "{b}", "--to": "file://{out}/there", "--round-rows": "10"},
-    "retention": {"--archive": "{b}", "--raw-days": "100000"},
-    "forget": {"--archive": "{b}", "--period": "2024-09", "--vehicle": "sim-003"},
+    "compact": {"--archive": "{b}", "--put-to": "file://{out}/there", "--round-rows": "10", "--json": ""},
+    "retention": {"--archive": "{b}", "--raw-days": "100000", "--dry-run": "", "--json": ""},
+    "forget": {"--archive": "{b}", "--period": "2024-09", "--vehicle": "sim-003", "--dry-run": "", "--json": ""},
     "export": {
         "what": (["export", "rollup", *USUAL["export"][2:]], USUAL["export"]), "--archive": "{b}",
-        "--out": "{out}/a.geojson", "--from": "2024-10-05", "--to": "2024-10-05", "--bbox": BOX,
+        "--out": "{out}/a.geojson", "--from": "2024-10-05", "--to": "2024-10-04", "--bbox": BOX, "--json": "",
+        "--snapshot": ([*MAP, "--snapshot"], MAP), "--min-vehicles": ([*MAP, "--min-vehicles", "3"], MAP),
     },
     "analyze": {
         "question": (["analyze", "grip", *ANALYZE[2:]], ANALYZE), "--archive": "{b}", "--out": "{out}/a.html",
         "--from": "2024-10-04T23:58", "--to": "2024-10-04T23:57", "--bbox": BOX, "--min-vehicles": "5",
         "--engine": "spark", "--at": ([*REPLAY, "--at", "2024-10-04T23:57"], REPLAY),
         "--step": ([*REPLAY, "--step", "60"], REPLAY),
+        "--json": "", "--as-it-lies": "",
         "--stations": ([*WEATHER, "--stations", "{warm}"], [*WEATHER, "--stations", "{cold}"]),
     },
     "certs": {
@@ -82,6 +85,9 @@ CHANGES: Final[dict[str, dict[str, str | tuple[list[str], list[str]]]]] = {
     },
 }  # fmt: skip
 SHOWN_BELOW: Final = {
+    "retention": {"--yes"},
+    "forget": {"--yes"},  # of terminals: test_commands.py
+    "completion": {"shell"},
     "certs": {"--renew-days"},
     "run": {"--config", "--archive", "--weather"},
     "query": {"--bbox", "--route", "--min-vehicles", "--at", "--basis", "--format", "--out", "--connect", "--config"},
@@ -160,7 +166,7 @@ def test_every_option_of_a_command_changes_what_it_does(
         at = usual.index(option) + 1
         other = [*usual[:at], change, *usual[at + 1 :]]
     else:
-        other = [*usual, option, change]
+        other = [*usual, option, *([change] if change else [])]
     first, again = (done(usual, tmp_path / name, capsys) for name in ("first", "again"))
     assert first == again
     assert first.code == 0, first.said

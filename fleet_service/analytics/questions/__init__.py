@@ -20,14 +20,12 @@ class Question(NamedTuple):
         about: one line for the help.
         order: column by which the terminal shows rows, descending with a minus in front.
         colour: column that a map colours cells by; None where the answer has no place.
-        plot: columns of the plot, x and y.
     """
 
     name: str
     about: str
     order: str
     colour: str | None
-    plot: tuple[str, str]
 
     @property
     def ask(self) -> Callable[[QueryEngine, Options], pa.Table]:
@@ -40,16 +38,13 @@ class Question(NamedTuple):
 QUESTIONS: Final = {
     question.name: question
     for question in (
-        Question("grip", "percentiles of mu per cell and day, and what is not known", "mu_p10", "mu_p50",
-                 ("day", "mu_p50")),
-        Question("worst", "the worst stretches, merged into segments", "-score", "mu", ("length_m", "share_slippery")),
-        Question("spells", "onset and duration of slippery spells, and the time to an alert", "onset", "duration_s",
-                 ("onset", "duration_s")),
-        Question("before-after", "what a treatment changed, with interval", "cells", None, ("period", "mu")),
-        Question("vehicles", "bias and sensor health per vehicle", "-z", None, ("values", "bias")),
-        Question("calibration", "how often the published interval held", "age_h", None, ("age_h", "held")),
-        Question("weather", "grip by temperature of the nearest station", "temperature", None,
-                 ("temperature", "mu_p50")),
-        Question("replay", "the map as of a moment, or a day of it", "-p_slippery", "mu", ("frame", "mu")),
+        Question("grip", "percentiles of mu per cell and day, and what is not known", "mu_p10", "mu_p50"),
+        Question("worst", "the worst stretches, merged into segments", "-score", "mu"),
+        Question("spells", "onset and duration of slippery spells, and the time to an alert", "onset", "duration_s"),
+        Question("before-after", "what a treatment changed, with interval", "-period", None),
+        Question("vehicles", "bias and sensor health per vehicle", "-z", None),
+        Question("calibration", "how often the published interval held", "age_h", None),
+        Question("weather", "grip by temperature of the nearest station", "temperature", None),
+        Question("replay", "the map as of a moment, or a day of it", "-p_slippery", "mu"),
     )
-}  # fmt: skip
+}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -9,31 +10,47 @@ import pyarrow as pa
 
 from fleet_service.analytics.engines import QueryEngine
 from fleet_service.analytics.options import Options
+from fleet_service.analytics.past_map import visited_cells
+from fleet_service.archive import layout
 from fleet_service.fusion import Fusion
 from fleet_service.ingest.weather import archived
 from fleet_service.replay.rebuild import Since, replay
-from fleet_service.serve.encode import cell_table
-from schemas import grid, tables
+from schemas import tables
+from schemas.errors import InputError
 from schemas.thresholds import NS
+from schemas.wire import Kind
 
+MOST_FRAMES: Final = 1500  # of an answer: a day of one a minute
+LEAST_STEP_S: Final = 1.0
 REPORT_ROWS: Final = 1_000_000  # between two lines of progress
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Cells of the map at `at`, or of each frame from the part's begin to its end; `frame` is its time."""
+    """Cells of the map at `at`, or of each frame from the part's begin to its end; `frame` is its time.
+
+    Raises:
+        InputError: the step is none, or makes more frames than anybody looks at.
+    """
+    if options.step_s is not None and not LEAST_STEP_S <= options.step_s < math.inf:
+        raise InputError("step", f"{options.step_s:g} s is no step", "give the seconds between two frames, e.g. 600")
     at = options.at if options.at is not None else engine.part.until
     fusion = Fusion(options.lateness_s)
-    fusion.update_weather(archived(engine.root, received_until=max(at, engine.part.until) if options.step_s else at))
-    if not options.step_s:
+    last = at if options.step_s is None else max(at, engine.part.until)
+    fusion.update_weather(archived(engine.root, received_until=last))
+    if options.step_s is None:
         rows = 0
         for updated in replay(engine.root, fusion, Since(until=at, box=engine.part.bbox)):
             rows += len(updated.late)
             if rows // REPORT_ROWS > (rows - len(updated.late)) // REPORT_ROWS:
                 options.report(f"{rows:,} observations replayed, {fusion.size:,} cells")
         return _frame(engine, fusion, at)
-    step, due, frames = int(options.step_s * NS), engine.part.since, []
+    step, due, frames = int(options.step_s * NS), None, []
     for updated in replay(engine.root, fusion, Since(until=engine.part.until, box=engine.part.bbox)):
-        now = int(fusion.live.time[updated.slots].max(initial=0))
+        if not len(updated.slots):
+            continue
+        now = int(fusion.live.time[updated.slots].max())
+        if due is None:
+            due = _begin(engine, int(fusion.live.time[updated.slots].min()), step)
         while due + step <= now:
             due += step
             frames.append(_frame(engine, fusion, due))
@@ -41,12 +58,23 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
     return pa.concat_tables([*frames, _frame(engine, fusion, engine.part.until)])
 
 
+def _begin(engine: QueryEngine, first: int, step: int) -> int:
+    """When the frames begin [ns]: with the part, or just before the first row where the part begins earlier.
+
+    Raises:
+        InputError: there would be more of them than anybody looks at.
+    """
+    days = layout.days(engine.root, layout.TABLES[Kind.OBSERVATION])
+    last = (max(map(layout.day_of, days), default=first // layout.DAY_NS) + 1) * layout.DAY_NS
+    begin = max(engine.part.since, first - first % step)
+    frames = (min(engine.part.until, max(last, first)) - begin) // step
+    if frames > MOST_FRAMES:
+        problem = f"makes {frames} frames from {np.datetime64(begin, 'ns').astype('datetime64[s]')} on"
+        raise InputError("step", problem, f"give a longer one, or --from and --to; {MOST_FRAMES} are the most")
+    return begin
+
+
 def _frame(engine: QueryEngine, fusion: Fusion, at: int) -> pa.Table:
-    slots = np.flatnonzero(fusion.live.vehicles[: fusion.size] > 0)  # a poor fix makes neighbours that nobody visited
-    if engine.part.bbox is not None:
-        west, south, east, north = grid.bounds(fusion.cell[slots])
-        box = engine.part.bbox
-        slots = slots[(east > box[0]) & (north > box[1]) & (west < box[2]) & (south < box[3])]
-    table = cell_table(fusion, slots, at)
+    table = visited_cells(fusion, at, engine.part.bbox)
     frame = pa.array(np.full(table.num_rows, at // tables.US_STEP)).cast(tables.US)
     return table.append_column("frame", frame)

@@ -15,7 +15,7 @@ from schemas.thresholds import SLIPPERY_MU
 
 
 def expression(t: Table, least_vehicles: int) -> Table:
-    """One row per spell; `end` and `duration_s` are null where it lasted at the end of the data."""
+    """One row per spell; where it `lasts` at the end of the data, `end` is null and `duration_s` the least it took."""
     t = t.filter(value(t)).select("cell", "sector", "time", "vehicle", "boot", "seq", "row", "mu")
     place = ["cell", "sector"]
     order = ["time", "vehicle", "boot", "seq", "row"]
@@ -40,7 +40,8 @@ def expression(t: Table, least_vehicles: int) -> Table:
     spells = spells.filter(spells.vehicles >= least_vehicles)
     end = ibis.ifelse(spells.open, ibis.null("int64"), spells.end)
     return spells.select(
-        *place, "onset", "last", "values", "vehicles", "mu", end=end, duration_s=end - spells.onset,
+        *place, "onset", "last", "values", "vehicles", "mu", end=end, lasts=spells.open,
+        duration_s=ibis.ifelse(spells.open, spells["last"], spells.end) - spells.onset,
         to_alert_s=spells.alert - spells.onset,
     )  # fmt: skip
 

@@ -84,7 +84,16 @@ def read(path: Path) -> tuple[pa.Table, pa.Table]:
     missing = [name for name in NEEDED if name not in table.schema.names]
     if missing:
         raise InputError("stations", f"{path.name} has no {missing[0]}", f"give columns {', '.join(NEEDED)}")
-    time = table["time"].cast(pa.timestamp("s")).cast(pa.int64())
+    try:
+        time = table["time"].cast(pa.timestamp("s")).cast(pa.int64())
+        numbers = {name: table[name].cast(pa.float64()) for name in NEEDED[2:]}
+    except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
+        problem = f"{path.name} has a value that is none ({str(error).splitlines()[0][:100]})"
+        fix = "write times like 2026-01-31T07:00:00, numbers with a point, and leave empty what is not known"
+        raise InputError("stations", problem, fix) from error
+    for name, column in numbers.items():
+        table = table.set_column(table.schema.get_field_index(name), name, column)
+    table = table.filter(pc.is_valid(table["temperature"]))
     table = table.append_column("hour", pc.divide(time, _HOUR_S)).set_column(
         table.schema.get_field_index("station"), "station", table["station"].cast(pa.string())
     )

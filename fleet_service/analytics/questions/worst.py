@@ -41,7 +41,7 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 
 def stretches(cells: pa.Table) -> pa.Table:
-    """Cells of one sector that touch, as one row each; the box is that of all its cells."""
+    """Cells of one sector that touch, as one row each; `members` are these, the box is around all of them."""
     column = {name: cells[name].to_numpy() for name in cells.schema.names}
     label = _touching(column["cell"], column["sector"].astype(np.int64))
     count = int(label.max(initial=-1)) + 1
@@ -64,6 +64,7 @@ def stretches(cells: pa.Table) -> pa.Table:
         "share_slippery": slippery / np.maximum(values, 1), "share_lower": lower,
         "mu": total(column["mu_sum"]) / np.maximum(slippery, 1), "score": lower * length,
         "west": west, "south": south, "east": east, "north": north,
+        "members": _members(column["cell"], label, count),
     }  # fmt: skip
     return pa.table(found).sort_by([("score", "descending"), ("cell", "ascending")])
 
@@ -87,6 +88,13 @@ def _touching(cell: IntArray, sector: IntArray) -> IntArray:
     here = np.broadcast_to(np.arange(len(key))[:, None], beside.shape)
     edges = coo_array((np.ones(int(touches.sum()), bool), (here[touches], there[touches])), shape=(len(key), len(key)))
     return np.asarray(connected_components(edges, directed=False)[1], np.int64)
+
+
+def _members(cell: IntArray, label: IntArray, count: int) -> pa.Array[Any]:
+    """The cells of each stretch: what is drawn of a bent road is the road, and not the box around it."""
+    order = np.lexsort((cell, label))
+    ends = np.concatenate([[0], np.cumsum(np.bincount(label, minlength=count))])
+    return pa.LargeListArray.from_arrays(pa.array(ends, pa.int64()), pa.array(cell[order], pa.int64()))
 
 
 def _boxes(cell: IntArray, label: IntArray, count: int) -> tuple[FloatArray, ...]:

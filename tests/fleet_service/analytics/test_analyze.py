@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
+import struct
 from pathlib import Path
 
 import geopandas
 import geoparquet_validator
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from fleet_service.analytics.questions import QUESTIONS
+from fleet_service.archive import export, geo
 from fleet_service.cli import main
+from tests.fleet_service.examples import CELL
 
 DAYS = ("--from", "2026-01-27", "--to", "2026-01-29")
 
@@ -31,7 +35,7 @@ def test_every_question_prints_a_table_and_says_what_it_reads(
     assert said.err.startswith(f"{name}: 2 files, 24,000 observations\n")
     lines = said.out.splitlines()
     answer = pq.read_table(out)
-    assert lines[0].split() == [f.name for f in answer.schema]
+    assert lines[0].split() == [f.name for f in answer.schema if not pa.types.is_nested(f.type)]
     assert lines[-1].startswith(f"{answer.num_rows} rows")
 
 
@@ -47,7 +51,8 @@ def test_an_answer_with_a_place_becomes_geoparquet_geojson_and_a_map(
     page = (tmp_path / "worst.html").read_text()
     assert "http" not in page.replace("http-equiv", "")
     data = json.loads(page.split("const data = ")[1].split(";\n")[0])
-    assert len(data["boxes"]) == len(data["values"]) == len(data["rows"]) == len(frame)
+    assert len(data["panels"][0]["values"]) == len(data["rows"]) == len(frame)
+    assert len(data["boxes"]) == frame["cells"].sum() == sum(len(one.geoms) for one in frame.geometry)
     assert (tmp_path / "worst.png").read_bytes().startswith(b"\x89PNG")
     assert "<svg" in (tmp_path / "worst.svg").read_text()
     capsys.readouterr()
@@ -57,7 +62,7 @@ def test_a_day_becomes_a_page_with_frames(archive: Path, tmp_path: Path, capsys:
     out = tmp_path / "day.html"
     assert analyze(archive, "replay", "--step", "21600", "--out", str(out)) == 0
     data = json.loads(out.read_text().split("const data = ")[1].split(";\n")[0])
-    assert data["frames"][:2] == ["2026-01-27 06:00", "2026-01-27 12:00"]
+    assert data["frames"][:2] == ["2026-01-27 06:00:00", "2026-01-27 12:00:00"]
     assert "frame 2026-01-27T06:00:00: " in capsys.readouterr().err
 
 
@@ -79,3 +84,38 @@ def test_a_wrong_word_is_one_line(
     assert analyze(archive, *words) == 2
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith(start)
+
+
+def test_the_first_question_as_geojson_has_its_days_as_text(archive: Path, tmp_path: Path) -> None:
+    assert analyze(archive, "grip", "--out", str(tmp_path / "grip.geojson")) == 0
+    first = json.loads((tmp_path / "grip.geojson").read_text())["features"][0]
+    assert first["properties"]["day"] in ("2026-01-27", "2026-01-28")
+    assert first["geometry"]["type"] == "Polygon"
+
+
+@pytest.mark.parametrize("step", ["-5", "0.0001", "nan", "inf"])
+def test_a_step_that_is_none_is_refused_at_once(archive: Path, step: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert analyze(archive, "replay", "--step", step) == 2
+    assert capsys.readouterr().err.splitlines()[-1].startswith("error: step: ")
+
+
+def test_frames_begin_with_the_first_report_and_too_many_are_refused(
+    archive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["analyze", "replay", "--archive", str(archive), "--to", "2026-01-27T06:00"]
+    assert main([*command, "--step", "10800"]) == 0
+    frames = [line for line in capsys.readouterr().err.splitlines() if line.startswith("frame")]
+    assert frames[0].startswith("frame 2026-01-27T03:00:00: ")
+    assert main([*command, "--step", "10"]) == 2
+    assert "error: step: makes 2129 frames from 2026-01-27T00:05:10 on" in capsys.readouterr().err
+
+
+def test_a_file_that_could_not_be_finished_is_none(tmp_path: Path) -> None:
+    table = geo.with_cells(pa.table({"cell": [CELL], "odd": [b"\x00"], "mu": [float("nan")]}))
+    path = tmp_path / "a.geojson"
+    path.write_text("as it was")
+    broken = table.set_column(table.schema.get_field_index("geometry"), "geometry", pa.array([b"\x01"]))
+    with pytest.raises((ValueError, struct.error)):
+        export.write(broken, path)
+    assert path.read_text() == "as it was"
+    assert [one.name for one in tmp_path.iterdir()] == ["a.geojson"]

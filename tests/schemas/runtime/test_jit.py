@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 CALLER = """from kernels.inner import inner
 from schemas.runtime.jit import compiled
 
@@ -53,3 +55,30 @@ def test_a_full_disk_under_the_cache_costs_only_the_cache(tmp_path: Path) -> Non
     (tmp_path / "kernels" / "outer.py").write_text(CALLER)
     assert run(tmp_path, "2.0", FULL_DISK) == "3.0"
     assert not list((tmp_path / "cache").rglob("*.nbc"))
+
+
+@pytest.mark.parametrize("place", ["/proc/nowhere", ""])
+def test_without_a_cache_that_can_be_written_kernels_are_compiled_at_each_start(tmp_path: Path, place: str) -> None:
+    """A service account without a home, a read-only container: no traceback, and nothing left in places of others."""
+    (tmp_path / "kernels").mkdir()
+    (tmp_path / "kernels" / "__init__.py").touch()
+    (tmp_path / "kernels" / "outer.py").write_text(CALLER)
+    homeless = (
+        "import os, tempfile; from pathlib import Path; tempfile.tempdir = '/proc/nowhere'; "
+        f"os.environ.update(HOME='/proc/nowhere', XDG_CACHE_HOME={place!r}); "
+    )
+    assert run(tmp_path, "2.0", homeless) == "3.0"
+    assert not (tmp_path / "cache").exists()
+    assert run(tmp_path, "2.0", homeless.replace("'/proc/nowhere'; from", f"{str(tmp_path)!r}; from")) == "3.0"
+
+
+def test_a_cache_that_others_may_write_is_not_used(tmp_path: Path) -> None:
+    (tmp_path / "kernels").mkdir()
+    (tmp_path / "kernels" / "__init__.py").touch()
+    (tmp_path / "kernels" / "outer.py").write_text(CALLER)
+    shared = tmp_path / "cache" / "gripmap"
+    shared.mkdir(parents=True)
+    shared.chmod(0o777)
+    assert run(tmp_path, "2.0", f"import os; os.environ['HOME'] = {str(tmp_path / 'home')!r}; ") == "3.0"
+    assert not list(shared.iterdir())
+    assert list((tmp_path / "home" / ".cache" / "gripmap").iterdir())

@@ -1,0 +1,87 @@
+"""A map of cells as one HTML file that needs no network: panels side by side, frames that play, a scale with its ticks.
+
+It works with mouse, finger and keyboard. What was not measured is hatched and has no colour.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from schemas.runtime.palette import GRIP, GRIP_RANGE, SURFACES, UNKNOWN
+
+_TEMPLATE: Final = Path(__file__).with_name("map.html")
+Value = float | None
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What the colours mean.
+
+    Attributes:
+        label: of the scale, with its unit.
+        low, high: values at its ends.
+        ticks: values on it and what is written there.
+        dark_is_high: whether large values are the dark ones; else small ones.
+        unknown: what a hatched place says.
+    """
+
+    label: str
+    low: float
+    high: float
+    ticks: Sequence[tuple[float, str]]
+    dark_is_high: bool = False
+    unknown: str = UNKNOWN
+
+
+GRIP_SCALE: Final = Scale(
+    "peak adhesion mu [1], the darker the more slippery", *GRIP_RANGE,
+    [(mu, f"{mu:g} {name}") for name, mu in SURFACES.items()],
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class DrawnCells:
+    """What is drawn: rows, each one or more squares of the map.
+
+    Attributes:
+        boxes: west, south, east, north [deg] of each square.
+        part: row of each square; None: row k has square k.
+        sector: heading sector of each row, 0 east to 3 south.
+        panels: name and value per row of each panel; None is 'not measured'.
+        names, rows: what is read out of a row.
+        frames, frame: names of the frames, and the number of each row's.
+        lasting: rows whose value still grows.
+    """
+
+    boxes: Sequence[Sequence[float]]
+    sector: Sequence[int]
+    panels: Mapping[str, Sequence[Value]]
+    names: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    part: Sequence[int] | None = None
+    frames: Sequence[str] = ("",)
+    frame: Sequence[int] | None = None
+    lasting: Sequence[bool] | None = None
+
+
+def render(
+    title: str, cells: DrawnCells, scale: Scale, *, about: str = "", table: Sequence[Sequence[str]] | None = None
+) -> str:
+    """The page. `table`: lines of a table below the map, the first its heads."""
+    data: dict[str, Any] = {
+        "title": title, "about": about, "table": table,
+        "scale": {
+            "label": scale.label, "low": scale.low, "high": scale.high, "ticks": list(scale.ticks),
+            "stops": GRIP[::-1] if scale.dark_is_high else GRIP, "unknown": scale.unknown,
+        },
+        "boxes": cells.boxes, "part": cells.part, "sector": cells.sector,
+        "panels": [{"name": name, "values": values} for name, values in cells.panels.items()],
+        "names": cells.names, "rows": cells.rows, "frames": cells.frames,
+        "frame": cells.frame if cells.frame is not None else [0] * len(cells.sector), "lasting": cells.lasting,
+    }  # fmt: skip
+    text = json.dumps(data, allow_nan=False).replace("<", "\\u003c")  # no value can end or open a tag
+    return _TEMPLATE.read_text(encoding="utf-8").replace("/*DATA*/null", text)

@@ -1,0 +1,33 @@
+"""The map of an archive as it stood at a moment, also now, with the polygons of its cells."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_service.archive import geo
+from fleet_service.archive.export import Box, Extract
+from fleet_service.fusion import Fusion
+from fleet_service.replay.rebuild import past
+from fleet_service.serve.encode import cell_table
+from schemas import grid, tables
+
+LATENESS_S = 120.0  # ServiceConfig.lateness_s
+
+
+def visited_cells(fusion: Fusion, at: int, box: Box | None) -> pa.Table:
+    """What is believed at a moment [ns] of the cells that somebody visited and that touch a box [deg]."""
+    slots = np.flatnonzero(fusion.live.vehicles[: fusion.size] > 0)  # a poor fix makes neighbours that nobody visited
+    if box is not None:
+        slots = slots[grid.touches(box, grid.bounds(fusion.cell[slots]))]
+    return cell_table(fusion, slots, at)
+
+
+def map_at(root: Path, part: Extract, lateness_s: float = LATENESS_S) -> pa.Table:
+    """The map at the end of a part: everything replayed that had been received by then, as a GeoParquet table."""
+    table = visited_cells(past(root, lateness_s, part.until, part.bbox), part.until, part.bbox)
+    time = pa.array(np.full(table.num_rows, part.until // tables.US_STEP)).cast(tables.US)
+    table = table.append_column("snapshot_time", time).sort_by([("cell", "ascending"), ("sector", "ascending")])
+    return geo.with_cells(table.cast(tables.MAP_ARCHIVE, safe=False))

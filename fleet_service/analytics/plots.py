@@ -1,0 +1,226 @@
+"""Plots of the answers, one way of drawing for each question: PNG for a page, SVG and PDF for print."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import UTC
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.figure import Figure
+
+from schemas import grid
+from schemas.numeric import FloatArray, IntArray
+from schemas.runtime.palette import GRIP, GRIP_RANGE, HATCH, UNKNOWN
+from schemas.thresholds import METRES_PER_DEGREE, SLIPPERY_MU, Z_95
+
+GRIP_MAP: Final = LinearSegmentedColormap.from_list("grip", GRIP)
+MU: Final = "peak adhesion μ [1]"
+MOST_ROWS: Final = 40  # spells or vehicles of a picture that can still be read
+MOST_PANELS: Final = 6
+EDGE: Final = 1.2  # points around each cell: a road of ten metres is seen on a map of ten kilometres
+DAY_S: Final = 86_400.0  # matplotlib counts days since 1970
+PUBLISHED: Final = 0.9  # how often a published interval is to hold
+_DARK, _LIGHT, _MARK = GRIP[2], GRIP[8], "#d0006f"
+
+
+def draw(table: pa.Table, name: str, about: str, path: Path) -> None:
+    """Draw an answer and write it as the ending of the path says (png, svg, pdf)."""
+    figure = Figure(figsize=(8.0, 4.8), layout="constrained")
+    if table.num_rows:
+        _DRAWN[name](figure, table)
+    else:
+        figure.text(0.5, 0.5, "the answer has no rows", ha="center")
+    figure.suptitle(f"{name}: {about}", fontsize=11)
+    figure.savefig(path, dpi=150)
+
+
+def cell_shapes(cell: IntArray, sector: IntArray | None = None) -> FloatArray:
+    """Squares of cells, (n, 4, 2), or the quarters of their heading sectors, (n, 3, 2) [m from the south-west]."""
+    west, south, east, north = grid.bounds(cell)
+    scale = METRES_PER_DEGREE * np.cos(np.radians(south.mean())) if len(cell) else 1.0
+    x0, x1 = (west - west.min(initial=180.0)) * scale, (east - west.min(initial=180.0)) * scale
+    y0, y1 = ((side - south.min(initial=90.0)) * METRES_PER_DEGREE for side in (south, north))
+    corners = np.stack([np.stack(pair, -1) for pair in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], 1)
+    if sector is None:
+        return corners
+    first, second = np.array([1, 2, 3, 0])[sector], np.array([2, 3, 0, 1])[sector]  # east, north, west, south
+    row = np.arange(len(sector))
+    return np.stack([corners.mean(axis=1), corners[row, first], corners[row, second]], axis=1)
+
+
+def paint(
+    axes: Axes, shapes: FloatArray, values: FloatArray, limits: tuple[float, float] = GRIP_RANGE
+) -> PolyCollection:
+    """Shapes in the colours of grip; those without a value are hatched and have none."""
+    known = np.isfinite(values)
+    if not known.all():
+        axes.add_collection(
+            PolyCollection(list(shapes[~known]), facecolors="white", edgecolors="0.55", hatch=HATCH, linewidths=0.2,
+                           label=UNKNOWN)
+        )  # fmt: skip
+    patches = PolyCollection(list(shapes[known]), array=values[known], cmap=GRIP_MAP, norm=Normalize(*limits))
+    patches.set(edgecolor="face", linewidth=EDGE)
+    axes.add_collection(patches)
+    axes.autoscale()
+    axes.set_aspect("equal")
+    axes.set(xlabel="east [m]", ylabel="north [m]")
+    return patches
+
+
+def _grip(figure: Figure, table: pa.Table) -> None:
+    days = np.array([str(day) for day in table["day"].to_pylist()])
+    middle = _floats(table, "mu_p50")
+    axes = figure.subplots()
+    names = np.unique(days)
+    for k, day in enumerate(names):
+        own = middle[(days == day) & np.isfinite(middle)]
+        bounded = int(((days == day) & ~np.isfinite(middle)).sum())
+        if len(own):
+            _band(
+                axes,
+                k,
+                np.quantile(own, (0.1, 0.5, 0.9)),
+                "tenth, middle and nine tenths of the cells" if not k else None,
+            )
+        axes.annotate(f"{len(own)} measured\n{bounded} bounded", (k, 0.02), ha="center", fontsize=8)
+    axes.axhline(SLIPPERY_MU, color=_MARK, linewidth=1, label=f"slippery below {SLIPPERY_MU}")
+    axes.set_xticks(range(len(names)), names, rotation=30 if len(names) > 5 else 0)
+    axes.set(ylabel=f"median {MU} of a cell", ylim=(0.0, 1.2), xlim=(-0.6, len(names) - 0.4))
+    axes.legend(fontsize=8)
+
+
+def _band(axes: Axes, at: float, three: FloatArray, label: str | None = None) -> None:
+    low, middle, high = three
+    axes.errorbar([at], [middle], [[middle - low], [high - middle]], fmt="o", capsize=5, color=_DARK, label=label)
+
+
+def _worst(figure: Figure, table: pa.Table) -> None:
+    rows: list[Any] = table.slice(0, MOST_PANELS).to_pylist()
+    panels = _panels(figure, len(rows))
+    for k, (axes, one) in enumerate(zip(panels, rows, strict=False), 1):
+        cells = np.array(one["members"], np.int64)
+        sector = np.full(len(cells), one["sector"], np.int64)
+        patches = paint(axes, cell_shapes(cells, sector), np.full(len(cells), one["mu"]))
+        axes.set_title(
+            f"{k}: {one['length_m']:.0f} m heading {grid.HEADINGS[one['sector']]}\n"
+            f"{one['share_slippery']:.0%} slippery (≥ {one['share_lower']:.0%}) of {one['values']} values", fontsize=9,
+        )  # fmt: skip
+        axes.margins(0.1)
+    figure.colorbar(patches, ax=panels, label=f"mean {MU} where slippery", shrink=0.8)
+
+
+def _panels(figure: Figure, count: int) -> list[Axes]:
+    """So many axes, three a row."""
+    columns, rows = min(count, 3) or 1, -(-count // 3) or 1
+    if count > 1:
+        figure.set_size_inches(4.2 * columns, 3.8 * rows)
+    panels: list[Axes] = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel().tolist()
+    for axes in panels[count:]:
+        axes.set_visible(False)
+    return panels
+
+
+def _spells(figure: Figure, table: pa.Table) -> None:
+    order = np.argsort(-_floats(table, "duration_s"), kind="stable")[:MOST_ROWS]
+    rows = sorted(table.take(order).to_pylist(), key=lambda one: one["onset"])
+    axes = figure.subplots()
+    for k, one in enumerate(rows):
+        begin, end = ((one["onset"] + extra) / DAY_S for extra in (0.0, one["duration_s"]))
+        axes.plot([begin, end], [k, k], color=_MARK if one["lasts"] else _DARK, linewidth=3, solid_capstyle="butt")
+        if one["lasts"]:
+            axes.plot([end], [k], marker=">", color=_MARK)
+    axes.xaxis_date(UTC)
+    axes.plot([], [], color=_DARK, linewidth=3, label="ended")
+    axes.plot([], [], color=_MARK, marker=">", linewidth=3, label="lasts at the end of the data")
+    axes.set(xlabel="time, UTC", ylabel="spell, by its onset", title=f"the {len(rows)} longest of {table.num_rows}")
+    axes.tick_params(axis="x", labelrotation=25)
+    axes.legend(fontsize=8)
+
+
+def _before_after(figure: Figure, table: pa.Table) -> None:
+    rows = {row["period"]: row for row in table.to_pylist()}
+    before, after = rows["before"], rows["after"]
+    left, right = figure.subplots(1, 2, width_ratios=[2, 1])
+    left.plot([0, 1], [before["mu"], after["mu"]], "o-", color=_DARK, label="mean of the same cells")
+    left.set_xticks([0, 1], ["before", "after"])
+    left.set(ylabel=MU, ylim=(0.0, 1.2), xlim=(-0.5, 1.5))
+    _band(right, 0, np.array([after[name] for name in ("lower", "difference", "upper")]), "difference, 95 % interval")
+    right.axhline(0.0, color=_MARK, linewidth=1, label="no change")
+    right.set_xticks([0], ["after - before"])
+    right.set(ylabel="change of μ [1]")
+    left.set_title(f"{after['cells']} cells, {after['vehicles']} vehicles, {after['values']} values", fontsize=10)
+    right.set_title(f"{after['difference']:+.3f} [{after['lower']:+.3f}, {after['upper']:+.3f}]", fontsize=10)
+    for axes in (left, right):
+        axes.legend(fontsize=8)
+
+
+def _vehicles(figure: Figure, table: pa.Table) -> None:
+    z = _floats(table, "z")
+    order = np.argsort(-np.nan_to_num(z, nan=-1.0), kind="stable")[:MOST_ROWS]
+    rows = [row for row in table.take(order).to_pylist() if row["bias"] is not None]
+    axes = figure.subplots()
+    at = np.arange(len(rows))
+    spread = [Z_95 * (row["bias_std"] or 0.0) for row in rows]
+    axes.errorbar([row["bias"] for row in rows], at, xerr=spread, fmt="o", markersize=3, capsize=2, color=_DARK,
+                  label="bias against others, 95 %")  # fmt: skip
+    axes.axvline(0.0, color=_MARK, linewidth=1)
+    axes.set_yticks(at, [str(row["vehicle"])[:8] for row in rows], fontsize=6)
+    axes.invert_yaxis()
+    axes.set(xlabel="bias of μ [1]", ylabel="vehicle", title=f"the {len(rows)} surest of {table.num_rows}")
+    axes.legend(fontsize=8)
+
+
+def _calibration(figure: Figure, table: pa.Table) -> None:
+    axes = figure.subplots()
+    basis = np.array(table["basis"].to_pylist(), str)
+    for name, marker, colour in (("measured", "o", _DARK), ("bound", "s", _LIGHT), ("borrowed", "^", _MARK)):
+        own = table.filter(pa.array(basis == name)).sort_by("age_h")
+        if own.num_rows:
+            for column, line in (("held", "-"), ("compatible", ":")):
+                axes.plot(_floats(own, "age_h"), _floats(own, column), line, marker=marker, color=colour,
+                          label=f"{name}: {column}")  # fmt: skip
+    axes.axhline(PUBLISHED, color="0.4", linewidth=1, label=f"published: {PUBLISHED:.0%}")
+    axes.set(xlabel="hours between map and value", ylabel="share of later values inside", ylim=(0.0, 1.05))
+    axes.legend(fontsize=8)
+
+
+def _weather(figure: Figure, table: pa.Table) -> None:
+    table = table.sort_by("temperature")
+    left, right = figure.subplots(1, 2)
+    t, p10, p50 = (_floats(table, name) for name in ("temperature", "mu_p10", "mu_p50"))
+    left.plot(t, p50, "o-", color=_DARK, label="median")
+    left.plot(t, p10, "s:", color=_LIGHT, label="worst tenth")
+    left.axvline(0.0, color="0.6", linewidth=1)
+    left.set(xlabel="temperature of the nearest station [°C]", ylabel=MU, ylim=(0.0, 1.2))
+    left.legend(fontsize=8)
+    right.bar(t, _floats(table, "share_slippery"), width=1.6, color=_DARK)
+    right.set(xlabel="temperature [°C]", ylabel=f"share of values below {SLIPPERY_MU}", ylim=(0.0, 1.0))
+
+
+def _replay(figure: Figure, table: pa.Table) -> None:
+    frame = table["frame"].cast(pa.int64()).to_numpy()
+    times = np.unique(frame)
+    times = times[np.unique(np.linspace(0, len(times) - 1, min(len(times), MOST_PANELS)).astype(int))]
+    panels = _panels(figure, len(times))
+    shapes = cell_shapes(table["cell"].to_numpy(), table["sector"].to_numpy().astype(np.int64))
+    for axes, time in zip(panels, times.tolist(), strict=False):
+        patches = paint(axes, shapes[frame == time], _floats(table, "mu")[frame == time])
+        axes.set_title(f"{np.datetime64(time, 'us').astype('datetime64[s]')} UTC", fontsize=9)
+    figure.colorbar(patches, ax=panels, label=f"{MU}; hatched: {UNKNOWN}", shrink=0.8)
+
+
+_DRAWN: Final[dict[str, Callable[[Figure, pa.Table], None]]] = {
+    "grip": _grip, "worst": _worst, "spells": _spells, "before-after": _before_after, "vehicles": _vehicles,
+    "calibration": _calibration, "weather": _weather, "replay": _replay,
+}  # fmt: skip
+
+
+def _floats(table: pa.Table, name: str) -> FloatArray:
+    values: list[Any] = table[name].to_pylist()
+    return np.array([np.nan if value is None else float(value) for value in values])

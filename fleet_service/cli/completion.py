@@ -1,0 +1,20 @@
+"""`fleet-service completion`: the script that completes its commands and options in a shell."""
+
+from __future__ import annotations
+
+import argparse
+
+from schemas.runtime import commandline
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("shell", metavar="|".join(commandline.SHELLS), help="which shell")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the script."""
+    from fleet_service.cli import COMMANDS, parser_of
+
+    print(commandline.completion(parser_of(*(command.name for command in COMMANDS)), arguments.shell))
+    return 0

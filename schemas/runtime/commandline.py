@@ -1,0 +1,138 @@
+"""What both command lines share: the frame around a command, negative numbers, versions, completion, who may be told.
+
+Exit codes: 0 done, 1 done and something failed or was left, 2 misuse or bad input, 3 not plausible (edge-agent), 130
+ended by Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from schemas.errors import InputError
+
+FAILED: Final = 1
+BAD_INPUT: Final = 2
+INTERRUPTED: Final = 130  # 128 + SIGINT, as shells have it
+SHELLS: Final = ("bash", "zsh", "tcsh")
+_NEGATIVE: Final = re.compile(r"^-[\d.]")
+
+
+def joined(argv: Sequence[str]) -> list[str]:
+    """The words of a command line, `--bbox -0.5,51,…` as `--bbox=-0.5,51,…`: argparse takes a minus for an option."""
+    out: list[str] = []
+    for word in argv:
+        if _NEGATIVE.match(word) and out and re.fullmatch(r"--[a-z-]+", out[-1]):
+            out[-1] += f"={word}"
+        else:
+            out.append(word)
+    return out
+
+
+def add_command(commands: Any, name: str, about: str, example: str) -> argparse.ArgumentParser:  # noqa: ANN401 argparse's own
+    """A subcommand with its example, and with the options that all have."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        name, help=about, description=about, epilog=f"example:\n  {example}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    louder = parser.add_mutually_exclusive_group()
+    louder.add_argument("-v", "--verbose", action="store_true", help="say what libraries say too")
+    louder.add_argument("-q", "--quiet", action="store_true", help="errors only")
+    return parser
+
+
+class VersionAction(argparse.Action):
+    """`--version`: that of the distribution that is installed."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, **_: object) -> None:
+        super().__init__(option_strings, dest, nargs=0, help="show the version and leave", default=argparse.SUPPRESS)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        """Print it and leave."""
+        print(f"{parser.prog} {version()}")
+        parser.exit(0)
+
+
+def version() -> str:
+    """Version of the distribution, or of a source tree that was never installed."""
+    from importlib import metadata
+
+    try:
+        return metadata.version("gripmap")
+    except metadata.PackageNotFoundError:
+        return "unknown (not installed)"
+
+
+def guarded(run: Callable[[], int]) -> int:
+    """Run a command; misuse, Ctrl-C and a reader that left end it with a line at most.
+
+    Returns:
+        its exit code.
+    """
+    try:
+        return int(run())
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:  # the reader of our output left: nobody to tell
+        sys.stderr.close()
+        return 0
+
+
+def out_folder(field: str, path: Path) -> Path:
+    """A path to write, before anything is computed for it.
+
+    Raises:
+        InputError: it is a folder, or lies in none.
+    """
+    if path.is_dir():
+        raise InputError(field, f"{path} is a folder", "name a file")
+    if not path.absolute().parent.is_dir():
+        raise InputError(
+            field, f"cannot write {path} (No such file or directory)", "name a file in a folder that is there"
+        )
+    return path
+
+
+def ending(field: str, path: Path, known: Sequence[str]) -> str:
+    """The ending of a path, which decides the format; the longest that fits.
+
+    Raises:
+        InputError: it is none of those known.
+    """
+    fits = [one for one in known if path.name.endswith(one)]
+    if not fits:
+        raise InputError(field, f"{path.name} has no known ending", f"use one of {', '.join(known)}")
+    return max(fits, key=len)
+
+
+def not_an_input(field: str, out: Path, inputs: Sequence[Path]) -> None:
+    """Refuse to write over what is read.
+
+    Raises:
+        InputError: the file to write is one of the inputs.
+    """
+    for source in inputs:
+        if out.resolve() == source.resolve():
+            raise InputError(field, f"would replace {source}, which is read", "name another file")
+
+
+def completion(parser: argparse.ArgumentParser, shell: str) -> str:
+    """The script that completes a command line in a shell.
+
+    Raises:
+        InputError: no such shell.
+    """
+    if shell not in SHELLS:
+        raise InputError("shell", f"{shell!r} is none", f"use one of {', '.join(SHELLS)}")
+    import shtab
+
+    script: Any = shtab.complete(parser, shell)
+    return str(script)

@@ -1,0 +1,32 @@
+"""Colours of everything that is drawn: they survive three kinds of colour blindness and a grey printer.
+
+`GRIP` is viridis (van der Walt and Smith 2015): its lightness rises all the way, so that darker is more slippery on any
+paper. What was not measured has no colour: it is white and hatched, and never a shade of the scale.
+`tests/test_palette.py` computes the distances.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+GRIP: Final = (
+    "#440154", "#481f70", "#443983", "#3b528b", "#31688e", "#287c8e", "#21918c", "#20a486", "#35b779", "#5ec962",
+    "#90d743", "#c8e020", "#fde725",
+)  # fmt: skip
+GRIP_RANGE: Final = (0.1, 1.0)  # of mu: from wet ice to dry asphalt
+SURFACES: Final = {"ice": 0.15, "snow": 0.35, "wet": 0.6, "dry": 0.9}  # peak adhesion that a reader knows them by
+HATCH: Final = "//////"  # of what was not measured, on white
+UNKNOWN: Final = "not measured: only lower bounds"
+
+
+def shade(value: float, low: float, high: float) -> str:
+    """Colour of a value on GRIP between `low` and `high`, as the pages compute it too."""
+    at = min(max((value - low) / (high - low), 0.0), 1.0) * (len(GRIP) - 1)
+    k = min(int(at), len(GRIP) - 2)
+    first, second = (_rgb(GRIP[j]) for j in (k, k + 1))
+    mixed = (round(a + (b - a) * (at - k)) for a, b in zip(first, second, strict=True))
+    return "#{:02x}{:02x}{:02x}".format(*mixed)
+
+
+def _rgb(text: str) -> tuple[int, ...]:
+    return tuple(int(text[k : k + 2], 16) for k in (1, 3, 5))

@@ -1,0 +1,97 @@
+"""What a command tells a person who waits: on stderr, never on stdout, and nothing when it was asked to be quiet.
+
+On a terminal a line with a clock turns while something takes longer than a second; elsewhere what takes long is said in
+a line once. A library that is imported says nothing: only the command lines call `speak`.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, Final
+
+PATIENCE_S: Final = 0.8  # after which a person asks whether it still runs
+COMPILING: Final = "compiling kernels, once on this machine: about 40 s for the default estimator"
+
+
+class _Voice:
+    """What is said and shown; one of the process."""
+
+    def __init__(self) -> None:
+        self.on = False
+        self.words = ""
+        self.told: set[str] = set()
+        self.shown: Any = None
+        self.lock = threading.Lock()
+
+
+_voice = _Voice()
+
+
+def speak(*, quiet: bool = False) -> None:
+    """Let this process talk to a person; a command line calls it."""
+    _voice.on = not quiet
+    _voice.told.clear()
+
+
+def say(line: str) -> None:
+    """A line of progress."""
+    if _voice.on:
+        with suppress(OSError):
+            print(line, file=sys.stderr, flush=True)
+
+
+def say_once(line: str) -> None:
+    """A line of progress that is the same however often it is due; on a terminal it is what turns."""
+    if line not in _voice.told:
+        _voice.told.add(line)
+        say(line)
+
+
+def doing(words: str) -> None:
+    """What is being done now, for the line that turns."""
+    with _voice.lock:
+        _voice.words = words
+        if _voice.shown is not None:
+            _voice.shown.update(0, description=words)
+
+
+@contextmanager
+def busy(words: str) -> Iterator[None]:
+    """Show that it still runs, from PATIENCE_S on and only on a terminal."""
+    if not (_voice.on and sys.stderr.isatty()) or _voice.shown is not None:
+        yield
+        return
+    doing(words)
+    timer = threading.Timer(PATIENCE_S, _show)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+        timer.join()
+        _hide()
+
+
+def _hide() -> None:
+    with _voice.lock:
+        shown, _voice.shown = _voice.shown, None
+    if shown is not None:
+        shown.stop()
+
+
+def _show() -> None:
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    shown = Progress(
+        SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), console=Console(stderr=True),
+        transient=True, redirect_stdout=sys.stdout.isatty(),
+    )  # fmt: skip
+    shown.add_task(_voice.words, total=None)
+    shown.start()
+    with _voice.lock:
+        _voice.shown = shown

@@ -1,0 +1,80 @@
+"""Pages in a real browser: headless Chromium of the system, driven by Playwright.
+
+Debian and Ubuntu: apt install chromium; CI does. Where there is none, or no Playwright, the tests of pages are skipped
+and say so.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import pytest
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+NAMES: Final = ("chromium", "chromium-browser", "google-chrome")
+PHONE: Final = {"width": 390, "height": 844}
+DESK: Final = {"width": 1280, "height": 900}
+
+
+def executable() -> str | None:
+    """Where Chromium lies."""
+    return next((found for name in NAMES if (found := shutil.which(name))), None)
+
+
+class Opened:
+    """A page that was opened, what it complained of, and what it asked the network for."""
+
+    def __init__(self, page: Page) -> None:
+        self.page = page
+        self.errors: list[str] = []
+        self.requests: list[str] = []
+        page.on("pageerror", lambda error: self.errors.append(str(error)))
+        page.on("console", lambda said: self.errors.append(said.text) if said.type == "error" else None)
+        page.on("request", lambda request: self.requests.append(request.url))
+
+    @property
+    def drawn(self) -> int:
+        """How many shapes the page says that it painted."""
+        return int(self.page.evaluate("document.body.dataset.drawn || 0"))
+
+    def colours(self, panel: int = 0) -> dict[str, int]:
+        """Opaque colours of a canvas and how many of its points have them."""
+        found: dict[str, int] = self.page.evaluate(_COLOURS, panel)
+        return found
+
+
+@contextmanager
+def opened(path: Path, *, phone: bool = False, ratio: float = 1.0) -> Iterator[Opened]:
+    """A file of this machine in the browser; skips the test where there is none."""
+    program = executable()
+    if program is None:
+        pytest.skip("no Chromium on this machine: apt install chromium")
+    api: Any = pytest.importorskip("playwright.sync_api", reason="no Playwright: pip install 'gripmap[dev]'")
+    with api.sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        context = browser.new_context(
+            viewport=PHONE if phone else DESK, device_scale_factor=ratio, has_touch=phone, is_mobile=phone
+        )
+        try:
+            found = Opened(context.new_page())
+            found.page.goto(path.resolve().as_uri())
+            yield found
+        finally:
+            browser.close()
+
+
+_COLOURS: Final = """panel => {
+  const canvas = document.querySelectorAll("canvas.map")[panel];
+  const bytes = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data, found = {};
+  for (let k = 0; k < bytes.length; k += 4) if (bytes[k + 3] === 255) {
+    const name = [bytes[k], bytes[k + 1], bytes[k + 2]].join(",");
+    found[name] = (found[name] || 0) + 1;
+  }
+  return found;
+}"""

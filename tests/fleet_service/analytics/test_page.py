@@ -1,0 +1,137 @@
+"""The pages as a person meets them: opened in a real browser, pointed at, touched and walked by keyboard."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from fleet_service.analytics import output
+from fleet_service.analytics.page import GRIP_SCALE, DrawnCells, render
+from fleet_service.analytics.questions import QUESTIONS
+from fleet_service.cli import main
+from schemas import grid
+from schemas.runtime.palette import GRIP_RANGE, shade
+from tests.browser import opened
+from tests.fleet_service.analytics.test_analyze import DAYS
+from tests.fleet_service.examples import CELL
+
+PLACED = [name for name, question in QUESTIONS.items() if question.colour]
+
+
+@pytest.fixture(scope="module")
+def pages(archive: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Every answer with a place, as a page; of `replay` a day in frames, too."""
+    folder = tmp_path_factory.mktemp("pages")
+    more: dict[str, list[str]] = {name: [] for name in PLACED} | {"frames": ["--step", "21600"]}
+    for name, words in more.items():
+        question = "replay" if name == "frames" else name
+        command = ["analyze", question, "--archive", str(archive), *DAYS, *words, "--out", str(folder / f"{name}.html")]
+        assert main(command) == 0
+    return {name: folder / f"{name}.html" for name in more}
+
+
+@pytest.mark.parametrize("name", [*PLACED, "frames"])
+def test_a_page_opens_without_an_error_or_a_network_and_draws_its_cells(pages: dict[str, Path], name: str) -> None:
+    with opened(pages[name]) as found:
+        assert found.errors == []
+        assert found.requests == [pages[name].resolve().as_uri()]
+        assert found.drawn > 3
+        assert len(found.colours()) > 3
+        assert found.page.locator("#frames").is_visible() == (name in ("frames", "grip"))
+
+
+def cells(values: list[float | None], lasting: list[bool] | None = None) -> DrawnCells:
+    boxes = np.stack(grid.bounds(CELL + np.arange(len(values))), axis=1).tolist()
+    rows = [[str(value)] for value in values]
+    return DrawnCells(boxes, [0, 1, 2, 3][: len(values)], {"map": values}, ["mu"], rows, lasting=lasting)
+
+
+def test_what_was_not_measured_has_no_colour_of_the_scale(tmp_path: Path) -> None:
+    path = tmp_path / "page.html"
+    path.write_text(render("two", cells([0.9, None]), GRIP_SCALE))
+    dry = ",".join(str(int(shade(0.9, *GRIP_RANGE)[k : k + 2], 16)) for k in (1, 3, 5))
+    with opened(path) as found:
+        colours = found.colours()
+        assert colours[dry] > 1000
+        painted = {name for name, count in colours.items() if count > 200} - {dry}
+        for name in painted:
+            red, green, blue = map(int, name.split(","))
+            assert max(red, green, blue) - min(red, green, blue) < 12, "a bound has a colour"
+        assert found.page.locator("#unknown").is_visible()
+        assert "0.15 ice" in found.page.locator("#ticks").inner_text()
+
+
+def test_pointing_tapping_and_the_keyboard_read_a_cell(tmp_path: Path) -> None:
+    path = tmp_path / "page.html"
+    path.write_text(render("one", cells([0.2]), GRIP_SCALE))
+    with opened(path) as found:
+        canvas = found.page.locator("canvas.map")
+        box = canvas.bounding_box()
+        assert box is not None
+        found.page.mouse.move(box["x"] + box["width"] / 2 + 5, box["y"] + box["height"] / 2)
+        assert found.page.locator("#said").inner_text() == "mu 0.2"
+        found.page.mouse.move(box["x"] + 3, box["y"] + 3)
+        assert "nothing is known" in found.page.locator("#said").inner_text()
+        canvas.focus()
+        found.page.keyboard.press("Enter")
+        assert found.page.locator("#said").inner_text() == "mu 0.2"
+        for _ in range(30):
+            found.page.keyboard.press("ArrowLeft")
+        assert "nothing is known" in found.page.locator("#said").inner_text()
+    with opened(path, phone=True, ratio=3.0) as found:
+        assert found.page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+        canvas = found.page.locator("canvas.map")
+        assert canvas.evaluate("c => c.width / c.clientWidth") == pytest.approx(3.0, abs=0.02)
+        canvas.tap()
+        assert found.page.locator("#said").inner_text() == "mu 0.2"
+
+
+def test_a_finger_moves_the_map(tmp_path: Path) -> None:
+    path = tmp_path / "page.html"
+    path.write_text(render("one", cells([0.2]), GRIP_SCALE))
+    with opened(path, phone=True) as found:
+        before = found.colours()
+        found.page.evaluate("""() => {
+          const canvas = document.querySelector("canvas.map"), box = canvas.getBoundingClientRect();
+          canvas.setPointerCapture = () => {};
+          const send = (type, x) => canvas.dispatchEvent(new PointerEvent(type, {
+            pointerId: 7, pointerType: "touch", clientX: box.left + x, clientY: box.top + 200, bubbles: true }));
+          send("pointerdown", 100); send("pointermove", 2000); send("pointerup", 2000);
+        }""")
+        assert found.errors == []
+        assert sum(found.colours().values()) < sum(before.values())
+
+
+def test_each_frame_is_drawn_alone_and_the_slider_changes_it(pages: dict[str, Path]) -> None:
+    with opened(pages["frames"]) as found:
+        first = found.page.locator("#frame").inner_text()
+        found.page.locator("#slider").fill("2")
+        assert found.page.locator("#frame").inner_text() != first
+        assert found.errors == []
+
+
+def test_frames_seconds_apart_are_frames_of_their_own() -> None:
+    frame = pa.array([0, 10_000_000, 20_000_000]).cast(pa.timestamp("us", "UTC"))
+    columns = {"cell": [CELL] * 3, "sector": [0] * 3, "mu": [0.2, 0.5, 0.9], "p_slippery": [1.0, 0.5, 0.0]}
+    text = output.page(pa.table({**columns, "frame": frame}), QUESTIONS["replay"])
+    assert '"frames": ["1970-01-01 00:00:00", "1970-01-01 00:00:10", "1970-01-01 00:00:20"]' in text
+    assert '"frame": [0, 1, 2]' in text
+
+
+def test_a_stretch_is_drawn_as_its_road_and_a_spell_that_lasts_is_marked(tmp_path: Path) -> None:
+    bent = grid.interleave(np.array([0, 1, 2, 2, 2]) + 1_118_000, np.array([0, 0, 0, 1, 2]) + 630_000).tolist()
+    worst = pa.table({"cell": [bent[0]], "sector": [0], "mu": [0.2], "score": [1.0], "members": [bent]})
+    (tmp_path / "worst.html").write_text(output.page(worst, QUESTIONS["worst"]))
+    with opened(tmp_path / "worst.html") as found:
+        assert found.drawn == len(bent)
+    spells = pa.table(
+        {"cell": [CELL, CELL + 1], "sector": [0, 0], "onset": [0, 1], "duration_s": [60, 600], "lasts": [False, True]}
+    )
+    (tmp_path / "spells.html").write_text(output.page(spells, QUESTIONS["spells"]))
+    with opened(tmp_path / "spells.html") as found:
+        assert found.page.locator("#lasting").is_visible()
+        assert not found.page.locator("#unknown").is_visible()
+        assert found.colours().get("208,0,111", 0) > 50

@@ -1,0 +1,230 @@
+"""Both command lines as a person meets them: versions, examples, completion, Ctrl-C, minus signs, brakes, endings."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import pty
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow.csv as pacsv
+import pyarrow.parquet as pq
+import pytest
+
+import edge_agent.cli
+import fleet_service.cli
+from schemas.errors import InputError
+from schemas.runtime import commandline
+from tests.fleet_service.archive.kept import DATA
+
+LINES: Final[dict[str, Any]] = {"edge-agent": edge_agent.cli, "fleet-service": fleet_service.cli}
+EXAMPLES: Final = [(name, c.name, c.example) for name, line in LINES.items() for c in line.COMMANDS]
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Path:
+    """A copy of the archive that is kept."""
+    return Path(shutil.copytree(DATA / "v1.0" / "archive", tmp_path / "archive"))
+
+
+@pytest.mark.parametrize("name", LINES)
+def test_the_version_is_that_of_the_distribution(name: str, capsys: Capture) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        LINES[name].main(["--version"])
+    assert capsys.readouterr().out == f"{name} {commandline.version()}\n"
+    assert commandline.version()[0].isdigit()
+
+
+@pytest.mark.parametrize(("name", "command", "example"), EXAMPLES)
+def test_the_example_of_each_help_is_a_command_that_is_understood(name: str, command: str, example: str) -> None:
+    words = shlex.split(example.partition(" > ")[0])
+    assert words[:2] == [name, command]
+    parser = LINES[name].parser_of(command)
+    assert parser.parse_args(commandline.joined(words[1:])).command == command
+
+
+@pytest.mark.parametrize("name", LINES)
+@pytest.mark.parametrize("shell", commandline.SHELLS)
+def test_completion_is_a_script_of_the_shell(name: str, shell: str, capsys: Capture) -> None:
+    assert LINES[name].main(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    for option in ("--version", "--archive" if name == "fleet-service" else "--estimator"):
+        assert option.lstrip("-") in script
+    if shell == "bash":
+        assert subprocess.run(["bash", "-n"], input=script, text=True, check=False).returncode == 0
+    assert LINES[name].main(["completion", "abacus"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("given", "understood"),
+    [
+        (["--bbox", "-0.5,51,0.3,52"], ["--bbox=-0.5,51,0.3,52"]),
+        (["--route", "-.1,51|-.2,52", "-q"], ["--route=-.1,51|-.2,52", "-q"]),
+        (["--slope", "-0.03", "log"], ["--slope=-0.03", "log"]),
+        (["--out", "x", "-v"], ["--out", "x", "-v"]),
+        (["--bbox=-1,2,3,4", "-1"], ["--bbox=-1,2,3,4", "-1"]),
+    ],
+)
+def test_a_minus_sign_is_a_number_behind_an_option(given: list[str], understood: list[str]) -> None:
+    assert commandline.joined(given) == understood
+
+
+def test_the_western_hemisphere_is_asked_like_the_eastern(archive: Path, tmp_path: Path, capsys: Capture) -> None:
+    words = ["export", "observations", "--archive", str(archive), "--out", str(tmp_path / "a.csv")]
+    assert fleet_service.cli.main([*words, "--bbox", "-0.5,51.2,0.3,51.7"]) == 0
+    assert capsys.readouterr().out.startswith("0 rows in ")
+
+
+def test_ctrl_c_is_130_and_one_word(capsys: Capture) -> None:
+    def interrupted() -> int:
+        raise KeyboardInterrupt
+
+    assert commandline.guarded(interrupted) == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+@pytest.mark.parametrize("command", ["compact", "retention --raw-days 31", "forget --period 2026-01", "export map"])
+def test_a_folder_that_is_no_archive_is_left_as_it_is(command: str, tmp_path: Path, capsys: Capture) -> None:
+    (tmp_path / "README.md").write_text("mine")
+    out = ["--out", str(tmp_path / "a.csv")] if command.startswith("export") else []
+    assert fleet_service.cli.main([*command.split(), "--archive", str(tmp_path), *out]) == 2
+    assert capsys.readouterr().err.startswith("error: archive: ")
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("README.md", "mine")]
+
+
+def test_a_page_of_somebody_else_in_an_archive_is_not_replaced(archive: Path) -> None:
+    (archive / "README.md").write_text("mine")
+    assert fleet_service.cli.main(["compact", "--archive", str(archive)]) == 0
+    assert (archive / "README.md").read_text() == "mine"
+
+
+def files(folder: Path) -> set[Path]:
+    return {path for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("words", [["forget", "--period", "2024-10"], ["retention", "--raw-days", "31"]])
+def test_what_destroys_can_be_tried_and_asks_on_a_terminal(words: list[str], archive: Path, capsys: Capture) -> None:
+    command = [*words, "--archive", str(archive)]
+    before = files(archive)
+    assert fleet_service.cli.main([*command, "--dry-run"]) == 0
+    assert "would be" in capsys.readouterr().out
+    assert files(archive) == before
+    said = on_terminal([sys.executable, "-m", "fleet_service.cli", *command], "n\n")
+    assert "Go on? [y/N]" in said
+    assert "nothing" in said
+    assert files(archive) == before
+    assert fleet_service.cli.main([*command, "--yes"]) == 0
+    assert files(archive) != before
+
+
+def on_terminal(command: list[str], answer: str) -> str:
+    """What a command says to a person on a terminal who answers its question so."""
+    here, there = pty.openpty()
+    with subprocess.Popen(command, stdin=there, stdout=there, stderr=there) as process:
+        os.close(there)
+        os.write(here, answer.encode())
+        said = b""
+        try:
+            while block := os.read(here, 4096):
+                said += block
+        except OSError:  # the other side has left
+            pass
+        assert process.wait(60) == 0
+    os.close(here)
+    return said.decode()
+
+
+def test_a_vehicle_that_is_not_there_is_told_from_one_that_is(archive: Path, capsys: Capture) -> None:
+    words = ["forget", "--archive", str(archive), "--period", "2024-10", "--vehicle"]
+    assert fleet_service.cli.main([*words, "sim-typo"]) == 0
+    assert capsys.readouterr().out == "no rows of sim-typo in 2024-10: nothing removed\n"
+    assert fleet_service.cli.main([*words, "sim-003", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["rows"] > 0
+
+
+def test_an_export_of_the_map_is_of_now_and_says_of_when(archive: Path, tmp_path: Path, capsys: Capture) -> None:
+    words = ["export", "map", "--archive", str(archive), "--out", str(tmp_path / "map.parquet")]
+    assert fleet_service.cli.main([*words, "--to", "2024-10-04T23:59:50"]) == 0
+    assert "the map as of 2024-10-04T23:59:50Z" in capsys.readouterr().out
+    then = pq.read_table(tmp_path / "map.parquet")
+    assert {f"{time:%S}" for time in then["snapshot_time"].to_pylist()} == {"50"}
+    assert fleet_service.cli.main([*words, "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["as_of"] > "2026-"
+    assert said["rows"] >= then.num_rows
+
+
+def test_what_waits_in_the_log_is_counted(archive: Path, capsys: Capture) -> None:
+    words = ["analyze", "grip", "--archive", str(archive), "--json"]
+    assert fleet_service.cli.main([*words, "--as-it-lies"]) == 0
+    without = capsys.readouterr()
+    assert fleet_service.cli.main(words) == 0
+    whole = capsys.readouterr()
+    assert "compacted first: " in whole.err
+    visits = [sum(json.loads(line)["observations"] for line in said.out.splitlines()) for said in (without, whole)]
+    assert visits[0] < visits[1]
+
+
+@pytest.mark.parametrize(
+    ("words", "start"),
+    [
+        (["grip", "--at", "2026-01-01"], "error: at: is not for grip; it is for before-after, replay"),
+        (["worst", "--min-vehicles", "0"], "error: min-vehicles: 0 is below 1"),
+        (["grip", "--from", "2024-10-05", "--to", "2024-10-04"], "error: to: 2024-10-04 is not after --from"),
+        (["grip", "--out", "nowhere/at/all.csv"], "error: out: cannot write"),
+        (["weather", "--stations", "{stations}"], "error: stations: german.csv has a value that is none"),
+    ],
+)
+def test_an_option_that_would_be_passed_over_is_refused(
+    words: list[str], start: str, archive: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    german = "station,time,latitude,longitude,temperature\na,31.01.2026 07:00,57.7,11.9,-2\n"
+    (tmp_path / "german.csv").write_text(german)
+    words = [word.format(stations=tmp_path / "german.csv") for word in words]
+    assert fleet_service.cli.main(["analyze", *words, "--archive", str(archive)]) == 2
+    assert capsys.readouterr().err.splitlines()[-1].startswith(start)
+
+
+def test_a_recording_is_never_replaced_by_its_estimates(tmp_path: Path, capsys: Capture) -> None:
+    log, car = tmp_path / "x.parquet", tmp_path / "x.json"
+    drive = ["simulate", "slalom", "--duration", "1", "--out", str(log), "--vehicle-out", str(car)]
+    assert edge_agent.cli.main(drive) == 0
+    before = log.read_bytes()
+    for out in (log, car, tmp_path / "." / "x.parquet"):
+        assert edge_agent.cli.main(["replay", str(log), "--out", str(out), "--estimator", "ckf"]) == 2
+        assert "would replace" in capsys.readouterr().err
+    assert log.read_bytes() == before
+
+
+def test_the_ending_of_a_file_decides_its_format(tmp_path: Path, capsys: Capture) -> None:
+    drive = ["simulate", "slalom", "--duration", "1", "--vehicle-out", str(tmp_path / "x.json"), "--out"]
+    for name in ("x.parquet", "x.csv"):
+        assert edge_agent.cli.main([*drive, str(tmp_path / name)]) == 0
+    log = tmp_path / "x.parquet"
+    assert pacsv.read_csv(tmp_path / "x.csv").num_rows == pq.read_table(log).num_rows
+    assert edge_agent.cli.main(["replay", str(log), "--out", str(tmp_path / "e.csv"), "--estimator", "ckf"]) == 0
+    assert {"mu", "mu_lower"} <= set(pacsv.read_csv(tmp_path / "e.csv").column_names)
+    assert edge_agent.cli.main(["replay", str(log), "--out", str(tmp_path / "e.xlsx"), "--estimator", "ckf"]) == 2
+    assert "error: out: e.xlsx has no known ending" in capsys.readouterr().err
+    assert not (tmp_path / "e.xlsx").exists()
+
+
+def test_what_may_be_written_is_known_before_anything_is_computed(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="out: .* is a folder"):
+        commandline.out_folder("out", tmp_path)
+    with pytest.raises(InputError, match="out: a.xls has no known ending; use one of .csv"):
+        commandline.ending("out", Path("a.xls"), (".csv",))
+    assert commandline.ending("out", Path("a.geo.parquet"), (".parquet", ".geo.parquet")) == ".geo.parquet"
+
+
+def test_every_module_of_a_command_says_what_it_is() -> None:
+    for line in LINES.values():
+        for command in line.COMMANDS:
+            assert importlib.import_module(command.module).__doc__.startswith("`")  # type: ignore[union-attr]
