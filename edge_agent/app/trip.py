@@ -63,7 +63,7 @@ class Trip:
         self._plain = vehicle.model_copy(update={"calibration": None})
         self._path, self._trusted = path, trusted
         self._known = _read(path, _identity(self._plain, profile))
-        learned = weighed(self._known.drives)
+        learned = weighed(self._known.drives, self._plain)
         self.vehicle = vehicle.model_copy(update={"calibration": surer(vehicle.calibration, learned)})
         self._blocks: list[tuple[FloatArray, FloatArray, FloatArray]] = []  # of this part: t, signals, ground
         self._since = self._looked = 0.0

@@ -17,6 +17,7 @@ from edge_agent.dynamics.parameters import parameter_table
 from edge_agent.estimators import adaptive_federated_ckf, compensated_wckf, federated_ckf, paper_aco_fckf, sr_ukf
 from edge_agent.estimators.bank import EstimatorBank
 from edge_agent.estimators.friction_mixture.bank import mixture_bank
+from edge_agent.estimators.friction_mixture.calibrated import spreads_of
 from edge_agent.estimators.friction_mixture.design import design_of
 from schemas.errors import InputError
 from schemas.vehicle import Vehicle
@@ -69,4 +70,5 @@ def create(name: str, vehicles: Sequence[Vehicle], *, memberships: Memberships |
         memberships = Memberships()
     if name == "paper-aco-fckf":
         return paper_aco_fckf.bank(vehicles, memberships)
-    return mixture_bank(parameter_table(vehicles), design_of(memberships, adaptive=name != "ckf"))
+    design = design_of(memberships, adaptive=name != "ckf")
+    return mixture_bank(parameter_table(vehicles), design, spreads_of(vehicles, design.nominal.std))

@@ -10,21 +10,21 @@ from schemas.vehicle import Vehicle
 def corrected(signals: FloatArray, vehicle: Vehicle) -> FloatArray:
     """Signals (…, 18) less what the vehicle's calibration knows of their errors; the same array where there is none.
 
-    What was not learned, or is smaller than its own standard deviation, is taken as sound. Rear steering, torque stay.
+    What was not learned is taken as sound; what was is a posterior mean, drawn to it. Rear steering and torque stay.
     """
     known = vehicle.calibration
     if known is None:
         return signals
     signals = signals.copy()
     for channel, estimate in ((S.AX, known.ax), (S.AY, known.ay), (S.YAW_RATE, known.yaw_rate)):
-        signals[..., channel] -= _sure(estimate, 0.0)
+        signals[..., channel] -= _value(estimate, 0.0)
     for i, wheel in enumerate(WHEELS):
-        signals[..., S.OMEGA + i] /= 1.0 + _sure(getattr(known, f"radius_{wheel}"), 0.0)
+        signals[..., S.OMEGA + i] /= 1.0 + _value(getattr(known, f"radius_{wheel}"), 0.0)
     front = slice(S.DELTA, S.DELTA + 2)
-    signals[..., front] -= _sure(known.steer_offset, 0.0)
-    signals[..., front] /= _sure(known.steer_gain, 1.0)
+    signals[..., front] -= _value(known.steer_offset, 0.0)
+    signals[..., front] /= _value(known.steer_gain, 1.0)
     return signals
 
 
-def _sure(estimate: tuple[float, float] | None, sound: float) -> float:
-    return sound if estimate is None or abs(estimate[0] - sound) < estimate[1] else estimate[0]
+def _value(estimate: tuple[float, float] | None, sound: float) -> float:
+    return sound if estimate is None else estimate[0]

@@ -10,6 +10,7 @@ from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators.common.excitation import Excitation
 from edge_agent.estimators.common.readings import INPUTS
 from edge_agent.estimators.friction_mixture.constants import ALL_NODES, STATES
+from edge_agent.estimators.friction_mixture.design import Nominal
 from schemas.numeric import FloatArray, IntArray
 from schemas.runtime.records import RecordArray, records
 
@@ -110,6 +111,7 @@ class MixtureMemory:
     """One filter."""
 
     row: Annotated[FloatArray, len(Parameter)]  # parameters of the vehicle
+    nominal: Nominal  # prior of its states, by what its file knows of them
     started: bool
     split: bool  # whether the split nodes take part
     last: LastInputs
@@ -139,8 +141,13 @@ class MixtureMemory:
     log_likelihood: float  # of what was measured at the sample [nat]
 
 
-def new_filters(rows: FloatArray) -> RecordArray:
-    """Filters of vehicles with parameters `rows` (N, 12) that have not seen a sample."""
+def new_filters(rows: FloatArray, nominal: Nominal, spreads: FloatArray) -> RecordArray:
+    """Filters of vehicles with parameters `rows` (N, 12) that have not seen a sample.
+
+    The prior of their states is `nominal`, with the standard deviations `spreads` (N, STATES).
+    """
     filters = records(MixtureMemory, len(rows))
+    prior = filters["nominal"]
+    prior["mean"], prior["std"], prior["time"] = nominal.mean, spreads, nominal.time
     filters["row"], filters["factor"], filters["last_side"] = rows, 1.0, np.nan
     return filters

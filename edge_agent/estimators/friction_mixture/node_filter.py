@@ -62,7 +62,7 @@ def update_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, 
 
     Writes its innovation and its theoretical variance without the inflation.
     """
-    constants, nominal, features, node = design.constants, design.nominal, scratch.features, scratch.node
+    constants, nominal, features, node = design.constants, memory.nominal, scratch.features, scratch.node
     mean, root, side_mu = memory.mean[j], scratch.root[j], design.sides.mu[j]
     innovation, theoretical = scratch.innovation[j], scratch.theoretical[j]
     node.gained.x, node.gained.y = gained_velocity(features.gain, mean)
@@ -278,15 +278,13 @@ def keep_within(mean: FloatArray, constants: Constants, nominal: Nominal) -> Non
 
 
 @compiled
-def predict_node(
-    memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int, turn_cos: float, turn_sin: float
-) -> None:
+def predict_node(memory: MixtureMemory, scratch: Scratch, j: int, turn_cos: float, turn_sin: float) -> None:
     """Advance node j over the block: exact rotation, gained velocity, process variances scratch.process.
 
     The map is affine, and the cubature of an affine map is the map itself: covariance <- F*L*(F*L)' + diag(noise).
     What is a property of vehicle or sensor returns to its prior by scratch.keep. scratch.root[j] is changed to F*L.
     """
-    nominal, keep, noise, gain = design.nominal, scratch.keep, scratch.process, memory.block.gain
+    nominal, keep, noise, gain = memory.nominal, scratch.keep, scratch.process, memory.block.gain
     mean, root, covariance = memory.mean[j], scratch.root[j], memory.covariance[j]
     n = mean.shape[0]
     for k in range(n):

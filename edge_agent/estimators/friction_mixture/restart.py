@@ -11,7 +11,7 @@ from edge_agent.estimators.common.excitation import begin_excitation
 from edge_agent.estimators.common.motion import FIRST_V_STD, UNKNOWN_V_STD
 from edge_agent.estimators.common.readings import believe, rolling_speed
 from edge_agent.estimators.friction_mixture.constants import ALL_NODES, NODES, NodeState
-from edge_agent.estimators.friction_mixture.design import MixtureDesign, Nominal
+from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.drive_split import FIRST_ODDS
 from edge_agent.estimators.friction_mixture.friction_grid import quantile
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles
@@ -53,7 +53,7 @@ def start(memory: MixtureMemory, design: MixtureDesign, time: float, sample: Flo
     speed = rolling_speed(memory.row, now)
     known = not math.isnan(speed)
     memory.overall_mean[NodeState.VX] = speed if known else 0.0
-    forget_vehicle(memory, design.nominal)
+    forget_vehicle(memory)
     covariance = memory.overall_covariance
     covariance[NodeState.VX, NodeState.VX] = (FIRST_V_STD if known else UNKNOWN_V_STD) ** 2
     covariance[NodeState.VY, NodeState.VY] = FIRST_V_STD**2
@@ -83,9 +83,9 @@ def find_quantiles(design: MixtureDesign, weight: FloatArray, friction: Quantile
 
 
 @compiled
-def forget_vehicle(memory: MixtureMemory, nominal: Nominal) -> None:
+def forget_vehicle(memory: MixtureMemory) -> None:
     """The overall moments of what is a property of vehicle or sensor become those of its prior."""
-    covariance = memory.overall_covariance
+    nominal, covariance = memory.nominal, memory.overall_covariance
     for i in range(NodeState.LN_KX, nominal.mean.shape[0]):
         memory.overall_mean[i] = nominal.mean[i]
         for j in range(i + 1):
@@ -175,7 +175,7 @@ def recover(memory: MixtureMemory, design: MixtureDesign, features: BlockFeature
 @compiled
 def _begin_anew(memory: MixtureMemory, design: MixtureDesign, speed: float) -> int:
     """Motion at `speed` [m/s], or where that is NaN at the one believed, and the prior of all else."""
-    forget_vehicle(memory, design.nominal)  # what was learned while lost is as wrong as the motion was
+    forget_vehicle(memory)  # what was learned while lost is as wrong as the motion was
     restart_motion(memory, speed, LOST_SPREAD_M_S)
     for group in range(2):
         memory.actual[group] = memory.theoretical[group]

@@ -70,7 +70,7 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
 @compiled
 def predict(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> None:
     """Predict all nodes to the end of the block, and renew the moments of the mixture."""
-    block, constants, nominal = memory.block, design.constants, design.nominal
+    block, constants, nominal = memory.block, design.constants, memory.nominal
     duration, process, keep = scratch.features.duration, scratch.process, scratch.keep
     leak = constants.leak_wander * abs(memory.last.ax)
     gyro = constants.gyro_wander * scratch.features.speed
@@ -91,7 +91,7 @@ def predict(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> N
     cos, sin = math.cos(block.angle), math.sin(block.angle)
     count = awake(memory)
     for j in range(count):
-        predict_node(memory, design, scratch, j, cos, sin)
+        predict_node(memory, scratch, j, cos, sin)
     match_moments(memory.mean, memory.covariance, memory.weight[:count], memory.overall_mean, memory.overall_covariance)
 
 

@@ -10,14 +10,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from edge_agent.calibration.learn import learn
+from edge_agent.calibration.learn import USUAL, learn, surer, weighed
 from edge_agent.cli import main
 from edge_agent.inputs.correct import corrected
 from edge_agent.lab.evaluation.planted import Recorded, drives, moved, scaled
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S
-from schemas.vehicle import Vehicle, load_vehicle
+from schemas.vehicle import Calibration, Vehicle, load_vehicle
 
 Output = pytest.CaptureFixture[str]
 OFF = {"ax": 0.5, "yaw_rate": 0.012, "steer_offset": 0.012, "radius_fl": 0.012}
@@ -62,16 +62,45 @@ def test_more_drives_are_surer(smooth: Recorded) -> None:
     assert many.ax[1] < few.ax[1]
 
 
-def test_a_correction_takes_off_what_was_learned_and_leaves_what_is_unsure(smooth: Recorded) -> None:
+def test_a_correction_takes_off_what_was_learned(smooth: Recorded) -> None:
     bad = spoiled(smooth)
     calibration = learn(parts(bad, 3), bad.vehicle)
     mended = corrected(bad.signals, bad.vehicle.model_copy(update={"calibration": calibration}))
     for channel, off in ((S.AX, OFF["ax"]), (S.YAW_RATE, OFF["yaw_rate"]), (S.DELTA, OFF["steer_offset"])):
         left = np.nanmedian(mended[:, channel] - smooth.signals[:, channel])
         assert abs(left) < 0.35 * off
-    unsure = bad.vehicle.model_copy(update={"calibration": calibration.model_copy(update={"ax": (0.1, 0.2)})})
-    assert np.array_equal(corrected(bad.signals, unsure)[:, S.AX], bad.signals[:, S.AX], equal_nan=True)
     assert corrected(bad.signals, bad.vehicle) is bad.signals
+
+
+def test_what_is_hardly_known_is_drawn_to_what_cars_usually_have(smooth: Recorded) -> None:
+    few, many = (weighed([{"steer_gain": 1.2}] * count, smooth.vehicle) for count in (1, 30))
+    assert few is not None
+    assert many is not None
+    assert few.steer_gain is not None
+    assert many.steer_gain is not None
+    assert 1.0 < few.steer_gain[0] < many.steer_gain[0] < 1.2
+    assert few.steer_gain[1] < USUAL["steer_gain"]
+
+
+def test_the_driven_axle_is_not_taken_for_a_smaller_one() -> None:
+    """On the same drives a file that does not say which axle drives is wrong about radii, and knows it."""
+    drive = drives(3, 32, rough=False, seconds=300)[2]  # a van: its rear wheels drive
+    assert drive.vehicle.drive_split_front == 0.0
+    unsaid = drive.vehicle.model_copy(update={"drive_split_front": None})
+    known, blind = (learn(parts(drive, 3), vehicle) for vehicle in (drive.vehicle, unsaid))
+    for name in ("radius_fl", "radius_fr", "radius_rl", "radius_rr"):
+        ours, theirs = getattr(known, name), getattr(blind, name)
+        assert abs(ours[0]) < 0.6 * abs(theirs[0])
+        assert theirs[1] > ours[1]
+
+
+def test_of_two_calibrations_the_surer_value_holds() -> None:
+    one = Calibration(drives=3, ax=(0.3, 0.05), ay=(0.1, 0.2))
+    other = Calibration(drives=9, ax=(0.2, 0.1), yaw_rate=(0.01, 0.001))
+    both = surer(one, other)
+    assert both == Calibration(drives=9, ax=(0.3, 0.05), ay=(0.1, 0.2), yaw_rate=(0.01, 0.001))
+    assert surer(None, other) == other
+    assert surer(one, None) == one
 
 
 def test_a_car_that_stands_teaches_nothing(smooth: Recorded) -> None:

@@ -1,0 +1,34 @@
+"""What the calibration of a vehicle file makes of the prior of its states."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from edge_agent.estimators.friction_mixture.constants import STATES, NodeState
+from schemas.numeric import FloatArray
+from schemas.signals import WHEELS
+from schemas.vehicle import Vehicle
+
+# state -> (quantity of the calibration, what of it is another in each drive: temperature, tyre pressure, load)
+LEARNED: Final[dict[int, tuple[str, float]]] = {
+    NodeState.BIAS_X: ("ax", 0.03),
+    NodeState.BIAS_Y: ("ay", 0.03),
+    NodeState.STEER: ("steer_offset", 0.0003),
+    **{NodeState.RADIUS + i: (f"radius_{wheel}", 0.0005) for i, wheel in enumerate(WHEELS)},
+}
+
+
+def spreads_of(vehicles: Sequence[Vehicle], std: FloatArray) -> FloatArray:
+    """Standard deviations (N, STATES) of the priors: `std` (STATES,), narrower where a vehicle's calibration knows.
+
+    The calibration's values are no longer in the signals (inputs.correct), so that the means stay.
+    """
+    spreads = np.repeat(std[None, :STATES], len(vehicles), axis=0)
+    for row, vehicle in zip(spreads, vehicles, strict=True):
+        for state, (quantity, each_drive) in LEARNED.items() if vehicle.calibration else ():
+            if (estimate := getattr(vehicle.calibration, quantity)) is not None:
+                row[state] = min(row[state], np.hypot(estimate[1], each_drive))
+    return spreads
