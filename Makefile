@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: setup demo test test-shuffled check package lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test
+.PHONY: setup demo test test-shuffled check package docs lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test
 
 setup: $(STAMP)  ## make .venv and install everything, pinned
 
@@ -20,6 +20,11 @@ test: setup  ## the tests that take seconds, a process a core; says what the slo
 
 test-shuffled: setup  ## ten times in an order drawn anew: none may lean on another
 	for round in 1 2 3 4 5 6 7 8 9 10; do $(BIN)/python -m pytest -q --numprocesses auto --dist loadfile --random-order || exit 1; done
+
+docs: setup  ## the documentation site, .docs/index.html; a warning is an error
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[docs]'
+	$(BIN)/python -m sphinx -W --keep-going -q -c deploy/docs . .docs
+	cp deploy/docs/landing.html .docs/index.html
 
 lint: setup
 	$(BIN)/ruff check .
@@ -65,4 +70,4 @@ lock: setup  ## write the installed versions to constraints.txt
 	$(BIN)/python -m pip freeze --exclude-editable --exclude gripmap > constraints.txt
 
 clean:
-	rm -rf .venv .demo .bench .analytics .faults build *.egg-info
+	rm -rf .venv .demo .docs dist .bench .analytics .faults build *.egg-info
