@@ -54,7 +54,9 @@ class AgentConfig(MonitoringSettings):
     slippery_mu: Positive = Field(default=SLIPPERY_MU, description="a visit whose upper bound is below is sent at once")
     position_std: Positive = Field(default=1.5, description="[m] of the satellite receiver")
     yaw_std: Positive = Field(default=0.02, description="[rad] of the satellite receiver")
-    spool: Path = Field(default=Path("spool.sqlite"), description="what is not yet acknowledged")
+    spool: Path = Field(
+        default=Path("spool.sqlite"), description="what is not yet acknowledged; {name} in it is the vehicle's name"
+    )
     spool_mb: Positive = Field(
         default=256.0, description="[MB] at the most; oldest state goes first, then observations"
     )
@@ -69,6 +71,10 @@ class AgentConfig(MonitoringSettings):
         default=0.0, ge=0.0, allow_inf_nan=False, description="[s] likewise; both must have passed"
     )
     tyre_season: int = Field(default=0, ge=0, le=3, description="0 unknown, 1 summer, 2 winter, 3 all-season")
+
+    def spool_of(self, name: str) -> Path:
+        """The outbox of a vehicle, or of a process."""
+        return Path(str(self.spool).replace("{name}", name))
 
 
 class ServiceConfig(MonitoringSettings):

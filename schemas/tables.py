@@ -8,7 +8,7 @@ import pyarrow as pa
 
 from schemas import grid, mugrid
 from schemas.signals import UNITS, per_wheel
-from schemas.thresholds import SLIPPERY_MU
+from schemas.thresholds import EXCITED_SHARE, SLIPPERY_MU
 
 
 class Field(NamedTuple):
@@ -103,6 +103,11 @@ BOOKKEEPING: Final = (
     Field("weight", F32, "-", "weight of the vehicle's vote that was used"),
 )
 
+# Whether what was said of mu is a value. Without it mu is mostly the prior, and only `mu_utilised` is known.
+VALUE: Final = Field(
+    "value", pa.bool_(), "-", f"mu is a value: {EXCITED_SHARE:g} of it was used; false: only a lower bound is known"
+)
+
 # Road weather of a region, as it came and as the map used it.
 WEATHER: Final = (
     Field("region", I64, "quadint z10", "the region"),
@@ -118,7 +123,7 @@ WEATHER: Final = (
 MAP_CELL: Final = (
     Field("cell", I64, "quadint z21", "the cell"),
     Field("sector", I8, "0 east, 1 north, 2 west, 3 south", "heading sector"),
-    Field("mu", F32, "-", "peak adhesion coefficient, median"),
+    Field("mu", F32, "-", "peak adhesion coefficient, median; null where only lower bounds are known"),
     Field("mu_lower", F32, "-", "5 % quantile"),
     Field("mu_upper", F32, "-", "95 % quantile"),
     Field("p_slippery", F32, "-", f"P(mu < {SLIPPERY_MU})"),
@@ -153,6 +158,8 @@ CELL_HOUR: Final = (
     Field("mu_max", F32, "-", "largest mu; -inf where none was said; take the largest"),
     Field("utilised_max", F32, "-", "largest grip used: mu was at least this; take the largest"),
     Field("mu_histogram", pa.list_(I32), "-", "counts of mu on the 32 bins of the friction grid; add per bin"),
+    Field("value_count", I64, "-", "values: observations that used enough of mu to tell it; add"),
+    Field("value_sum", F64, "-", "sum of mu of the values; add"),
     Field("log_likelihood_sum", pa.list_(I32), "1/16 nat", "sum of log_likelihood on the 32 bins; add per bin"),
 )
 
@@ -203,7 +210,8 @@ MAP_SCHEMA: Final = arrow_schema(*MAP_CELL)
 ESTIMATES_SCHEMA: Final = arrow_schema(*ESTIMATES)
 MAP_KEPT: Final = kept(*MAP_CELL, Field("snapshot_time", NS, "", "when the map was so"))
 MAP_ARCHIVE: Final = arrow_schema(*MAP_KEPT)
-OBSERVATION_ARCHIVE: Final = arrow_schema(*kept(*OBSERVATION, *IDENTITY, *BOOKKEEPING))
+OBSERVATION_KEPT: Final = kept(*OBSERVATION, *IDENTITY, *BOOKKEEPING, VALUE)
+OBSERVATION_ARCHIVE: Final = arrow_schema(*OBSERVATION_KEPT)
 WEATHER_ARCHIVE: Final = arrow_schema(*kept(*WEATHER))
 STATE_CELL: Final = Field("cell", I64, "quadint z21", "cell of the position")
 STATE_ARCHIVE: Final = arrow_schema(*kept(*STATE, *IDENTITY, STATE_CELL, *BOOKKEEPING[:1]))

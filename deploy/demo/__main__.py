@@ -56,7 +56,7 @@ def show(folder: Path, endpoint: str, comparison: compare.MapComparison) -> None
 The observations, as any Parquet reader sees them:
   import duckdb
   print(duckdb.sql("select sector, count(*), median(mu), count(distinct vehicle)
-                    from '{folder}/archive/observations/*/*/*.parquet' where mu_utilised > .2 group by sector"))""")
+                    from '{folder}/archive/observations/*/*/*.parquet' where value group by sector"))""")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -83,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     figures.write(FOLDER / "figures.json", "demo", [args.seed], found)
     table = figures.markdown(found)
     picture.draw(comparison, FOLDER / "map.png")
-    page.write(comparison, table, FOLDER / "map.html")
+    page.write(comparison, found, FOLDER / "map.html")
     print(f"\n{table}\n\npicture {FOLDER}/map.png, page {FOLDER}/map.html, figures {FOLDER}/figures.json")
     return 0 if all(figure.holds for figure in found) else 1
 

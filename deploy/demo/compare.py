@@ -44,6 +44,12 @@ class MapComparison:
         """Whether the value rests on more than lower bounds."""
         return np.asarray(self.cells["basis"].to_numpy(zero_copy_only=False) == "measured")
 
+    @property
+    def values(self) -> FloatArray:
+        """The map's median, (n,); NaN where nothing was measured."""
+        mu = self.cells["mu"].to_numpy()
+        return np.where(self.measured, mu, np.nan)
+
 
 def final_truth(visits: pa.Table, changed_ns: int) -> dict[tuple[int, int], float]:
     """Friction of each visited (cell, sector) at the end: mean over visits since the road changed, else over all."""

@@ -2,22 +2,54 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from deploy.demo.compare import MapComparison
-from deploy.demo.picture import quarters
+from fleet_service.analytics.page import GRIP_SCALE, DrawnCells, render
+from schemas import grid
+from schemas.runtime.figures import Figure, row
 
-TEMPLATE = Path(__file__).with_name("page.html")
-COLUMNS = ("mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehicles", "observations", "latitude", "longitude")
+NAMES = (
+    "truth",
+    "mu",
+    "5 %",
+    "95 %",
+    "basis",
+    "P(slippery)",
+    "vehicles",
+    "observations",
+    "heading",
+    "latitude",
+    "longitude",
+)
 
 
-def write(comparison: MapComparison, table: str, path: Path) -> None:
-    """Fill the template with the cells and the figures table (text); nothing is loaded from elsewhere."""
-    rows = comparison.cells.select(COLUMNS).to_pylist()
-    for row, truth, shape in zip(rows, comparison.truth, np.round(quarters(comparison), 2).tolist(), strict=True):
-        row |= {"truth": float(truth), "shape": shape}
-    data = json.dumps({"cells": rows, "table": table}).replace("<", "\\u003c")  # no value can end or open a tag
-    path.write_text(TEMPLATE.read_text().replace("/*DATA*/null", data))
+def write(comparison: MapComparison, figures: list[Figure], path: Path) -> None:
+    """Two maps and the table of figures; nothing is loaded from elsewhere."""
+    cells = comparison.cells
+    boxes = np.stack([cells[side].to_numpy() for side in ("west", "south", "east", "north")], axis=1)
+    sector: Any = cells["sector"].to_pylist()
+    truth = comparison.truth.round(4).tolist()
+    found = comparison.values.round(4).tolist()
+    panels = {"truth": truth, "map": [mu if np.isfinite(mu) else None for mu in found]}
+    lines = [_words(one, true) for one, true in zip(cells.to_pylist(), truth, strict=True)]
+    drawn = DrawnCells(boxes.round(7).tolist(), sector, panels, NAMES, lines)
+    several = int(comparison.several.sum())
+    about = (
+        f"{cells.num_rows} cells and directions that have a truth; {several} of them seen by two or more vehicles, "
+        "and the figures below judge these."
+    )
+    table = [["figure", "value", "bar", ""], *(row(figure) for figure in figures)]
+    path.write_text(render("GripMap: the map beside the truth", drawn, GRIP_SCALE, about=about, table=table))
+
+
+def _words(cell: dict[str, Any], truth: float) -> list[str]:
+    mu = "not measured" if cell["mu"] is None else f"{cell['mu']:.2f}"
+    return [
+        f"{truth:.2f}", mu, f"{cell['mu_lower']:.2f}", f"{cell['mu_upper']:.2f}", cell["basis"],
+        f"{cell['p_slippery']:.2f}", str(cell["vehicles"]), str(cell["observations"]), grid.HEADINGS[cell["sector"]],
+        f"{cell['latitude']:.5f}", f"{cell['longitude']:.5f}",
+    ]  # fmt: skip

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from schemas.vehicle import Vehicle
 
 
+FLEET = "fleet"  # what {name} in the path of an outbox is for many vehicles
+
+
 def checked_name(name: str) -> str:
     """A name that may stand in a key.
 
@@ -43,13 +46,15 @@ def publisher_of(names: Sequence[str], config: AgentConfig, estimator: str) -> P
     Raises:
         InputError: Zenoh refuses its settings, or the outbox is in use or unusable.
     """
+    from edge_agent.app.estimates_file import writable
     from edge_agent.publish.outbox import Outbox
     from edge_agent.publish.publisher import Publisher
     from schemas.runtime.zenoh_session import configuration
 
     for name in names:  # a bad setting, or a missing certificate, is to be an error here, not in a thread
         configuration(config.zenoh, name)
-    outbox = Outbox(config.spool, capacity_bytes=round(config.spool_mb * 1e6), first_resend_s=config.resend_s)
+    spool = writable("spool", config.spool_of(names[0] if len(names) == 1 else FLEET))
+    outbox = Outbox(spool, capacity_bytes=round(config.spool_mb * 1e6), first_resend_s=config.resend_s)
     publisher = Publisher(names, outbox, config, estimator)
     publisher.start()
     return publisher

@@ -68,7 +68,7 @@ def _live(args: argparse.Namespace, sources: list[str], config: AgentConfig) -> 
     name = checked_name(args.name or vehicle.name)
     feeds, profile, clock = open_sources(sources, args.profile, args.dbc)
     rows = LiveRows(feeds, profile, vehicle, clock)
-    trip = Trip(vehicle, profile, beside(config.spool, name), trusted=args.trust)
+    trip = Trip(vehicle, profile, beside(config.spool_of(name), name), trusted=args.trust)
     blocks = trip.blocks(rows.blocks(), lambda: rows.ground)
     try:
         return drive_live(

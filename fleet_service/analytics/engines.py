@@ -24,7 +24,8 @@ except ImportError as error:
 Table: TypeAlias = Any  # an ibis.Table, whose package has no types
 ENGINES: Final = ("duckdb", "spark")
 _MAP_COLUMNS: Final = (
-    "cell, sector, mu, mu_lower, mu_upper, basis, vehicles"  # Ibis does not know geometries with a crs
+    # Ibis does not know geometries with a crs; files before 1.2 give bounds a mu
+    "cell, sector, CASE WHEN basis = 'bound' THEN NULL ELSE mu END AS mu, mu_lower, mu_upper, basis, vehicles"
 )
 NAMES: Final = {"observations": layout.TABLES[Kind.OBSERVATION], "map": snapshots.TABLE}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -18,9 +18,11 @@ from fleet_service.archive.files import MAP, write_table
 from fleet_service.archive.load import load
 from schemas import grid, tables
 from schemas.errors import InputError
+from schemas.numeric import BoolArray
 from schemas.runtime.durable import written
 from schemas.wire import Kind
 
+_OF_MU: Final = ("mu_sum", "mu_sum_squares", "mu_min", "mu_max", "value_sum")  # of the roll-up
 Box = tuple[float, float, float, float]
 
 
@@ -42,6 +44,7 @@ def observations(root: Path, part: Extract) -> pa.Table:
     days = (part.since // layout.DAY_NS, part.until // layout.DAY_NS)
     found = [*reading.read(root, Kind.OBSERVATION, where=where, days=days), tables.OBSERVATION_ARCHIVE.empty_table()]
     table = pa.concat_tables(found).sort_by([("cell", "ascending"), ("leave_time", "ascending")])
+    table = without(table, ("mu",), table["value"].to_numpy().astype(bool))
     return geo.with_points(table, table["longitude"].to_numpy(), table["latitude"].to_numpy())
 
 
@@ -68,7 +71,17 @@ def map_then(root: Path, part: Extract) -> pa.Table:
     table = load(path, tables.MAP_ARCHIVE)
     if table is None:
         raise InputError("to", f"the snapshot {path} is damaged", "give an earlier time")
+    table = without(table, ("mu",), np.array(table["basis"].to_pylist(), str) != "bound")  # files before 1.2 say one
     return geo.with_cells(_inside(table, part.bbox))
+
+
+def without(table: pa.Table, names: Sequence[str], known: BoolArray) -> pa.Table:
+    """A table whose columns `names` are null where nothing was measured: who colours by them paints no bound."""
+    for name in names:
+        column = table[name]
+        held: pa.ChunkedArray[Any] = pc.if_else(pa.array(known), column, pa.scalar(None, column.type))
+        table = table.set_column(table.schema.get_field_index(name), table.schema.field(name), held)
+    return table
 
 
 def cell_hours(root: Path, part: Extract) -> pa.Table:
@@ -80,6 +93,8 @@ def cell_hours(root: Path, part: Extract) -> pa.Table:
     loaded = (load(path, tables.CELL_HOUR_SCHEMA, where=where) for path in paths)
     found = [table for table in loaded if table is not None]
     table = pa.concat_tables([*found, tables.CELL_HOUR_SCHEMA.empty_table()])
+    told = np.nan_to_num(table["value_count"].to_numpy()) > 0  # null before 1.2
+    table = without(table, _OF_MU, told)
     return geo.with_cells(_inside(table, part.bbox).sort_by([("cell", "ascending"), ("hour", "ascending")]))
 
 

@@ -12,11 +12,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from fleet_service.archive.segments import is_value
 from fleet_service.archive.version import DamagedError, Version, entries_of, judge, newer
+from schemas import tables
 from schemas.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -139,6 +142,9 @@ def _column(table: pa.Table, wanted: pa.Field[Any]) -> pa.ChunkedArray[Any]:
     if wanted.name not in table.column_names:
         if wanted.name in NEEDED:
             raise InputError("archive", f"a file has no column {wanted.name}", "read it with the GripMap that wrote it")
+        if wanted.name == tables.VALUE.name and {"mu", "mu_utilised"} <= set(table.column_names):  # before 1.2
+            mu, used = (np.asarray(table[name].to_numpy(), np.float32) for name in ("mu", "mu_utilised"))
+            return pa.chunked_array([pa.array(is_value(mu, used))])
         return pa.chunked_array([pa.nulls(table.num_rows, wanted.type)])
     column = table.column(wanted.name)
     try:

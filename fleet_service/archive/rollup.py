@@ -96,6 +96,7 @@ def _statistics(rows: segments.Rows, starts: IntArray) -> dict[str, Any]:
     _, who = np.unique(rows["vehicle"].astype(str), return_inverse=True)
     names = np.array([int(name[:2], 16) % _BITS for name in np.unique(rows["vehicle"].astype(str))], np.uint64)
     pairs = np.unique(group * (int(who.max()) + 1) + who)
+    value = segments.is_value(rows["mu"], rows["mu_utilised"])
     return {
         "observations": np.diff(starts, append=n),
         "late": np.add.reduceat(rows["late"].astype(np.int64), starts),
@@ -106,6 +107,8 @@ def _statistics(rows: segments.Rows, starts: IntArray) -> dict[str, Any]:
         "mu_min": np.minimum.reduceat(np.where(with_mu, rows["mu"], np.inf), starts),
         "mu_max": np.maximum.reduceat(np.where(with_mu, rows["mu"], -np.inf), starts),
         "utilised_max": np.fmax.reduceat(rows["mu_utilised"], starts),
+        "value_count": np.add.reduceat(value.astype(np.int64), starts),
+        "value_sum": np.add.reduceat(np.where(value, mu, 0.0), starts),
         "mu_histogram": histogram,
         "log_likelihood_sum": np.add.reduceat(rows["log_likelihood"].astype(np.int32), starts, axis=0),
     }  # fmt: skip

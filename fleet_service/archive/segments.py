@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from fleet_service.archive import layout
 from fleet_service.archive.files import SEGMENT, write_table
 from schemas import mugrid, tables
-from schemas.numeric import IntArray
+from schemas.numeric import BoolArray, Float32Array, IntArray
 from schemas.runtime.durable import ENDING, sync_directory
+from schemas.thresholds import EXCITED_SHARE
 from schemas.wire import Kind
 from schemas.wire.batches import ABSENT
 
@@ -30,6 +31,7 @@ _FOLDERS: Final = {Kind.OBSERVATION: "inbox", Kind.STATE: "inbox/states"}
 _TIMES: Final = ("enter_time", "leave_time", "time", "received_at")
 _STEPS: Final = {f.name: f.step for f in (*tables.OBSERVATION, *tables.STATE) if f.step}
 
+NEARLY: Final = 1e-6  # far below the steps of both, so that rounding decides nothing
 Rows = dict[str, NDArray[Any]]
 
 
@@ -108,7 +110,7 @@ def table_of(kind: Kind, rows: Rows) -> pa.Table:
 
 
 def _column(f: pa.Field[Any], rows: Rows) -> pa.Array[Any]:
-    values = rows[f.name]
+    values = is_value(rows["mu"], rows["mu_utilised"]) if f.name == tables.VALUE.name else rows[f.name]
     if f.type == tables.LIKELIHOOD:
         valid = np.packbits(rows["with_likelihood"], bitorder="little").tobytes()
         return pa.Array.from_buffers(f.type, len(values), [pa.py_buffer(valid), pa.py_buffer(values.tobytes())])
@@ -116,6 +118,11 @@ def _column(f: pa.Field[Any], rows: Rows) -> pa.Array[Any]:
         values = values // tables.US_STEP
     column: pa.Array[Any] = pa.array(values).cast(f.type)
     return column
+
+
+def is_value(mu: Float32Array, used: Float32Array) -> BoolArray:
+    """Whether rows tell a value of mu and not only a bound, (n,): they used EXCITED_SHARE of it. NaN tells nothing."""
+    return np.asarray(used.astype(np.float64) >= (EXCITED_SHARE - NEARLY) * mu.astype(np.float64))
 
 
 def rows_of(table: pa.Table) -> Rows:

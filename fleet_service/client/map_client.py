@@ -124,6 +124,8 @@ def text(answer: Answer) -> str:
 
 
 def _shown(name: str, value: object) -> str:
+    if value is None:
+        return "-"
     if not isinstance(value, float):
         return str(value)
     return f"{value:.6f}" if name in ("latitude", "longitude") else f"{value:.2f}"

@@ -17,26 +17,27 @@ from schemas.query import Format
 from schemas.thresholds import GRAVITY
 
 _BASES: Final = pa.array(["bound", "measured", "borrowed"])
-_BORROWED: Final = 2
+_BOUND, _BORROWED = 0, 2
 _SCHEMA: Final = tables.MAP_SCHEMA.serialize().to_pybytes()
 _END: Final = b"\xff\xff\xff\xff\x00\x00\x00\x00"  # a message without a head: the stream's end
 
 
 def batch_of(cells: CellView, now: int) -> pa.RecordBatch:
-    """Cells in the schema of the map; their age is that at `now` [ns]."""
+    """Cells in the schema of the map; their age is that at `now` [ns]. A bound has no mu."""
     latitude, longitude = grid.centre(cells.cell)
     west, south, east, north = grid.bounds(cells.cell)
     lower, middle, upper = quantiles(cells.belief, (LOWER, 0.5, UPPER))
     basis = np.where(cells.imputed, _BORROWED, measured(lower, upper, cells.values))
     columns: dict[str, Any] = {
-        "cell": cells.cell, "sector": cells.sector, "mu": middle, "mu_lower": lower, "mu_upper": upper,
-        "p_slippery": cells.belief @ SLIPPERY_SHARE, "basis": _BASES.take(basis.astype(np.int8)),
+        "cell": cells.cell, "sector": cells.sector, "mu": pa.array(middle, mask=basis == _BOUND), "mu_lower": lower,
+        "mu_upper": upper, "p_slippery": cells.belief @ SLIPPERY_SHARE, "basis": _BASES.take(basis.astype(np.int8)),
         "vehicles": cells.vehicles, "observations": cells.observations,
         "first_time": cells.first, "last_time": cells.last, "age_s": np.maximum(now - cells.last, 0) * 1e-9,
         "latitude": latitude, "longitude": longitude, "west": west, "south": south, "east": east, "north": north,
         "safe_deceleration": GRAVITY * lower,
     }  # fmt: skip
-    arrays = [pa.array(columns[f.name]).cast(f.type, safe=False) for f in tables.MAP_SCHEMA]
+    found = ((columns[f.name], f.type) for f in tables.MAP_SCHEMA)
+    arrays = [(c if isinstance(c, pa.Array) else pa.array(c)).cast(kind, safe=False) for c, kind in found]
     return pa.RecordBatch.from_arrays(arrays, schema=tables.MAP_SCHEMA)
 
 
@@ -69,7 +70,8 @@ def _plain(table: pa.RecordBatch) -> list[dict[str, Any]]:
             ns = table[f.name].cast(pa.int64()).to_numpy()
             columns[f.name] = np.datetime_as_string(ns.astype("datetime64[ns]"), "ms", "UTC").tolist()
         elif f.type == pa.float32():
-            columns[f.name] = table[f.name].to_numpy().astype(np.float64).round(6).tolist()
+            numbers = table[f.name].to_numpy(zero_copy_only=False).astype(np.float64).round(6)
+            columns[f.name] = [number if number == number else None for number in numbers.tolist()]
         else:
             columns[f.name] = table[f.name].to_pylist()
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]

@@ -79,12 +79,17 @@ def write(path: Path, campaign: str, seeds: Sequence[int], figures: Sequence[Fig
 
 def markdown(figures: Sequence[Figure]) -> str:
     """The figures as a Markdown table; a bar that does not hold says so."""
-    signs = {"less": "≤ ", "more": "≥ "}
     lines = ["| figure | value | bar | |", "|---|---|---|---|"]
-    for f in figures:
-        bar, verdict = "", ""
-        if f.bar is not None:
-            bar = f"{f.bar[0]:g} – {f.bar[1]:g}" if isinstance(f.bar, tuple) else f"{signs[f.better]}{f.bar:g}"
-            verdict = "holds" if f.holds else "DOES NOT HOLD"
-        lines.append(f"| `{f.name}` | {f.value:.4g} {f.unit} | {bar} | {verdict} |")
+    for name, *rest in map(row, figures):
+        lines.append(f"| `{name}` | {' | '.join(rest)} |")
     return "\n".join(lines)
+
+
+def row(figure: Figure) -> list[str]:
+    """Name, value with unit, bar and verdict of a figure; a bar that does not hold says so."""
+    signs, bar = {"less": "≤ ", "more": "≥ "}, figure.bar
+    value = f"{figure.value:.4g} {figure.unit}"
+    if bar is None:
+        return [figure.name, value, "", ""]
+    text = f"{bar[0]:g} – {bar[1]:g}" if isinstance(bar, tuple) else f"{signs[figure.better]}{bar:g}"
+    return [figure.name, value, text, "holds" if figure.holds else "DOES NOT HOLD"]

@@ -7,7 +7,7 @@ paper. What was not measured has no colour: it is white and hatched, and never a
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 GRIP: Final = (
     "#440154", "#481f70", "#443983", "#3b528b", "#31688e", "#287c8e", "#21918c", "#20a486", "#35b779", "#5ec962",
@@ -17,6 +17,33 @@ GRIP_RANGE: Final = (0.1, 1.0)  # of mu: from wet ice to dry asphalt
 SURFACES: Final = {"ice": 0.15, "snow": 0.35, "wet": 0.6, "dry": 0.9}  # peak adhesion that a reader knows them by
 HATCH: Final = "//////"  # of what was not measured, on white
 UNKNOWN: Final = "not measured: only lower bounds"
+
+
+class LineStyle(NamedTuple):
+    """How a line is drawn, everywhere; `dash` as matplotlib writes it."""
+
+    colour: str
+    dash: str = "-"
+
+
+TRUTH: Final = LineStyle("#000000")
+# One colour an estimator, in every plot: Okabe and Ito (2008), with a red brown for black, which is the truth's.
+ESTIMATORS: Final = {
+    "aco-fckf": LineStyle("#0072b2"),
+    "fckf": LineStyle("#56b4e9", "--"),
+    "ckf": LineStyle("#009e73"),
+    "federated-ckf": LineStyle("#e69f00"),
+    "adaptive-federated-ckf": LineStyle("#f0e442", "--"),
+    "compensated-wckf": LineStyle("#cc79a7"),
+    "sr-ukf": LineStyle("#7e210d", "--"),
+    "paper-aco-fckf": LineStyle("#d55e00"),
+}
+OTHER: Final = LineStyle("#777777", ":")  # an estimator from outside
+
+
+def line_of(estimator: str) -> LineStyle:
+    """The line of an estimator by name."""
+    return ESTIMATORS.get(estimator, OTHER)
 
 
 def shade(value: float, low: float, high: float) -> str:

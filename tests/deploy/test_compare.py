@@ -11,7 +11,9 @@ import pyarrow as pa
 import pytest
 
 from deploy.demo import compare, page, picture
+from schemas.runtime.figures import Figure
 from schemas.wire import Alert
+from tests.browser import opened
 
 S = 1_000_000_000
 
@@ -88,12 +90,28 @@ def test_picture_and_page_are_written_and_no_value_can_end_the_script(tmp_path: 
     basis = found.cells.schema.get_field_index("basis")
     hostile = replace(found, cells=found.cells.set_column(basis, "basis", [["</script><!--<script>", "measured"]]))
     picture.draw(found, tmp_path / "map.png")
-    page.write(hostile, "| table |", tmp_path / "map.html")
+    page.write(hostile, [Figure("demo.map.rmse", 0.09, "", 0.12)], tmp_path / "map.html")
     assert (tmp_path / "map.png").stat().st_size > 10_000
     text = (tmp_path / "map.html").read_text()
     assert text.count("</script>") == 1
-    data = json.loads(text.split("const data = ")[1].split(";\nconst points")[0])
-    assert [cell["basis"] for cell in data["cells"]] == ["</script><!--<script>", "measured"]
+    data = json.loads(text.split("const data = ")[1].split(";\n")[0])
+    assert [row[4] for row in data["rows"]] == ["</script><!--<script>", "measured"]
     assert "<!--" not in text
-    assert [cell["truth"] for cell in data["cells"]] == [0.2, 0.5]
+    truth, shown = data["panels"]
+    assert (truth["name"], truth["values"]) == ("truth", [0.2, 0.5])
+    assert (shown["name"], shown["values"]) == ("map", [None, pytest.approx(0.25)])
     assert "http" not in text
+
+
+def test_the_page_of_the_demo_opens_in_a_browser_with_both_maps_and_its_figures(tmp_path: Path) -> None:
+    found = compare.compare(tile([7, 8], 0.1, 0.4), visits(("a", 11, 7, 0.2, 0.1), ("a", 12, 8, 0.5, 0.1)), 10 * S)
+    basis = found.cells.schema.get_field_index("basis")
+    found = replace(found, cells=found.cells.set_column(basis, "basis", [["bound", "measured"]]))
+    page.write(found, [Figure("demo.map.rmse", 0.09, "", 0.12)], tmp_path / "map.html")
+    with opened(tmp_path / "map.html") as shown:
+        assert shown.errors == []
+        assert shown.drawn == 4
+        assert len(shown.colours(0)) >= 2
+        assert len(shown.colours(1)) > 2, "a colour, and the hatching with its white"
+        assert shown.page.locator("#unknown").is_visible()
+        assert "demo.map.rmse" in shown.page.locator("#table").inner_text()

@@ -220,9 +220,11 @@ def _without(folder: Path, honest: Sequence[Honest], seconds: float, now: int) -
 
 
 def _difference(found: pa.Table, expected: pa.Table, honest: Sequence[Honest]) -> float:
-    """The largest difference of mu over the cells of the honest vehicles; NaN if one is missing."""
+    """The largest difference of an end of mu over the cells of the honest vehicles; NaN if one is missing."""
     driven = {int(sent.columns["cell"][0]) for one in honest for sent, _ in one.sent.values()}
-    mu = [{row["cell"]: float(row["mu"]) for row in table.to_pylist()} for table in (found, expected)]
-    if not driven <= mu[0].keys() & mu[1].keys():
+    ends = [
+        {row["cell"]: (row["mu_lower"], row["mu_upper"]) for row in table.to_pylist()} for table in (found, expected)
+    ]
+    if not driven <= ends[0].keys() & ends[1].keys():
         return float("nan")
-    return max(abs(mu[0][cell] - mu[1][cell]) for cell in driven)
+    return float(max(np.abs(np.subtract(ends[0][cell], ends[1][cell])).max() for cell in driven))

@@ -45,7 +45,8 @@ def same(found: dict[str, Any], made: dict[str, Any]) -> None:
     """The map is the one that the old code made, to what single precision and another machine's logarithm leave."""
     assert found["at"] == made["at"]
     np.testing.assert_allclose(found["beliefs"], made["beliefs"], rtol=0.0, atol=1e-6)
-    for now, then in zip(found["cells"], made["cells"], strict=True):
+    for now, line in zip(found["cells"], made["cells"], strict=True):
+        then = line | ({"mu": None} if line["basis"] == "bound" else {})  # since 1.2 a bound has no mu
         assert now == {name: pytest.approx(then[name], abs=1e-5) for name in COLUMNS}
 
 
@@ -92,7 +93,7 @@ def test_what_is_kept_is_compacted_together_with_what_is_new_and_gives_the_same_
     rollup.complete(old)
     assert not any(segments.paths(old, kind) for kind in Kind)
     said = Counter(str(content(path).version) for path in files(old))  # type: ignore[union-attr]
-    assert said.keys() == {"1.0", "1.1"}
+    assert said.keys() == {"1.0", str(version.VERSION)}
     assert {str(kind): _identities(old, kind) for kind in Kind} == rows
     with closing(Engine(ServiceConfig(), old)) as engine:
         assert map_of(engine, now_of(ROUNDS + 2)) == before, "bit for bit"

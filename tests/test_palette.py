@@ -1,0 +1,61 @@
+"""Colours that are told apart by every kind of sight and on grey paper, computed and not believed.
+
+Sight is simulated as Machado, Oliveira and Fernandes (2009) do at full severity, distances are CIEDE2000 (Sharma, Wu
+and Dalal 2005).
+"""
+
+from __future__ import annotations
+
+from itertools import combinations, pairwise
+
+import numpy as np
+import pytest
+
+from edge_agent.estimators import ESTIMATORS as REGISTERED
+from schemas.runtime.palette import ESTIMATORS, GRIP, GRIP_RANGE, SURFACES, TRUTH, shade
+from tests.sight import SIGHTS, difference, lab
+
+LEAST = 10.0  # CIEDE2000; 2.3 is just noticed side by side
+
+
+def test_the_difference_is_the_published_one() -> None:
+    """Pairs 1, 13 and 21 of table 1 of Sharma, Wu and Dalal (2005)."""
+    pairs = [
+        ((50.0, 2.6772, -79.7751), (50.0, 0.0, -82.7485), 2.0425),
+        ((50.0, 2.5, 0.0), (56.0, -27.0, -3.0), 31.9030),
+        ((60.2574, -34.0099, 36.2677), (60.4626, -34.1751, 39.4387), 1.2644),
+    ]
+    for first, second, expected in pairs:
+        assert difference(np.array(first), np.array(second)) == pytest.approx(expected, abs=1e-4)
+
+
+@pytest.mark.parametrize("sight", SIGHTS)
+def test_ice_snow_wet_and_dry_are_told_apart(sight: str) -> None:
+    shades = [lab(shade(mu, *GRIP_RANGE), sight) for mu in SURFACES.values()]
+    assert min(difference(a, b) for a, b in combinations(shades, 2)) >= LEAST
+
+
+@pytest.mark.parametrize("sight", SIGHTS)
+def test_none_of_them_is_the_white_of_what_was_not_measured(sight: str) -> None:
+    white = lab("#ffffff", sight)
+    assert min(difference(lab(shade(mu, *GRIP_RANGE), sight), white) for mu in SURFACES.values()) >= LEAST
+
+
+def test_the_scale_grows_lighter_all_the_way_so_that_grey_print_keeps_its_order() -> None:
+    light = [float(lab(stop)[0]) for stop in GRIP]
+    assert all(b > a + 2.0 for a, b in pairwise(light))
+    surfaces = [float(lab(shade(mu, *GRIP_RANGE))[0]) for mu in SURFACES.values()]
+    assert all(b > a + LEAST for a, b in pairwise(surfaces))
+
+
+@pytest.mark.parametrize("sight", SIGHTS)
+def test_the_lines_of_the_estimators_are_told_apart(sight: str) -> None:
+    assert set(ESTIMATORS) == set(REGISTERED)
+    for (first, a), (second, b) in combinations([*ESTIMATORS.items(), ("truth", TRUTH)], 2):
+        assert difference(lab(a.colour, sight), lab(b.colour, sight)) >= LEAST, (first, second)
+
+
+def test_the_old_scale_fails() -> None:
+    """Red to green, which this replaced: dry and snow were one olive to one man in twelve."""
+    snow, dry = lab("#b8831b", "deuteranopia"), lab("#1bb83e", "deuteranopia")
+    assert difference(snow, dry) < LEAST
