@@ -17,7 +17,8 @@ from schemas.runtime import commandline, talk
 ENDINGS: Final = (".parquet", ".geo.parquet", ".geojson", ".csv", ".png", ".svg", ".pdf", ".html")
 # which questions an option is for; to the others it would be one that is passed over in silence
 FOR: Final = {
-    "at": ("before-after", "replay"), "stations": ("weather",), "step": ("replay",), "min_vehicles": ("worst", "spells")
+    "at": ("before-after", "replay"), "stations": ("weather", "change-rates"), "step": ("replay",),
+    "min_vehicles": ("worst", "spells"),
 }  # fmt: skip
 USUAL_VEHICLES: Final = 2
 
@@ -31,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="FILE", type=Path, help=f"ends in {', '.join(ENDINGS)}")
     parser.add_argument("--engine", default="duckdb", metavar="duckdb|spark", help="default %(default)s")
     parser.add_argument("--at", metavar="TIME", help="before-after: of the treatment; replay: of the map")
-    parser.add_argument("--stations", metavar="FILE", type=Path, help="weather: readings, CSV or Parquet")
+    parser.add_argument("--stations", metavar="FILE", type=Path, help="weather, change-rates: readings, CSV or Parquet")
     parser.add_argument("--step", metavar="SECONDS", type=float, help="replay: between frames")
     parser.add_argument("--min-vehicles", metavar="K", type=int, help=f"worst, spells: default {USUAL_VEHICLES}")
     parser.add_argument("--as-it-lies", action="store_true", help="leave the log alone: only compacted files are read")

@@ -45,6 +45,7 @@ QUESTIONS: Final = {
         Question("vehicles", "bias and sensor health per vehicle", "-z", None),
         Question("calibration", "how often the published interval held", "age_h", None),
         Question("weather", "grip by temperature of the nearest station", "temperature", None),
+        Question("change-rates", "how fast roads turn slippery or back, by temperature and hour", "by", None),
         Question("replay", "the map as of a moment, or a day of it", "-p_slippery", "mu"),
     )
 }

@@ -23,6 +23,16 @@ _HOUR_S: Final = 3600
 _BITS: Final = 22  # of a cell below its region: 2·(21 - 10)
 
 
+def nearest_readings(t: Table, path: Path) -> Table:
+    """Observations with the `temperature` [°C] that the station nearest to their region read in that hour.
+
+    Raises:
+        InputError: the table of stations cannot be used.
+    """
+    stations, readings = read(path)
+    return _joined(t, ibis.memtable(stations), ibis.memtable(readings))
+
+
 def expression(t: Table, stations: Table, readings: Table) -> Table:
     """One row per band of temperature [temperature, temperature + BAND): values, percentiles, share of slippery ones.
 
@@ -31,24 +41,8 @@ def expression(t: Table, stations: Table, readings: Table) -> Table:
         stations: `station`, `latitude`, `longitude`.
         readings: `station`, `hour`, `temperature` [°C].
     """
-    t = t.filter(value(t)).select(
-        "vehicle",
-        "latitude",
-        "longitude",
-        region=t.cell >> _BITS,
-        hour=(t.time / _HOUR_S).floor().cast("int64"),
-        y=t.mu.cast("float64"),
-    )
-    regions = t.group_by("region").aggregate(lat=t.latitude.mean(), lon=t.longitude.mean())
-    pairs = regions.cross_join(stations)
-    metres = ((pairs.lat - pairs.latitude) ** 2) + (
-        (pairs.lon - pairs.longitude) * (pairs.lat * np.pi / 180).cos()
-    ) ** 2
-    pairs = pairs.mutate(metres=metres)
-    pairs = pairs.mutate(rank=ibis.row_number().over(group_by="region", order_by=[pairs.metres, pairs.station]))
-    nearest = pairs.filter(pairs["rank"] == 0).select("region", "station")
-    t = t.inner_join(nearest, "region").inner_join(readings, ["station", "hour"])
-    t = t.mutate(band=(t.temperature / BAND).floor() * BAND)
+    t = _joined(t.filter(value(t)), stations, readings)
+    t = t.mutate(y=t.mu.cast("float64"), band=(t.temperature / BAND).floor() * BAND)
     return t.group_by(temperature=t.band).aggregate(
         values=t.count(),
         vehicles=t.vehicle.nunique(),
@@ -57,6 +51,20 @@ def expression(t: Table, stations: Table, readings: Table) -> Table:
         mu_p50=t.y.quantile(0.5),
         share_slippery=(t.y < SLIPPERY_MU).cast("float64").mean(),
     )
+
+
+def _joined(t: Table, stations: Table, readings: Table) -> Table:
+    t = t.mutate(region=t.cell >> _BITS, hour=(t.time / _HOUR_S).floor().cast("int64"))
+    regions = t.group_by("region").aggregate(lat=t.latitude.mean(), lon=t.longitude.mean())
+    pairs = regions.cross_join(stations)
+    metres = ((pairs.lat - pairs.latitude) ** 2) + (
+        (pairs.lon - pairs.longitude) * (pairs.lat * np.pi / 180).cos()
+    ) ** 2
+    pairs = pairs.mutate(metres=metres)
+    pairs = pairs.mutate(rank=ibis.row_number().over(group_by="region", order_by=[pairs.metres, pairs.station]))
+    nearest = pairs.filter(pairs["rank"] == 0).select("region", "station")
+    t = t.inner_join(nearest, "region")
+    return t.inner_join(readings, [t.station == readings.station, t.hour == readings.hour], rname="reading_{name}")
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:

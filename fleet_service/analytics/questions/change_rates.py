@@ -1,0 +1,178 @@
+"""`change-rates`: how fast roads turn slippery or back, by temperature and by hour, from the archive's own values.
+
+Two values of a cell in a row, by different vehicles, say whether the road was slippery at both times. After a time Δ
+
+    P(unlike | Δ) = e + (m − e) (1 − exp(−λ Δ)),   m = 2 π (1 − π)
+
+    λ   rate at which a road becomes another one, as in the fusion (CHANGE_S is 1/λ)        [1/s]
+    e   two readings of the same road that are unlike by their errors
+    m   two readings of two roads that are; π is the share of slippery ones in the class
+
+which is the fusion's own model of change (`fleet_service/fusion/README.md`). λ and e are those of the largest
+likelihood over bins of Δ. Roads of a region change together, so pairs are no witnesses of their own: days are, and the
+90 % interval is that of days drawn with replacement. With fewer than LEAST_DAYS there is none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import ibis
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from scipy.optimize import minimize
+
+from fleet_service.analytics.engines import QueryEngine, Table, value
+from fleet_service.analytics.options import Options
+from fleet_service.analytics.questions.weather import nearest_readings
+from fleet_service.fusion.constants import CHANGE_S
+from fleet_service.fusion.weather import AIR_ABOVE_ROAD_C, FREEZING_C, STEADY_C
+from schemas.numeric import FloatArray
+from schemas.thresholds import SLIPPERY_MU
+
+LONGEST_S: Final = 3 * 3600  # beyond, more than one change may lie between two values
+BINS_PER_OCTAVE: Final = 1
+LEAST_DAYS: Final = 5
+DRAWS: Final = 200
+ENDS: Final = (5.0, 95.0)
+HOURS: Final = 6  # of the day in a class
+LEAST_PAIRS: Final = 50  # of a class that is answered
+UNKNOWN: Final = "unknown"
+BANDS: Final = (
+    (f"below {FREEZING_C[0]:.0f}", -np.inf, FREEZING_C[0]),
+    (f"{FREEZING_C[0]:.0f} to {FREEZING_C[1]:.0f}", *FREEZING_C),
+    (f"{FREEZING_C[1]:.0f} to {STEADY_C:.0f}", FREEZING_C[1], STEADY_C),
+    (f"above {STEADY_C:.0f}", STEADY_C, np.inf),
+)  # of the road [°C], those of the fusion's weather
+
+
+def expression(t: Table) -> Table:
+    """Pairs by class, day and bin of time between: `pairs`, `unlike`, `slippery` values among both, `seconds`.
+
+    Args:
+        t: observations with `temperature` of the air [°C], null where nobody knows it.
+    """
+    t = t.filter(value(t))
+    w = ibis.window(group_by=["cell", "sector"], order_by=["time", "vehicle", "boot", "seq", "row"])
+    t = t.mutate(slippery=(t.mu < SLIPPERY_MU).cast("int64"))
+    t = t.mutate(before=t.slippery.lag().over(w), since=t.time.lag().over(w), by=t.vehicle.lag().over(w))
+    t = t.mutate(apart=(t.time - t.since).cast("float64"))
+    t = t.filter(t.before.notnull() & (t.by != t.vehicle) & (t.apart >= 1.0) & (t.apart <= LONGEST_S))
+    road = t.temperature - AIR_ABOVE_ROAD_C
+    band = ibis.literal(UNKNOWN)
+    for name, low, high in BANDS:
+        inside = (road > low) if np.isinf(high) else (road <= high) if np.isinf(low) else (road > low) & (road <= high)
+        band = ibis.ifelse(inside, name, band)
+    t = t.mutate(
+        band=ibis.ifelse(t.temperature.isnull(), UNKNOWN, band),
+        hours=((t.time / 3600).floor() % 24 / HOURS).floor().cast("int64"),
+        octave=(t.apart.log2() * BINS_PER_OCTAVE).floor().cast("int64"),
+    )
+    return t.group_by("band", "hours", "day", "octave").aggregate(
+        pairs=t.count(),
+        unlike=(t.slippery != t.before).cast("int64").sum(),
+        slippery=(t.slippery + t.before).sum(),
+        seconds=t.apart.sum(),
+    )
+
+
+def ask(engine: QueryEngine, options: Options) -> pa.Table:
+    """A row per band of road temperature and per part of the day: rate per hour, its interval, what it rests on.
+
+    Temperatures are those of the nearest station where `stations` is given, else those that vehicles reported.
+
+    Raises:
+        InputError: the table of stations cannot be used.
+    """
+    t = engine.observations()
+    if options.stations is None:
+        t = t.mutate(temperature=t.air_temperature.cast("float64"))
+    else:
+        t = nearest_readings(t, options.stations)
+    counted = engine.answer(expression(t))
+    rows: list[dict[str, object]] = []
+    for by, column, names in (
+        ("road temperature", "band", [*(band[0] for band in BANDS), UNKNOWN]),
+        ("hour of the day (UTC)", "hours", list(range(24 // HOURS))),
+    ):
+        for one in names:
+            part = counted.filter(pc.equal(counted[column], pa.scalar(one)))
+            if (pc.sum(part["pairs"]).as_py() or 0) >= LEAST_PAIRS:
+                rows.append({"by": by, "class": _named(one), **_fitted(part)})
+    return pa.Table.from_pylist(rows, schema=SCHEMA)
+
+
+_FIELDS: Final[list[tuple[str, pa.DataType]]] = [
+    ("by", pa.string()), ("class", pa.string()), ("pairs", pa.int64()), ("days", pa.int64()),
+    ("hours_between", pa.float64()), ("unlike", pa.int64()), ("share_slippery", pa.float64()),
+    ("rate_per_hour", pa.float64()), ("rate_lower", pa.float64()), ("rate_upper", pa.float64()),
+    ("misread", pa.float64()), ("assumed_per_hour", pa.float64()),
+]  # fmt: skip
+SCHEMA: Final = pa.schema(_FIELDS)
+
+
+def _named(one: str | int) -> str:
+    return one if isinstance(one, str) else f"{one * HOURS:02}-{(one + 1) * HOURS:02}"
+
+
+def _fitted(counted: pa.Table) -> dict[str, float | int | None]:
+    """Rate of a class, with the interval of days drawn with replacement."""
+    columns = {name: counted[name].to_numpy().astype(float) for name in ("pairs", "unlike", "slippery", "seconds")}
+    days, day = np.unique(counted["day"].to_numpy(zero_copy_only=False), return_inverse=True)
+    octaves, octave = np.unique(counted["octave"].to_numpy(), return_inverse=True)
+    cube = np.zeros((len(days), len(octaves), len(columns)))  # by day, bin of time, count
+    for k, column in enumerate(columns.values()):
+        np.add.at(cube[..., k], (day, octave), column)
+    pairs, unlike, slippery, seconds = cube.sum(axis=(0, 1)) if cube.size else np.zeros(4)
+    rate, misread = fit(cube.sum(axis=0)) if cube.size else (np.nan, np.nan)
+    lower, upper = np.nan, np.nan
+    if len(days) >= LEAST_DAYS and np.isfinite(rate):
+        rng = np.random.default_rng(0)
+        samples = rng.integers(len(days), size=(DRAWS, len(days)))
+        drawn = [fit(cube[sample].sum(axis=0), ((rate, misread),))[0] for sample in samples]
+        lower, upper = np.nanpercentile(drawn, ENDS) if np.isfinite(drawn).any() else (np.nan, np.nan)
+    return {
+        "pairs": int(pairs), "days": len(days), "hours_between": seconds / 3600, "unlike": int(unlike),
+        "share_slippery": slippery / max(2.0 * pairs, 1.0), "rate_per_hour": _known(3600 * rate),
+        "rate_lower": _known(3600 * lower), "rate_upper": _known(3600 * upper), "misread": _known(misread),
+        "assumed_per_hour": 3600 / CHANGE_S,
+    }  # fmt: skip
+
+
+BEGINS: Final = tuple((1.0 / seconds, misread) for seconds in (600.0, 10_800.0, 100_000.0) for misread in (0.01, 0.2))
+
+
+def fit(counts: FloatArray, begins: Sequence[tuple[float, float]] = BEGINS) -> tuple[float, float]:
+    """λ [1/s] and e of the largest likelihood; NaN where no pair was unlike, or all roads are alike.
+
+    Args:
+        counts: (bins, 4) pairs, unlike ones, slippery values, seconds between.
+        begins: λ and e from which the search begins; the best end is taken.
+    """
+    counts = counts[counts[:, 0] > 0]
+    pairs, unlike, slippery, seconds = counts.T
+    share = slippery.sum() / (2.0 * pairs.sum()) if len(counts) else 0.0
+    most = 2.0 * share * (1.0 - share)
+    if unlike.sum() == 0 or most <= 0.0:
+        return np.nan, np.nan
+    apart = seconds / pairs
+
+    def loss(x: FloatArray) -> float:
+        rate, misread = np.exp(x[0]), most / (1.0 + np.exp(-x[1]))
+        p = np.clip(misread + (most - misread) * -np.expm1(-rate * apart), 1e-9, 1.0 - 1e-9)
+        return -float(unlike @ np.log(p) + (pairs - unlike) @ np.log1p(-p))
+
+    starts = [np.array([np.log(rate), _logit(misread / most)]) for rate, misread in begins]
+    best = min((minimize(loss, x, method="Nelder-Mead") for x in starts), key=lambda found: float(found.fun))
+    return float(np.exp(np.clip(best.x[0], -30.0, 5.0))), float(most / (1.0 + np.exp(-best.x[1])))
+
+
+def _logit(share: float) -> float:
+    share = float(np.clip(share, 1e-4, 1.0 - 1e-4))
+    return float(np.log(share / (1.0 - share)))
+
+
+def _known(number: float) -> float | None:
+    return float(number) if np.isfinite(number) else None

@@ -1,0 +1,96 @@
+"""Rates of change: the fit finds those of a known process, its interval holds, pairs are counted right."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pytest
+
+from fleet_service.analytics.questions.change_rates import LEAST_DAYS, LONGEST_S, _fitted, fit
+from schemas.numeric import FloatArray
+from schemas.thresholds import SLIPPERY_MU
+
+Ask = Callable[..., pa.Table]
+RATE = 1.0 / 1800.0
+MISREAD = 0.05  # of one reading
+PI = 0.3  # slippery share of roads
+
+
+def pairs_of_a_day(rng: np.random.Generator, rate: float, count: int) -> FloatArray:
+    """(bins, 4) counts of pairs of readings of a road that becomes another one at `rate`."""
+    apart = np.exp(rng.uniform(0.0, np.log(LONGEST_S), count))
+    first = rng.random(count) < PI
+    second = np.where(rng.random(count) < -np.expm1(-rate * apart), rng.random(count) < PI, first)
+    first, second = (road ^ (rng.random(count) < MISREAD) for road in (first, second))
+    octave = np.log2(apart).astype(int)
+    columns = (np.ones(count), first != second, first.astype(float) + second, apart)
+    return np.stack([np.bincount(octave, column, minlength=14) for column in columns], axis=1)
+
+
+def test_the_fit_finds_the_rate_and_the_misreadings_of_a_known_process() -> None:
+    rate, misread = fit(pairs_of_a_day(np.random.default_rng(1), RATE, 200_000))
+    assert rate == pytest.approx(RATE, rel=0.1)
+    assert misread == pytest.approx(2 * MISREAD * (1 - MISREAD), abs=0.01)
+
+
+def counted(days: list[FloatArray]) -> pa.Table:
+    rows = [
+        {"day": f"2026-01-{day + 1:02}", "octave": octave, **dict(zip(NAMES, counts.tolist(), strict=True))}
+        for day, one in enumerate(days)
+        for octave, counts in enumerate(one)
+        if counts[0] > 0
+    ]
+    return pa.Table.from_pylist(rows)
+
+
+NAMES = ("pairs", "unlike", "slippery", "seconds")
+
+
+def test_the_interval_holds_as_often_as_it_says_when_days_differ() -> None:
+    """Days of very unlike rates, mean RATE: the pairs of a day are no independent witnesses."""
+    held, trials = 0, 20
+    for trial in range(trials):
+        rng = np.random.default_rng([7, trial])
+        days = [pairs_of_a_day(rng, RATE * rng.uniform(0.4, 1.6), 800) for _ in range(12)]
+        found = _fitted(counted(days))
+        assert found["rate_lower"] is not None
+        assert found["rate_upper"] is not None
+        held += found["rate_lower"] <= 3600 * RATE <= found["rate_upper"]
+    assert held >= 14  # of 18 expected; less happens by chance once in 40
+
+
+def test_few_days_have_no_interval() -> None:
+    rng = np.random.default_rng(2)
+    found = _fitted(counted([pairs_of_a_day(rng, RATE, 500) for _ in range(LEAST_DAYS - 1)]))
+    assert found["rate_per_hour"] is not None
+    assert found["rate_lower"] is None
+    assert found["rate_upper"] is None
+
+
+def test_pairs_are_values_in_a_row_by_different_vehicles(asked: Ask, rows: pd.DataFrame) -> None:
+    found = asked("change-rates").to_pandas()
+    told = rows[rows["value"]].sort_values(["cell", "sector", "time", "vehicle", "boot", "seq", "row"])
+    before = told.groupby(["cell", "sector"])[["time", "vehicle", "mu"]].shift()
+    apart = told["time"] - before["time"]
+    pair = (before["vehicle"] != told["vehicle"]) & (apart >= 1) & (apart <= LONGEST_S)
+    unlike = pair & ((before["mu"] < SLIPPERY_MU) != (told["mu"] < SLIPPERY_MU))
+    hours = found[found["by"] == "hour of the day (UTC)"]
+    assert hours["pairs"].sum() == pair.sum() > 500
+    assert hours["unlike"].sum() == unlike.sum() > 0
+    assert hours["hours_between"].sum() == pytest.approx(apart[pair].sum() / 3600)
+
+
+def test_roads_change_faster_where_ice_comes_and_goes(asked: Ask, stations: Path) -> None:
+    """The synthetic roads freeze at four and thaw at eight: below freezing, not in the afternoon."""
+    for options in ({}, {"stations": stations}):
+        found = asked("change-rates", **options).to_pandas().set_index(["by", "class"])
+        assert found.loc[("hour of the day (UTC)", "06-12"), "unlike"] > 5
+        assert found.loc[("hour of the day (UTC)", "12-18"), "unlike"] == 0
+        assert found.loc[("hour of the day (UTC)", "12-18"), "rate_per_hour"] is None or np.isnan(
+            found.loc[("hour of the day (UTC)", "12-18"), "rate_per_hour"]
+        )
+        assert found["pairs"].sum() > 1000
