@@ -26,6 +26,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--only", choices=ONLY, help="a campaign of its own: inputs, of the signal doctor and of calibration"
     )
+    parser.add_argument(
+        "--plots", choices=("png", "svg", "pdf"), default="png", help="their format (default %(default)s)"
+    )
     parser.add_argument("--no-plots", action="store_true", help="figures and table only; needs no matplotlib")
 
 
@@ -65,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.no_plots:
         from edge_agent.lab.evaluation.plots import draw
 
-        draw(results, figures, args.out)
+        draw(results, figures, args.out, seed=seeds[0], form=args.plots)
     print(text.partition("## The papers' figures")[0].rstrip())
     return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
 

@@ -10,12 +10,13 @@ from fleet_service.lab.bars import COUNTS
 from fleet_service.lab.rules import RULES
 from schemas.errors import InputError
 from schemas.runtime.figures import Figure
+from schemas.runtime.palette import ESTIMATORS
 
 SIZE = (5.5, 4.2)
 
 
-def draw(found: Sequence[Figure], folder: Path) -> list[Path]:
-    """Write the four plots into `folder`.
+def draw(found: Sequence[Figure], folder: Path, forms: Sequence[str] = ("png", "svg", "pdf")) -> list[Path]:
+    """Write the four plots into `folder`, in each form.
 
     Raises:
         InputError: matplotlib is not installed.
@@ -32,8 +33,9 @@ def draw(found: Sequence[Figure], folder: Path) -> list[Path]:
         canvas = Canvas(figsize=SIZE, layout="constrained")
         axes = canvas.subplots()
         plot(axes, values)
-        paths.append(folder / f"{name}.png")
-        canvas.savefig(paths[-1], dpi=130)
+        for form in forms:
+            paths.append(folder / f"{name}.{form}")
+            canvas.savefig(paths[-1], dpi=130)
     return paths
 
 
@@ -67,11 +69,11 @@ def _delay(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
 def _misbehaving(axes: Any, values: Mapping[str, float]) -> None:  # noqa: ANN401
     shares = {"clean": 0.0, "mis05": 5.0, "mis15": 15.0, "mis30_colluding": 30.0}
     axes.plot(shares.values(), [values.get(f"fusion.{n}.rmse", float("nan")) for n in shares], "o-", label="fusion")
-    for rule in RULES:
+    for rule, style in zip(RULES, list(ESTIMATORS.values())[1:], strict=False):
         label = rule.replace(" ", "_")
         axes.plot(
             shares.values(), [values.get(f"rule.{n}.{label}.rmse", float("nan")) for n in shares], marker=".",
-            linewidth=1, label=rule,
+            linewidth=1, label=rule, color=style.colour, linestyle=style.dash,
         )  # fmt: skip
     axes.set(
         title="Error against misbehaving vehicles", xlabel="% that always claim .25, sure", ylabel="RMSE of the median",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -14,34 +14,42 @@ from edge_agent.estimators import TUNED
 from edge_agent.lab.evaluation.campaign import DEFAULT, PlottedDrive, Results
 from edge_agent.lab.evaluation.measures import bounds, nees
 from edge_agent.lab.evaluation.real_world import SURFACES, RealWorldResults
+from edge_agent.lab.evaluation.scenarios import OTHERS, PAPERS, VEHICLES
 from schemas.runtime.figures import Figure
+from schemas.runtime.palette import ESTIMATORS, TRUTH, line_of
 from schemas.signals import Health, S
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-def draw(results: Results, figures: Sequence[Figure], folder: Path) -> list[Path]:
-    """Write the plots (PNG) into `folder`; returns their paths."""
+SCENARIOS: Final = {**PAPERS, **OTHERS, **VEHICLES}
+DPI: Final = 110  # of PNG: 1 000 points wide; SVG and PDF are for print
+NEARLY_ALIKE: Final = 0.02  # of mu: one road
+FORMS: Final = ("png", "svg", "pdf")
+
+
+def draw(results: Results, figures: Sequence[Figure], folder: Path, *, seed: int = 0, form: str = "png") -> list[Path]:
+    """Write the plots into `folder`; returns their paths. `seed`: of the drive that is shown; `form`: one of FORMS."""
     import matplotlib as mpl
 
     mpl.use("Agg")
     written = []
     for scenario in sorted({scenario for scenario, _ in results.drives}):
         drives = {name: drive for (of, name), drive in results.drives.items() if of == scenario}
-        written.append(_scenario(scenario, drives, folder / f"{scenario}.png"))
+        written.append(_scenario(scenario, drives, seed, folder / f"{scenario}.{form}"))
     if results.rough is not None:
-        written.append(_rough(results.rough, folder / "rough.png"))
+        written.append(_rough(results.rough, folder / f"rough.{form}"))
     return [
         *written,
-        _surfaces(figures, folder / "surfaces.png"),
-        _memberships(folder / "memberships.png"),
-        _reliability(figures, folder / "reliability.png"),
-        _consistency(figures, folder / "consistency.png"),
+        _surfaces(figures, folder / f"surfaces.{form}"),
+        _memberships(folder / f"memberships.{form}"),
+        _reliability(figures, folder / f"reliability.{form}"),
+        _consistency(figures, folder / f"consistency.{form}"),
     ]
 
 
-def _scenario(scenario: str, drives: dict[str, PlottedDrive], path: Path) -> Path:
+def _scenario(scenario: str, drives: dict[str, PlottedDrive], seed: int, path: Path) -> Path:
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(6, 1, figsize=(9, 14), sharex=True, layout="constrained")
@@ -50,28 +58,49 @@ def _scenario(scenario: str, drives: dict[str, PlottedDrive], path: Path) -> Pat
     for axis, (name, label) in zip(
         axes, (("vx", "v_x [m/s]"), ("vy", "v_y [m/s]"), ("yaw_rate", "yaw rate [rad/s]")), strict=False
     ):
-        axis.plot(t, first.batch.truth[f"true_{name}"][:, 0], "k", label="true")
+        axis.plot(t, first.batch.truth[f"true_{name}"][:, 0], **_true(), label="true")
         for estimator, drive in drives.items():
-            axis.plot(t, getattr(drive.reported, name)[:, 0], lw=0.8, label=estimator)
+            axis.plot(t, getattr(drive.reported, name)[:, 0], **_line(estimator), label=estimator)
         axis.set_ylabel(label)
-    axes[3].plot(t, first.batch.mu[:, 0], "k")
+    axes[3].plot(t, first.batch.mu[:, 0], **_true(), label="true, mean of the wheels")
     for estimator, drive in drives.items():
-        line = axes[3].plot(t, drive.reported.mu[:, 0], lw=0.8)[0]
+        said, style = drive.reported, _line(estimator)
+        axes[3].plot(t, said.mu[:, 0], **style)
         if estimator == DEFAULT or len(drives) == 1:
-            axes[3].fill_between(
-                t, drive.reported.mu_lower[:, 0], drive.reported.mu_upper[:, 0], color=line.get_color(), alpha=0.2, lw=0
-            )
-        axes[4].plot(t, drive.reported.adaptation[:, 0], lw=0.8)
-        axes[5].semilogy(t, nees(drive.batch, drive.reported).mean(axis=1), lw=0.8)
+            band = {"color": style["color"], "alpha": 0.2, "lw": 0, "label": f"90 % band of {estimator}"}
+            axes[3].fill_between(t, said.mu_lower[:, 0], said.mu_upper[:, 0], **band)
+        axes[4].plot(t, said.adaptation[:, 0], **style)
+        axes[5].semilogy(t, nees(drive.batch, said).mean(axis=1), **style)
     axes[3].set(ylabel="μ and its 90 % band", ylim=(0.0, 1.25))
     axes[4].set(ylabel="factor on R")
-    axes[5].axhspan(*bounds("nees", first.batch.t.shape[1]), color="k", alpha=0.15, lw=0)
+    ends = bounds("nees", first.batch.t.shape[1])
+    axes[5].axhspan(*ends, color="k", alpha=0.15, lw=0, label="95 % of a consistent filter's mean")
     axes[5].set(ylabel="NEES, all drives", xlabel="t [s]", ylim=(1e-3, 1e3))
-    axes[0].set_title(scenario)
-    axes[0].legend(fontsize="x-small", ncols=3)
-    figure.savefig(path, dpi=80)
+    axes[0].set_title(title(scenario, first, seed))
+    for axis in (axes[0], axes[3], axes[5]):
+        axis.legend(fontsize="x-small", ncols=3)
+    figure.savefig(path, dpi=DPI)
     plt.close(figure)
     return path
+
+
+def title(scenario: str, drive: PlottedDrive, seed: int) -> str:
+    """What is driven: scenario, manoeuvre, speed, friction, vehicle and seed."""
+    spec, batch = SCENARIOS.get(scenario), drive.batch
+    mu, speed = batch.mu[:, 0], batch.truth["true_vx"][0, 0]
+    road = f"{mu.min():.2f}" if np.ptp(mu) < NEARLY_ALIKE else f"{mu.max():.2f} to {mu.min():.2f}"
+    about = spec.about if spec is not None else "drive"
+    return f"{scenario}: {about}\nfrom {speed:.0f} m/s, μ {road}, {batch.vehicles[0].name}, seed {seed}"
+
+
+def _line(estimator: str) -> dict[str, Any]:
+    """The estimator's own line: the same in every plot."""
+    style = line_of(estimator)
+    return {"color": style.colour, "linestyle": style.dash, "lw": 1.0}
+
+
+def _true() -> dict[str, Any]:
+    return {"color": TRUTH.colour, "linestyle": TRUTH.dash, "lw": 1.6}
 
 
 def _rough(world: RealWorldResults, path: Path) -> Path:
@@ -85,12 +114,16 @@ def _rough(world: RealWorldResults, path: Path) -> Path:
     axes[0].plot(t, batch.truth["true_vx"][:, car], "k", label="true")
     axes[1].plot(t, wheels - batch.truth["true_vx"][:, car], color="0.7", lw=0.8, label="mean of the wheels")
     for name, reported in world.reported.items():
-        line = axes[0].plot(t, reported.vx[:, car], lw=0.8, label=name)[0]
-        axes[1].plot(t, reported.vx[:, car] - batch.truth["true_vx"][:, car], lw=0.8, color=line.get_color())
+        axes[0].plot(t, reported.vx[:, car], **_line(name), label=name)
+        axes[1].plot(t, reported.vx[:, car] - batch.truth["true_vx"][:, car], **_line(name))
     axes[2].plot(t, 100.0 * batch.truth["true_slope"][:, car], "k")
-    axes[3].plot(t, batch.mu[:, car], "k")
-    axes[3].plot(t, first.mu[:, car], lw=0.8)
-    axes[3].fill_between(t, first.mu_lower[:, car], first.mu_upper[:, car], alpha=0.2, lw=0)
+    style = _line(next(iter(world.reported)))
+    axes[3].plot(t, batch.mu[:, car], **_true(), label="true")
+    axes[3].plot(t, first.mu[:, car], **style, label=f"median of {next(iter(world.reported))}")
+    band = {"color": style["color"], "alpha": 0.2, "lw": 0, "label": "its 90 % band"}
+    axes[3].fill_between(t, first.mu_lower[:, car], first.mu_upper[:, car], **band)
+    axes[3].legend(fontsize="x-small", ncols=3)
+    axes[1].legend(fontsize="x-small")
     for flag in Health:
         if flag and (when := (first.health[:, car].astype(np.int64) & int(flag)) != 0).any():
             axes[4].plot(t[when], [flag.name] * int(when.sum()), "|")
@@ -102,7 +135,7 @@ def _rough(world: RealWorldResults, path: Path) -> Path:
     axes[3].set(ylabel="μ and its 90 % band", ylim=(0.0, 1.25))
     axes[4].set(ylabel="health", xlabel="t [s]")
     axes[0].legend(fontsize="x-small", ncols=3)
-    figure.savefig(path, dpi=80)
+    figure.savefig(path, dpi=DPI)
     plt.close(figure)
     return path
 
@@ -116,13 +149,19 @@ def _surfaces(figures: Sequence[Figure], path: Path) -> Path:
     drawn, axis = plt.subplots(figsize=(9, 4), layout="constrained")
     for k, name in enumerate(names):
         shares = [values.get(f"world.{name}.coverage90.{surface}", np.nan) for surface in SURFACES]
-        axis.bar(np.arange(len(SURFACES)) + 0.8 * (k + 0.5) / len(names) - 0.4, shares, 0.8 / len(names), label=name)
+        axis.bar(
+            np.arange(len(SURFACES)) + 0.8 * (k + 0.5) / len(names) - 0.4,
+            shares,
+            0.8 / len(names),
+            label=name,
+            color=line_of(name).colour,
+        )
     axis.axhline(0.9, color="k", ls=":")
     axis.set(
         xticks=range(len(SURFACES)), xticklabels=list(SURFACES), ylabel="coverage of the 90 % interval", ylim=(0, 1)
     )
     axis.legend(fontsize="x-small", ncols=4)
-    drawn.savefig(path, dpi=80)
+    drawn.savefig(path, dpi=DPI)
     plt.close(drawn)
     return path
 
@@ -140,12 +179,12 @@ def _consistency(figures: Sequence[Figure], path: Path) -> Path:
                 scenario, _, estimator = figure.name[len("real.") : -len(f".{measure}")].rpartition(".")
                 found.setdefault(estimator, {})[scenario] = figure.value
         for estimator, values in found.items():
-            axis.plot(list(values), list(values.values()), "o", label=estimator)
+            axis.plot(list(values), list(values.values()), "o", color=line_of(estimator).colour, label=estimator)
         axis.axhspan(ends[f"bounds.{measure}.lower"], ends[f"bounds.{measure}.upper"], color="k", alpha=0.15, lw=0)
         axis.set(ylabel=measure.upper(), yscale="log")
     axes[0].legend(fontsize="x-small", ncols=3)
     axes[1].tick_params(axis="x", rotation=90)
-    drawn.savefig(path, dpi=80)
+    drawn.savefig(path, dpi=DPI)
     plt.close(drawn)
     return path
 
@@ -157,17 +196,18 @@ def _memberships(path: Path) -> Path:
     figure, axes = plt.subplots(3, 2, figsize=(9, 7), layout="constrained")
     tuned = ((f"after, {name}", shipped(file)) for name, file in TUNED.items())
     for row, (name, sets) in enumerate((("before", Memberships()), *tuned)):
-        _triangles(axes[row, 0], sets.inputs, f"{name}: mismatch")
-        _triangles(axes[row, 1], sets.outputs, f"{name}: step of ln R")
-    figure.savefig(path, dpi=80)
+        _triangles(axes[row, 0], sets.inputs, f"{name}: sets of the mismatch", "mismatch of the innovations [1]")
+        _triangles(axes[row, 1], sets.outputs, f"{name}: sets of the step", "step of ln R [1]")
+    figure.savefig(path, dpi=DPI)
     plt.close(figure)
     return path
 
 
-def _triangles(axis: Axes, peaks: tuple[float, ...], title: str) -> None:
-    for k in range(len(peaks)):
-        axis.plot(peaks, np.eye(len(peaks))[k])
-    axis.set_title(title)
+def _triangles(axis: Axes, peaks: tuple[float, ...], title: str, name: str) -> None:
+    for k, style in zip(range(len(peaks)), ESTIMATORS.values(), strict=False):
+        axis.plot(peaks, np.eye(len(peaks))[k], color=style.colour, label=f"set {k + 1}, peak {peaks[k]:.2g}")
+    axis.set(title=title, xlabel=name, ylabel="membership [1]")
+    axis.legend(fontsize="xx-small")
 
 
 def _reliability(figures: Sequence[Figure], path: Path) -> Path:
@@ -182,9 +222,9 @@ def _reliability(figures: Sequence[Figure], path: Path) -> Path:
     drawn, axis = plt.subplots(figsize=(5, 5), layout="constrained")
     axis.plot([0, 1], [0, 1], "k:")
     for estimator, levels in found.items():
-        axis.plot(list(levels), list(levels.values()), "o-", ms=3, label=estimator)
+        axis.plot(list(levels), list(levels.values()), marker="o", ms=3, **_line(estimator), label=estimator)
     axis.set(xlabel="stated", ylabel="share of truths below", title="reliability of friction")
     axis.legend(fontsize="x-small")
-    drawn.savefig(path, dpi=80)
+    drawn.savefig(path, dpi=DPI)
     plt.close(drawn)
     return path

@@ -162,7 +162,7 @@ def test_misuse_is_one_line_and_exit_code_two(
 
 
 def test_the_quick_campaign_writes_figures_report_and_plots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", "--out", str(tmp_path), "--quick"]) in (0, 1)
+    assert main(["evaluate", "--out", str(tmp_path), "--quick", "--plots", "svg"]) in (0, 1)
     output = capsys.readouterr()
     assert "double lane change" in output.err
     header, *rows = json.loads((tmp_path / "figures.json").read_text())
@@ -177,15 +177,15 @@ def test_the_quick_campaign_writes_figures_report_and_plots(tmp_path: Path, caps
     assert all(f"| {case} |" in text for case in CASES)
     assert "NO (" not in text
     assert (tmp_path / "report.md").read_text().startswith("# Evaluation")
-    assert {"memberships.png", "reliability.png", "consistency.png", "004.dlc.png"} <= {
-        path.name for path in tmp_path.glob("*.png")
+    assert {"memberships.svg", "reliability.svg", "consistency.svg", "004.dlc.svg"} <= {
+        path.name for path in tmp_path.glob("*.svg")
     }
 
 
 def test_more_seeds_are_driven_and_no_plots_drawn_where_so_asked(tmp_path: Path) -> None:
     assert main(["evaluate", "--out", str(tmp_path), "--quick", "--seeds", "3", "--no-plots"]) in (0, 1)
     assert json.loads((tmp_path / "figures.json").read_text())[0]["seeds"] == [FIGURES, FIGURES + 1, FIGURES + 2]
-    assert not list(tmp_path.glob("*.png"))
+    assert not [path for ending in ("png", "svg", "pdf") for path in tmp_path.glob(f"*.{ending}")]
     assert (tmp_path / "report.md").exists()
 
 

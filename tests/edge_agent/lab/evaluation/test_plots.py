@@ -1,0 +1,39 @@
+"""What a plot says of itself, and that an estimator is known by its colour."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.lab.evaluation import plots
+from edge_agent.lab.evaluation.batch import estimates, realistic
+from edge_agent.lab.evaluation.campaign import PlottedDrive
+from edge_agent.lab.seeds import FIGURES
+from schemas.runtime.palette import line_of
+
+
+@pytest.fixture(scope="module")
+def drives() -> dict[str, PlottedDrive]:
+    """Two estimators on a double lane change."""
+    batch = realistic(plots.SCENARIOS["004.dlc"], [FIGURES])
+    return {name: PlottedDrive(batch, estimates(bank_of(name, batch.vehicles), batch)) for name in ("ckf", "sr-ukf")}
+
+
+def test_a_title_says_manoeuvre_speed_friction_vehicle_and_seed(drives: dict[str, PlottedDrive]) -> None:
+    said = plots.title("004.dlc", drives["ckf"], 7)
+    assert said == "004.dlc: double lane change, 80 km/h\nfrom 22 m/s, μ 0.85, sedan, seed 7"
+    assert plots.title("of a user", drives["ckf"], 7).startswith("of a user: drive\n")
+
+
+def test_a_plot_is_a_picture_or_print_and_an_estimator_has_its_colour(
+    drives: dict[str, PlottedDrive], tmp_path: Path
+) -> None:
+    for form, begin in (("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")):
+        path = plots._scenario("004.dlc", dict(reversed(drives.items())), 7, tmp_path / f"a.{form}")
+        assert path.read_bytes().startswith(begin)
+    text = (tmp_path / "a.svg").read_text()
+    assert all(line_of(name).colour in text for name in drives)
+    assert line_of("ckf") != line_of("sr-ukf")
+    assert line_of("of a user").colour not in text
