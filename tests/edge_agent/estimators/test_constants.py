@@ -1,7 +1,4 @@
-"""Constants of the default's table move what they are for, in the direction and by the size that their reason says.
-
-Those that the rough world changed are seen to matter in `test_constants_change`, until their sizes are stated anew.
-"""
+"""Every constant of the default's table moves what it is for, in the direction and by the size that its reason says."""
 
 from __future__ import annotations
 
@@ -17,15 +14,20 @@ from edge_agent.estimators.estimates import Estimates
 from edge_agent.estimators.friction_mixture.bank import mixture_bank
 from edge_agent.estimators.friction_mixture.constants import NODES, Constants, NodeState
 from edge_agent.estimators.friction_mixture.design import design_of
+from edge_agent.lab.simulation import simulate_manoeuvre
 from schemas.numeric import FloatArray
-from schemas.signals import S
+from schemas.signals import CHANNELS, S
 from schemas.vehicle import Vehicle
 from tests.edge_agent.estimators.drives import drive, joined
 
 SAMPLES = 400  # of the short drives
 FIRST = 100  # sample from which figures are taken
 CUT = 20  # samples between two looks into the filters
-LOOKED_AT = ("weight", "split", "mean", "penalty", "overall_mean", "overall_covariance")
+TORQUE, OMEGA = slice(S.TORQUE, S.TORQUE + 4), slice(S.OMEGA, S.OMEGA + 4)
+SHORT: dict[str, float | None] = {
+    "j-turn": 0.4, "braking": 0.3, "acceleration": 0.3, "gaining-slalom": 0.9, "pulses": 0.6, "slalom": 0.3,
+    "split-braking": None,
+}  # fmt: skip
 
 
 class Move(NamedTuple):
@@ -37,15 +39,20 @@ class Move(NamedTuple):
     times: float = 3.0  # the constant
 
 
+LESS = 1.0 / 3.0
 MOVES = {
     # fewer and more independent measurements
+    "block_time": Move("updates", "acceleration", 0.4),
+    "correlation_time": Move("vy_std", "j-turn", 1.2),
     "window": Move("adaptation", "acceleration", 0.8),  # R follows the spin later
     # the road
+    "hazard": Move("least probabilities", "j-turn", 1.5),
     "diffusion": Move("width", "acceleration", 1.15),
     "split_prior": Move("split probability", "turn and straight", 2.0),
     "split_hazard": Move("one friction's probability", "split-braking", 1.5),
     "split_asymmetry": Move("split nodes awake", "turn and straight", 0.5),
     # how much a block counts
+    "demand_half": Move("width", "constant-radius", 1.5),  # the same force tells less
     "demand_power": Move("penalty", "acceleration", 0.5),  # above the threshold all is evidence, nothing is charged
     "plausible_loss": Move("least probabilities", "constant-radius", 1.2),
     "largest_loss": Move("least probabilities", "j-turn", 0.3),
@@ -53,86 +60,152 @@ MOVES = {
     "steady_half": Move("width", "constant-radius", 1.12),
     "steady_share": Move("width", "constant-radius", 0.9),
     "sliding_slope": Move("upper", "constant-radius", 1.2),  # more nodes pay for sliding: those of little friction
+    "sliding_penalty": Move("lower", "constant-radius", 1.05),
     "axle_penalty": Move("upper", "slalom", 0.88),  # saturated nodes, of little friction, gain
     # limits
+    "farthest": Move("penalty", "braking", 0.5, LESS),  # nodes may not go to where they would be charged
+    "huber": Move("nis", "stopping", 5.0, LESS),  # R is inflated by what is refused, and follows it less
+    "diverged_x": Move("nodes apart in v_x", "braking", 0.6, LESS),
+    "diverged_y": Move("nodes apart in v_y", "turn and straight", 0.6, LESS),
     # the tyre and the vehicle: what a sharper curve explains is not explained by a sharper tyre
     "curve_c": Move("sharpness", "braking", 0.8, 1.1),
     "curve_e": Move("sharpness", "j-turn", 0.95),
     "shape_std": Move("std SHAPE", "gaining-slalom", 2.0),
+    "shape_time": Move("std SHAPE", "split-braking", 1.06, LESS),  # it forgets sooner
+    "stiffness_x_std": Move("std LN_KX", "gaining-slalom", 2.0),
+    "stiffness_y_std": Move("std LN_KY", "stopping", 2.5),
     "stiffness_time": Move("std STEER", "turn and straight", 0.88),
     "stiffness_power_x": Move("nis", "acceleration", 0.6),  # the residual of a stiff tyre is divided by more
+    "stiffness_power_y": Move("nis", "turn and straight", 0.94),
+    "informing_x": Move("std LN_KX", "j-turn", 1.08),
     "informing_y": Move("std LN_KY", "pulses", 1.2),
     "gain_std": Move("width", "acceleration", 1.1),
     # sensors
     "leak_y_mean": Move("mean LEAK_Y", "acceleration", 2.0),
     "leak_y_std": Move("std LEAK_Y", "acceleration", 2.0),
+    "leak_x": Move("vx_std", "braking without torque", 1.04),
+    "leak_time": Move("std LEAK_Y", "constant-radius", 1.02, LESS),
+    "bias_x_std": Move("std BIAS_X", "stopping", 0.7, LESS),
+    "bias_y_std": Move("std BIAS_Y", "constant-radius", 0.7, LESS),
+    "bias_time": Move("std BIAS_Y", "turn and straight", 1.08, LESS),
+    "slope_std": Move("std SLOPE", "braking", 1.6),
+    "slope_length": Move("std SLOPE", "pulses", 1.08, LESS),  # it is another one sooner
+    "bank_std": Move("std BANK", "j-turn", 0.5, LESS),
+    "bank_length": Move("std BANK", "constant-radius", 1.08),
+    "slope_time": Move("std BANK", "standing", 1.06),
     "steer_std": Move("std STEER", "constant-radius", 1.5),
+    "wheel_std": Move("std RADIUS", "standing", 2.5),
+    "radius_std": Move("vx_std", "turn and straight", 2.5),
+    "lag_std": Move("std LAG_WHEEL", "standing", 2.5),
+    "drift_x": Move("std VX", "slalom", 1.2),
     "drift_y": Move("vy_std", "gaining-slalom", 1.6),
+    "leak_wander": Move("std VX", "split-braking", 1.2),
+    "gyro_wander": Move("vy_std", "rough acceleration", 1.07),
     # noise: what is expected to be larger is found to be smaller than expected
     "omega_noise": Move("nis", "gaining-slalom", 0.6),
+    "step_noise": Move("nis", "gaining-slalom", 0.6),
+    "angle_std": Move("nis", "side force without turning", 0.97),
+    "angle_share": Move("std STEER", "slalom", 1.25),
     "gyro_std": Move("vy_std", "gaining-slalom", 1.15),
     "floor_x": Move("nis", "split-braking", 0.85),
+    "floor_y": Move("nis", "j-turn", 0.86),
     "force_share": Move("nis", "acceleration", 0.7),
+    "axle_share": Move("nis", "j-turn", 0.91),
     "shape_share": Move("nis", "split-braking", 0.88),
+    "lag": Move("nis", "turn and straight", 0.94),
+    "no_torque_share": Move("nis", "braking without torque", 0.6),
+    "no_torque_floor": Move("nis", "pulses", 0.89),
+    # wheels that tell the motion without a tyre
+    "standing_time": Move("stands", "stopping", 0.5),
+    "agreeing_time": Move("v_x told by wheels", "slalom", 0.6),
+    "agreeing_width": Move("v_x told by wheels", "pulses", 0.8, LESS),
+    "agreeing_most": Move("v_x told by wheels", "stopping", 2.0),
+    "agreeing_std": Move("std of wheels' v_x", "turn and straight", 1.6),
+    "agreeing_floor": Move("std of wheels' v_x", "standing", 2.0),
+    "agreeing_slip": Move("std of wheels' v_x", "rough acceleration", 1.3),
+    "agreeing_cube": Move("std of wheels' v_x", "rough acceleration", 1.08),
+    "agreeing_lag": Move("std of wheels' v_x", "rough acceleration", 1.13),
+    "agreeing_look": Move("std VX", "turn and straight", 1.1),
+    "following_most": Move("v_y told by an axle", "slalom", 2.0),
+    "following_std": Move("std of the axle's v_y", "turn and straight", 1.5),
+    # no friction below the grip in use
+    "guard_margin": Move("least probabilities", "braking", 1.4),
+    "guard_std": Move("least probabilities", "acceleration", 1.25),
+    # contradiction
+    "odd_rise": Move("oddity", "turn and straight", 0.6),
+    "odd_fall": Move("distrust", "side force without turning", 0.75, LESS),
+    "distrust_noise": Move("nis", "side force without turning", 0.97, LESS),  # it no longer follows what it distrusts
+    "distrust_drift": Move("vy_std", "side force without turning", 1.5),
+    "distrust_forget": Move("BIAS_Y", "side force without turning", 1.2),  # what was learned is kept for longer
 }
 
 
 @cache
-def drives() -> tuple[dict[str, int], FloatArray, FloatArray, list[Vehicle]]:
-    """Samples of each drive, t (T, N), signals (T, N, 18), vehicles; NaN after a drive's end.
-
-    Turning, locking, spinning, creeping, split sides; without torque, without accelerations for a while; a steady
-    circle, and a long straight after a turn.
-    """
-    chosen = {
-        name: drive(name, mu)
-        for name, mu in (
-            ("j-turn", 0.4), ("braking", 0.3), ("acceleration", 0.3), ("gaining-slalom", 0.9), ("pulses", 0.6),
-            ("slalom", 0.3), ("split-braking", None),
+def driven(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
+    """t (T,), signals (T, 18) and vehicle of a drive."""
+    if name in SHORT:
+        t, signals, vehicle = drive(name, SHORT[name])
+        t, signals = t[:SAMPLES], signals[:SAMPLES].copy()
+        if name == "pulses":
+            signals[FIRST:, TORQUE] = np.nan
+        if name == "slalom":
+            signals[150:250, [S.AX, S.AY]] = np.nan
+        return t, signals, vehicle
+    if name == "braking without torque":
+        t, signals, vehicle = drive("braking", 0.8)
+        signals = signals.copy()
+        signals[:, TORQUE] = np.nan
+        return t[:SAMPLES], signals[:SAMPLES], vehicle
+    if name == "constant-radius":
+        return drive(name, 0.5)
+    if name == "turn and straight":
+        turn = drive("j-turn", 0.5)
+        return *joined(turn, drive("straight", 0.5, seconds=40.0)), turn[2]
+    if name == "rough acceleration":
+        log, vehicle = simulate_manoeuvre(
+            "acceleration", mu=0.8, seed=1, duration_s=12.0, sensors="rough", road="hilly"
         )
-    }  # fmt: skip
-    chosen = {name: (t[:SAMPLES], signals[:SAMPLES].copy(), one) for name, (t, signals, one) in chosen.items()}
-    chosen["pulses"][1][100:, S.TORQUE : S.TORQUE + 4] = np.nan
-    chosen["slalom"][1][150:250, [S.AX, S.AY]] = np.nan
-    chosen["constant-radius"] = drive("constant-radius", 0.5)
-    turn = drive("j-turn", 0.5)
-    chosen["turn and straight"] = (*joined(turn, drive("straight", 0.5, seconds=40.0)), turn[2])
-    lengths = {name: len(one[0]) for name, one in chosen.items()}
-    t = np.full((max(lengths.values()), len(chosen)), np.nan)
-    signals = np.full((*t.shape, chosen["j-turn"][1].shape[1]), np.nan)
-    for n, one in enumerate(chosen.values()):
-        t[: len(one[0]), n], signals[: len(one[0]), n] = one[0], one[1]
-    return lengths, t, signals, [one[2] for one in chosen.values()]
+        return log["t"].to_numpy(), np.stack([log[c].to_numpy() for c in CHANNELS], axis=-1).astype(float), vehicle
+    return made_up(name)
+
+
+def made_up(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
+    """Drives that no plant makes: a stop on slipping wheels, a car that stands, side force that nothing turns."""
+    t = np.arange(0.0, 4.0 if name == "stopping" else 20.0, 0.01)
+    signals = np.zeros((len(t), len(CHANNELS)))
+    if name == "stopping":
+        signals[:, S.AX] = np.where((t > 0.5) & (t < 2.4), -11.0, 0.3)
+        signals[:, OMEGA] = np.clip(70.0 - 36.0 * np.clip(t - 0.5, 0.0, 3.0), 0.0, None)[:, None]
+    elif name == "standing":
+        signals[:, S.AX] = 0.5
+        signals[:, OMEGA] = np.clip(20.0 - 10.0 * t, 0.0, None)[:, None]
+    else:
+        signals[:, OMEGA] = 60.0
+        signals[:, S.AY] = np.where(t < 10.0, 3.0 * np.sin(2.0 * t), 0.0)
+    return t, signals, drive("j-turn", SHORT["j-turn"])[2]
 
 
 @cache
-def figures(name: str | None, times: float) -> dict[tuple[str, str], float]:
-    """Figures of every drive, with constant `name` that many times as large."""
-    lengths, t, signals, vehicles = drives()
+def figures(place: str, name: str | None, times: float) -> dict[str, float]:
+    """Figures of a drive, with constant `name` that many times as large."""
+    t, signals, vehicle = driven(place)
     constants = Constants()
     if name is not None:
         constants = constants._replace(**{name: times * getattr(constants, name)})
-    bank = mixture_bank(parameter_table(vehicles), design_of(Memberships(), adaptive=True, constants=constants))
+    bank = mixture_bank(parameter_table([vehicle]), design_of(Memberships(), adaptive=True, constants=constants))
     parts, looks = [], []
     for k in range(0, len(t), CUT):
-        parts.append(bank.advance(t[k : k + CUT], signals[k : k + CUT]).values)
-        looks.append({field: bank._filters[field].copy() for field in LOOKED_AT})
-    found = Estimates(np.concatenate(parts))
-    seen = {field: np.stack([look[field] for look in looks]) for field in LOOKED_AT}
-    return {
-        (figure, place): value
-        for n, (place, length) in enumerate(lengths.items())
-        for figure, value in (
-            *reported(Estimates(found.values[FIRST:length, n])).items(),
-            *inside({field: values[FIRST // CUT : length // CUT, n] for field, values in seen.items()}).items(),
-        )
-    }
+        parts.append(bank.advance(t[k : k + CUT, None], signals[k : k + CUT, None]).values)
+        looks.append(bank._filters.copy())
+    found = Estimates(np.concatenate(parts)[FIRST:, 0])
+    return reported(found) | inside(np.concatenate(looks)[FIRST // CUT :])
 
 
 def reported(estimates: Estimates) -> dict[str, float]:
     """Figures of what is reported of one drive."""
     mean = {
         "width": estimates.mu_upper - estimates.mu_lower,
+        "lower": estimates.mu_lower,
         "upper": estimates.mu_upper,
         "vx_std": estimates.vx_std,
         "vy_std": estimates.vy_std,
@@ -143,13 +216,15 @@ def reported(estimates: Estimates) -> dict[str, float]:
     return {name: float(np.mean(values)) for name, values in mean.items()}
 
 
-def inside(filters: dict[str, np.ndarray]) -> dict[str, float]:
+def inside(filters: np.ndarray) -> dict[str, float]:
     """Figures of the filter of one drive, looked into again and again."""
     weight, split = filters["weight"], filters["split"]
     chain, halves = weight[:, :NODES], weight[split][:, NODES:].sum(axis=1)
     best = chain.argmax(axis=1)
     apart = np.abs(filters["mean"][:, :NODES, :2] - filters["mean"][np.arange(len(best)), best][:, None, :2])
-    std, mean = np.sqrt(np.diag(filters["overall_covariance"][-1])), filters["overall_mean"][-1]
+    overall = filters["overall_mean"]
+    std, mean = np.sqrt(np.diag(filters["overall_covariance"][-1])), overall[-1]
+    rolling, trust = filters["rolling"], filters["trust"]
     return {
         "least probabilities": geometric(chain),
         "penalty": float(np.abs(filters["penalty"][:, :NODES]).mean()),
@@ -161,7 +236,21 @@ def inside(filters: dict[str, np.ndarray]) -> dict[str, float]:
         "sharpness": float(np.exp(mean[NodeState.SHAPE])),
         **{f"std {state.name}": float(std[state]) for state in NodeState},
         **{f"mean {state.name}": float(mean[state]) for state in NodeState},
+        **{state.name: float(np.sqrt(np.mean(overall[:, state] ** 2))) for state in NodeState},
+        "stands": float(rolling["stands"].mean()),
+        "v_x told by wheels": float(np.isfinite(rolling["ahead"]).mean()),
+        "v_y told by an axle": float(np.isfinite(rolling["left"]).mean()),
+        "std of wheels' v_x": known(rolling["ahead_std"], rolling["ahead"]),
+        "std of the axle's v_y": known(rolling["left_std"], rolling["left"]),
+        "oddity": float(trust["odd"].mean()),
+        "distrust": float(trust["distrust"].mean()),
     }
+
+
+def known(values: FloatArray, where: FloatArray) -> float:
+    """Mean of what is told, 0 of none."""
+    there = np.isfinite(where)
+    return float(values[there].mean()) if there.any() else 0.0
 
 
 def geometric(values: FloatArray) -> float:
@@ -169,10 +258,14 @@ def geometric(values: FloatArray) -> float:
     return float(np.exp(np.log(np.maximum(values, 1e-12)).mean())) if values.size else 0.0
 
 
+def test_every_constant_has_its_move() -> None:
+    assert set(MOVES) == set(Constants._fields)
+
+
 @pytest.mark.parametrize("name", MOVES)
 def test_a_constant_moves_what_it_is_for_in_its_direction_and_by_its_size(name: str) -> None:
     move = MOVES[name]
-    usual, changed = (figures(one, move.times if one else 1.0)[move.figure, move.drive] for one in (None, name))
+    usual, changed = (figures(move.drive, *one)[move.figure] for one in ((None, 1.0), (name, move.times)))
     assert usual > 0.0
     ratio = changed / usual
     assert ratio >= move.ratio if move.ratio > 1.0 else ratio <= move.ratio, f"{move.figure} times {ratio:.3f}"
