@@ -81,7 +81,8 @@ def report(memory: MixtureMemory, design: MixtureDesign, output: FloatArray) -> 
         return
     last = memory.last
     vx, vy = velocity(memory)
-    var_x = memory.overall_covariance[NodeState.VX, NodeState.VX] + (design.constants.radius_std * vx) ** 2
+    constants, var_x = design.constants, memory.overall_covariance[NodeState.VX, NodeState.VX]
+    var_x += (constants.radius_std * vx) ** 2 + (constants.common_lag * last.ax) ** 2  # what no sensor tells
     var_y = memory.overall_covariance[NodeState.VY, NodeState.VY]
     var_rate = last.yaw_rate_var + YAW_RATE_OFFSET_STD**2
     write_motion(output, vx, vy, last.yaw_rate, var_x, var_y, var_rate)

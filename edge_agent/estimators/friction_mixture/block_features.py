@@ -17,12 +17,11 @@ from edge_agent.dynamics.parameters import Parameter, body
 from edge_agent.dynamics.slip import SLOWEST_M_S, wheel_position
 from edge_agent.dynamics.wheel import force_from_torque
 from edge_agent.estimators import flags
-from edge_agent.estimators.friction_mixture.constants import Constants
+from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.drive_split import front_share
 from edge_agent.estimators.friction_mixture.memory import BlockSums, MixtureMemory
 from edge_agent.estimators.friction_mixture.workspace import BlockFeatures
-from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 from schemas.thresholds import GRAVITY
@@ -30,7 +29,8 @@ from schemas.thresholds import GRAVITY
 SLOWEST_COMPARED_M_S = 1.0  # slips of two wheels are compared at this speed at least: speeds differ by noise below
 NO_FORCE_SHARE = 0.3  # force over load that may act where nobody has measured any
 ROUNDING = 1 / math.sqrt(12.0)  # standard deviation of rounding to a step
-CERTAIN = 4.0  # standard deviations of wheel-speed noise that a difference between the sides must exceed
+CERTAIN = 4.0  # standard deviations of wheel-speed noise that a difference between the sides must exceed,
+LIKELY = 2.0  # and of what is unknown of the radii
 
 
 @compiled
@@ -55,7 +55,7 @@ def block_features(memory: MixtureMemory, design: MixtureDesign, features: Block
     _noise(memory, design, features)
     features.demand = demand(features)
     _inform(constants, features)
-    features.asymmetry = asymmetry(row, constants, block, features)
+    features.asymmetry = asymmetry(memory, constants, features)
     return health
 
 
@@ -194,19 +194,26 @@ def _inform(constants: Constants, features: BlockFeatures) -> None:
 
 
 @compiled
-def asymmetry(row: FloatArray, constants: Constants, block: BlockSums, features: BlockFeatures) -> float:
-    """Largest difference between the sides of an axle of slip (as linear force over load) not asked for by force."""
-    most, speed = 0.0, max(features.speed, SLOWEST_COMPARED_M_S)
+def asymmetry(memory: MixtureMemory, constants: Constants, features: BlockFeatures) -> float:
+    """Largest difference between the sides of an axle of slip (as linear force over load) not asked for by force.
+
+    Wheels of unlike radius differ for ever: what is believed of them is taken off, and what may be is allowed for.
+    """
+    row, block, radius, first = memory.row, memory.block, memory.overall_mean, NodeState.RADIUS
+    most, speed, covariance = 0.0, max(features.speed, SLOWEST_COMPARED_M_S), memory.overall_covariance
     for axle in range(2):
         left, right = 2 * axle, 2 * axle + 1
         track = row[Parameter.TRACK_FRONT] if axle == 0 else row[Parameter.TRACK_REAR]
         turning = track * features.yaw_rate * features.steer_cos[left]
-        slip = (features.rolling[right] - features.rolling[left] - turning) / speed
+        i, j = first + left, first + right
+        faster = features.rolling[right] * (1.0 + radius[j]) - features.rolling[left] * (1.0 + radius[i])
+        slip = (faster - turning) / speed
+        unknown = math.sqrt(max(covariance[i, i] + covariance[j, j] - 2.0 * covariance[i, j], 0.0))
         samples = max(min(block.counts[S.OMEGA + left], block.counts[S.OMEGA + right]), 1)
         noise = constants.omega_noise * row[Parameter.RADIUS] / speed * math.sqrt(2.0 / samples)
         apart = abs(row[Parameter.SLOPE_X] * slip - features.force[right] + features.force[left])
         if not math.isnan(apart):
-            most = max(most, apart - CERTAIN * row[Parameter.SLOPE_X] * noise)
+            most = max(most, apart - row[Parameter.SLOPE_X] * (CERTAIN * noise + LIKELY * unknown))
     return most
 
 

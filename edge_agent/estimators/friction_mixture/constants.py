@@ -12,6 +12,7 @@ from typing import NamedTuple
 NODES = 20  # friction hypotheses, equidistant in the square root of mu: fine where mu is small
 SPLIT_NODES = 30  # hypotheses of a split road: a low and a high friction, either way round
 ALL_NODES = NODES + SPLIT_NODES
+PATCH_NODES = 5  # the first nodes, of ice: mu up to .195
 CURVED = 4  # states in which the rows of measurement are not linear
 STRAIGHT = 10  # states up to this one are differentiated one by one; the others follow from these and from speeds
 ACTIVE = 16  # states that the rows see within a block
@@ -53,6 +54,8 @@ class Constants(NamedTuple):
     hazard: float = 1 / 190
     # [1/m] slow change to a neighbouring node
     diffusion: float = 0.003
+    # [m] in which ice may begin unnoticed: patches are 20 to 100 m long
+    patch_length: float = 18.0
     # [1] share of roads whose two sides differ
     split_prior: float = 0.05
     # [1/m] end of such a road
@@ -72,7 +75,7 @@ class Constants(NamedTuple):
     steady_time: float = 2.0
     # [1] change of force over load from the usual at which half of the evidence is new
     steady_half: float = 0.03
-    # [1] evidence left where nothing changes: the error of curve and offsets is then the same again
+    # [1] evidence left, and weight of the axles, where nothing changes: errors of curve and offsets are the same again
     steady_share: float = 0.15
     # [1] slope of the tyre curve below which a wheel counts as sliding
     sliding_slope: float = 0.3
@@ -142,11 +145,13 @@ class Constants(NamedTuple):
     slope_time: float = 60.0
     # [rad] offset of steering and toe: 1 to 17 mrad on logs of real cars, mostly below 4
     steer_std: float = 0.004
-    # [1] radius of a wheel against the others: tyre pressure and wear
-    wheel_std: float = 0.004
-    # [1] radius of all wheels together: nominal radii of real cars are 1 % off; nothing here tells it
-    radius_std: float = 0.01
-    # [s] lag of wheel speeds and of steering: devices up to 60 ms late
+    # [1] radius of a wheel against the others: pressure, wear, and axles whose tyres differ (1 % on BMW M8 and AV-21)
+    wheel_std: float = 0.008
+    # [1] radius of all wheels together: nominal radii of real cars are up to 1.5 % off; nothing here tells it
+    radius_std: float = 0.0125
+    # [s] lag that all devices share: 60 ms are common, .2 s are met; no sensor tells it, it is in the spread of v_x
+    common_lag: float = 0.05
+    # [s] lag of wheel speeds and of steering against the inertial sensors: devices up to 60 ms late
     lag_std: float = 0.025
 
     # [m/s/s^.5] white noise of a_x and what is not constant in its offset (vehicle)
@@ -222,6 +227,6 @@ class Constants(NamedTuple):
     # [1] R of the axles at full distrust, over R
     distrust_noise: float = 1000.0
     # [m/s/s^.5] walk of v_y at full distrust
-    distrust_drift: float = 1.5
+    distrust_drift: float = 3.0
     # [s] in which at full distrust what was learned of vehicle, sensors and road goes back to the prior
     distrust_forget: float = 5.0

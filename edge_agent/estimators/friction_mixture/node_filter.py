@@ -58,7 +58,8 @@ class NodeUpdate(NamedTuple):
 def update_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int, inflation: float) -> NodeUpdate:
     """Cubature update of node j with R times `inflation`: its mean and scratch.root[j] are changed.
 
-    R of the axles is larger still where they are distrusted.
+    R of the axles is larger still where they are distrusted, and where nothing changes: what is wrong of curve and
+    offsets is the same again, and taken for noise it would be averaged into stiffness and shape.
 
     Writes its innovation and its theoretical variance without the inflation.
     """
@@ -68,7 +69,7 @@ def update_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, 
     node.gained.x, node.gained.y = gained_velocity(features.gain, mean)
     price = linearize(memory.row, design, side_mu, mean, features, node)
     spread(memory.row, design, side_mu, mean, root, features, node)
-    across = inflation * (1.0 + constants.distrust_noise * memory.trust.distrust)
+    across = inflation * (1.0 + constants.distrust_noise * memory.trust.distrust) / features.novelty
     plain = square = 0.0
     for r in range(ROWS):
         innovation[r] = -node.residual[r]
@@ -101,12 +102,19 @@ def linearize(
     features: BlockFeatures,
     node: NodeWorkspace,
 ) -> float:
-    """Fill node.derivative, leave node.force as at the mean, and return the price of sliding."""
+    """Fill node.derivative, leave node.force as at the mean, and return the price of sliding.
+
+    Leak and offset of a_y move the same forces, so that one derivative tells the other.
+    """
     constants, curve = design.constants, design.curve
-    price = 0.0
+    price, all_torques = 0.0, True
+    for wheel in range(4):
+        all_torques = all_torques and features.force_unit[wheel] == 0.0
     for i in range(STATES):
         node.point[i] = mean[i]
     for state in range(STRAIGHT, CURVED - 1, -1):  # at the mean, then with each moved, STEER last
+        if state == NodeState.LEAK_Y or (state == NodeState.BIAS_X and all_torques):
+            continue
         step = 0.0 if state == STRAIGHT else 0.5 * design.nominal.std[state]
         if state < STRAIGHT:
             node.point[state] += step
@@ -123,8 +131,14 @@ def linearize(
             for r in range(ROWS):
                 out[r] = (out[r] - node.residual[r]) / step
     _by_wheel_speeds(row, design, side_mu, mean, features, node)
+    derivative = node.derivative
     for r in range(ROWS):
-        node.derivative[NodeState.LAG_STEER, r] = node.derivative[NodeState.STEER, r] * features.steer_rate
+        axle = r // 2 if r < 4 else r - 4
+        across = -features.side_leak[axle] / features.side_unit[axle]
+        derivative[NodeState.LEAK_Y, r] = 0.0 if math.isnan(across) else derivative[NodeState.BIAS_Y, r] * across
+        derivative[NodeState.LAG_STEER, r] = derivative[NodeState.STEER, r] * features.steer_rate
+        if all_torques:  # an offset of a_x is then no force
+            derivative[NodeState.BIAS_X, r] = 0.0
     return price
 
 
@@ -202,7 +216,10 @@ def spread(
     features: BlockFeatures,
     node: NodeWorkspace,
 ) -> None:
-    """Fill node.deviation (A), node.residual with the predicted rows and node.nonlinearity with its variance."""
+    """Fill node.deviation (A), node.residual with the predicted rows and node.nonlinearity with its variance.
+
+    root is lower triangular.
+    """
     scale = math.sqrt(CURVED)
     for r in range(ROWS):
         node.residual[r] = node.nonlinearity[r] = 0.0
@@ -215,20 +232,18 @@ def spread(
             find_slips(row, design.constants, mean, features, node)
             find_residuals(design.curve, side_mu, features, node, out)
         for r in range(ROWS):
-            total = 0.5 * (node.ahead[r] - node.behind[r]) / scale
-            for state in range(CURVED, ACTIVE):
-                total += node.derivative[state, r] * root[state, column]
-            node.deviation[r, column] = total
+            node.deviation[r, column] = 0.5 * (node.ahead[r] - node.behind[r]) / scale
             node.middle[column, r] = 0.5 * (node.ahead[r] + node.behind[r])
             node.residual[r] += node.middle[column, r] / CURVED
     for r in range(ROWS):
         for column in range(CURVED):
             node.nonlinearity[r] += (node.middle[column, r] - node.residual[r]) ** 2 / CURVED
         for column in range(CURVED, ACTIVE):
-            total = 0.0
-            for state in range(CURVED, ACTIVE):
-                total += node.derivative[state, r] * root[state, column]
-            node.deviation[r, column] = total
+            node.deviation[r, column] = 0.0
+        for state in range(CURVED, ACTIVE):
+            by_state = node.derivative[state, r]
+            for column in range(state + 1):
+                node.deviation[r, column] += by_state * root[state, column]
 
 
 @compiled

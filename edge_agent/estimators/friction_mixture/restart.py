@@ -21,6 +21,7 @@ from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 
+REST_M_S, REST_V_STD = 0.1, 0.05  # [m/s] wheels that turn slower at the first sample are those of a car at rest
 YAW_STD = 0.002  # [rad/s] white noise of a gyroscope sample
 UNKNOWN_YAW_VAR = 1.0  # [rad^2/s^2] without a gyroscope
 GAP_ACCELERATION = 2.0  # [m/s^2] that may have acted during a silence
@@ -55,8 +56,9 @@ def start(memory: MixtureMemory, design: MixtureDesign, time: float, sample: Flo
     memory.overall_mean[NodeState.VX] = speed if known else 0.0
     forget_vehicle(memory)
     covariance = memory.overall_covariance
-    covariance[NodeState.VX, NodeState.VX] = (FIRST_V_STD if known else UNKNOWN_V_STD) ** 2
-    covariance[NodeState.VY, NodeState.VY] = FIRST_V_STD**2
+    first = REST_V_STD if speed < REST_M_S else FIRST_V_STD
+    covariance[NodeState.VX, NodeState.VX] = (first if known else UNKNOWN_V_STD) ** 2
+    covariance[NodeState.VY, NodeState.VY] = first**2
     for j in range(NODES):
         memory.weight[j] = memory.visit_weight[j] = design.prior[j]
         put(memory.mean[j], memory.overall_mean)
@@ -181,6 +183,7 @@ def _begin_anew(memory: MixtureMemory, design: MixtureDesign, speed: float) -> i
         memory.actual[group] = memory.theoretical[group]
         memory.factor[group] = 1.0
     put_split_to_sleep(memory)
+    clear(memory.patch)
     for j in range(NODES):
         memory.weight[j] = memory.visit_weight[j] = design.prior[j]
     return flags.RESET

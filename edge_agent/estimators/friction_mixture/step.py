@@ -14,9 +14,10 @@ from edge_agent.estimators import flags
 from edge_agent.estimators.common.excitation import note_excitation
 from edge_agent.estimators.common.motion import SLIDING_THETA
 from edge_agent.estimators.friction_mixture.block_features import block_features
-from edge_agent.estimators.friction_mixture.constants import NodeState
+from edge_agent.estimators.friction_mixture.constants import NODES, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.drive_split import learn_drive
+from edge_agent.estimators.friction_mixture.ice_patch import drive_onto, told_lower
 from edge_agent.estimators.friction_mixture.intake import begin_block, take_sample
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles
 from edge_agent.estimators.friction_mixture.mixing import awake, drive_on, match_moments, wake_or_sleep
@@ -56,6 +57,7 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
     watch_wheels(memory, design.constants, features)
     wake_or_sleep(memory, design, scratch)
     drive_on(memory, design, scratch, features.speed * features.duration)
+    drive_onto(memory, design, features.speed * features.duration)
     measure(memory, design, scratch)
     judge(memory, design, features.duration)
     predict(memory, design, scratch)
@@ -117,6 +119,8 @@ def _find_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scratc
         _find_side(memory, design, scratch, BOTH, memory.friction)
     else:
         find_quantiles(design, memory.weight, memory.friction)
+        lower = memory.friction.lower
+        memory.friction.lower = told_lower(memory.patch, design, memory.weight[:NODES], lower, scratch.blended)
         for side in (memory.friction_left, memory.friction_right):
             both = memory.friction
             side.median, side.lower, side.upper = both.median, both.lower, both.upper
@@ -128,6 +132,7 @@ def _find_side(
 ) -> None:  # fmt: skip
     project(memory.weight, design.sides.share[side], scratch.projected)
     find_quantiles(design, scratch.projected, friction)
+    friction.lower = told_lower(memory.patch, design, scratch.projected, friction.lower, scratch.blended)
 
 
 @compiled

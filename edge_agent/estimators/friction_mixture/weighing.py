@@ -9,6 +9,7 @@ from edge_agent.estimators.friction_mixture.constants import Constants, NodeStat
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.friction_grid import reweigh
 from edge_agent.estimators.friction_mixture.grip_guard import guard
+from edge_agent.estimators.friction_mixture.ice_patch import refute
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.mixing import awake, reset_diverged
 from edge_agent.estimators.friction_mixture.node_filter import update_node
@@ -31,6 +32,7 @@ def measure(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> N
     temper(memory, design, scratch)
     weight = memory.weight[: awake(memory)]
     reset_diverged(memory.mean, scratch.root, weight, design.constants)
+    refute(memory.patch, weight, scratch.log_likelihood)
     reweigh(weight, scratch.log_likelihood)
     reweigh(memory.visit_weight[: awake(memory)], scratch.log_likelihood)
     adapt(memory, design, scratch)
@@ -44,6 +46,7 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
     for group in range(2):
         scratch.actual_sum[group] = scratch.theoretical_sum[group] = 0.0
     top, nis, rows = -math.inf, 0.0, 0
+    scratch.features.novelty = novelty(memory.usual_force, scratch.features, design.constants)
     for j in range(count):
         factorize(memory.covariance[j], scratch.root[j], LEAST_VARIANCE)
         found = update_node(memory, design, scratch, j, inflation)
@@ -78,7 +81,7 @@ def temper(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> No
         best = max(best, scratch.log_likelihood[j])
     need = (constants.demand_half / max(features.demand, LEAST_DEMAND)) ** constants.demand_power
     blind = memory.block.counts[S.AX] == 0 or math.isnan(features.side[0] + features.side[1])
-    share = novelty(memory.usual_force, features, constants) / (1.0 + need)
+    share = features.novelty / (1.0 + need)
     moving = slip_meaning(features, memory.overall_mean[NodeState.VX]) * (1.0 - memory.trust.distrust)
     for j in range(count):
         loss = scratch.log_likelihood[j] - best

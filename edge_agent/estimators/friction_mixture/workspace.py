@@ -23,6 +23,7 @@ class BlockFeatures:
     sin: float
     gain: VelocityGain  # mean over the block
     yaw_rate: float  # mean [rad/s]
+    novelty: float  # share of the forces that is new [1]
     demand: float  # largest force over load of any wheel [1]
     change: float  # measured a_x, mean [m/s^2]
     steer_rate: float  # of the front wheels [rad/s]
@@ -92,6 +93,7 @@ class Scratch:
     velocity_row: Annotated[FloatArray, STATES]  # deviation of a velocity in the axes of a root's columns
     projected: Annotated[FloatArray, NODES]
     expected: Annotated[FloatArray, NODES]
+    blended: Annotated[FloatArray, NODES]
 
 
 class MixtureContext:

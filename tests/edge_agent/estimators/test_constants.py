@@ -47,10 +47,11 @@ MOVES = {
     "window": Move("adaptation", "acceleration", 0.8),  # R follows the spin later
     # the road
     "hazard": Move("least probabilities", "j-turn", 1.5),
+    "patch_length": Move("lower", "turn and straight", 1.1),  # ice comes later
     "diffusion": Move("width", "acceleration", 1.15),
-    "split_prior": Move("split probability", "turn and straight", 2.0),
+    "split_prior": Move("one friction's probability", "split-braking", 0.85),
     "split_hazard": Move("one friction's probability", "split-braking", 1.5),
-    "split_asymmetry": Move("split nodes awake", "turn and straight", 0.5),
+    "split_asymmetry": Move("split probability", "split-braking", 0.97),  # they wake later
     # how much a block counts
     "demand_half": Move("width", "constant-radius", 1.5),  # the same force tells less
     "demand_power": Move("penalty", "acceleration", 0.5),  # above the threshold all is evidence, nothing is charged
@@ -96,6 +97,7 @@ MOVES = {
     "steer_std": Move("std STEER", "constant-radius", 1.5),
     "wheel_std": Move("std RADIUS", "standing", 2.5),
     "radius_std": Move("vx_std", "turn and straight", 2.5),
+    "common_lag": Move("vx_std", "stopping", 1.5),
     "lag_std": Move("std LAG_WHEEL", "standing", 2.5),
     "drift_x": Move("std VX", "slalom", 1.2),
     "drift_y": Move("vy_std", "gaining-slalom", 1.6),
