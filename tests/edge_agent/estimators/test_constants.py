@@ -47,7 +47,7 @@ MOVES = {
     "window": Move("adaptation", "acceleration", 0.8),  # R follows the spin later
     # the road
     "hazard": Move("least probabilities", "j-turn", 1.5),
-    "patch_length": Move("lower", "turn and straight", 1.1),  # ice comes later
+    "patch_length": Move("lower", "slalom", 1.015),  # ice comes later
     "diffusion": Move("width", "acceleration", 1.15),
     "split_prior": Move("one friction's probability", "split-braking", 0.85),
     "split_hazard": Move("one friction's probability", "split-braking", 1.5),
@@ -85,15 +85,15 @@ MOVES = {
     "leak_y_mean": Move("mean LEAK_Y", "acceleration", 2.0),
     "leak_y_std": Move("std LEAK_Y", "acceleration", 2.0),
     "leak_x": Move("vx_std", "braking without torque", 1.04),
-    "leak_time": Move("std LEAK_Y", "constant-radius", 1.02, LESS),
+    "leak_time": Move("std LEAK_Y", "pulses", 1.04, LESS),
     "bias_x_std": Move("std BIAS_X", "stopping", 0.7, LESS),
     "bias_y_std": Move("std BIAS_Y", "constant-radius", 0.7, LESS),
     "bias_time": Move("std BIAS_Y", "turn and straight", 1.08, LESS),
     "slope_std": Move("std SLOPE", "braking", 1.6),
     "slope_length": Move("std SLOPE", "pulses", 1.08, LESS),  # it is another one sooner
     "bank_std": Move("std BANK", "j-turn", 0.5, LESS),
-    "bank_length": Move("std BANK", "constant-radius", 1.08),
-    "slope_time": Move("std BANK", "standing", 1.06),
+    "bank_length": Move("std BANK", "constant-radius", 0.87, LESS),
+    "slope_time": Move("std BANK", "standing", 0.96, LESS),
     "steer_std": Move("std STEER", "constant-radius", 1.5),
     "wheel_std": Move("std RADIUS", "standing", 2.5),
     "radius_std": Move("vx_std", "turn and straight", 2.5),
