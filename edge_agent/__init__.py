@@ -1,1 +1,47 @@
-"""The software of one vehicle: sensors in, friction evidence out."""
+"""The software of one vehicle: sensors in, friction evidence out.
+
+    import edge_agent
+    log, vehicle = edge_agent.read_log("drive.parquet"), edge_agent.load_vehicle("drive.json")
+    print(edge_agent.estimate(log, vehicle).to_pandas()[["t", "mu", "mu_lower", "mu_upper"]])
+
+The names of `__all__` are what other programs may rely on; they are loaded when they are first asked for.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+_FACE = {
+    "ESTIMATORS": "edge_agent.estimators",
+    "Estimates": "edge_agent.estimators",
+    "EstimatorBank": "edge_agent.estimators",
+    "Memberships": "edge_agent.adaptation.memberships",
+    "SignalLog": "edge_agent.inputs.signal_log",
+    "Vehicle": "schemas.vehicle",
+    "InputError": "schemas.errors",
+    "CHANNELS": "schemas.signals",
+    "Block": "edge_agent.inputs.block",
+    "estimate": "edge_agent.app.library",
+    "estimators": "edge_agent.app.library",
+    "load_memberships": "edge_agent.app.library",
+    "load_vehicle": "edge_agent.app.library",
+    "make_bank": "edge_agent.app.library",
+    "plot": "edge_agent.app.library",
+    "read_log": "edge_agent.app.library",
+    "simulate_manoeuvre": "edge_agent.lab.simulation",
+    "to_table": "edge_agent.app.library",
+}
+__all__ = sorted(_FACE)
+
+
+def __getattr__(name: str) -> Any:  # noqa: ANN401 whatever stands behind a name
+    """A name of the face."""
+    if name not in _FACE:
+        raise AttributeError(f"edge_agent has no {name!r}; its face is {', '.join(__all__)}")
+    return getattr(import_module(_FACE[name]), name)
+
+
+def __dir__() -> list[str]:
+    """The face."""
+    return __all__

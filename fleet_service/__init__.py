@@ -1,1 +1,37 @@
-"""The fleet service: many vehicles' evidence in, one map of grip out."""
+"""The fleet service: many vehicles' evidence in, one map of grip out.
+
+    import fleet_service
+    print(fleet_service.ask_archive("archive", "worst").to_pandas())
+    print(fleet_service.ask_map("tcp/127.0.0.1:7447", bbox=(11.9, 57.6, 12.1, 57.8)).to_pandas())
+
+The names of `__all__` are what other programs may rely on; they are loaded when they are first asked for.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+_FACE = {
+    "QUESTIONS": "fleet_service.analytics.questions",
+    "Question": "fleet_service.analytics.questions",
+    "QueryEngine": "fleet_service.analytics.engines",
+    "ask_archive": "fleet_service.analytics.library",
+    "ask_map": "fleet_service.client.library",
+    "decode_tile": "schemas.wire.tile",
+    "map_of_archive": "fleet_service.analytics.library",
+    "write_answer": "fleet_service.analytics.library",
+}
+__all__ = sorted(_FACE)
+
+
+def __getattr__(name: str) -> Any:  # noqa: ANN401 whatever stands behind a name
+    """A name of the face."""
+    if name not in _FACE:
+        raise AttributeError(f"fleet_service has no {name!r}; its face is {', '.join(__all__)}")
+    return getattr(import_module(_FACE[name]), name)
+
+
+def __dir__() -> list[str]:
+    """The face."""
+    return __all__

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+from edge_agent.adaptation.memberships import Memberships
 from edge_agent.app.estimates_file import EstimatesFile
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.inputs.correct import corrected
@@ -56,7 +57,9 @@ def beside(log: Path) -> Path:
     return log.with_suffix(".json")
 
 
-def backfill(tasks: Sequence[Task], estimator: str, jobs: int) -> Iterator[Outcome]:
+def backfill(
+    tasks: Sequence[Task], estimator: str, jobs: int, memberships: Memberships | None = None
+) -> Iterator[Outcome]:
     """Estimate all drives, `jobs` at a time; outcomes as they come. A bad drive stops no other.
 
     Raises:
@@ -65,15 +68,15 @@ def backfill(tasks: Sequence[Task], estimator: str, jobs: int) -> Iterator[Outco
     if jobs < 1:
         raise InputError("jobs", f"{jobs} is below 1", "give at least one job")
     with ThreadPoolExecutor(jobs) as pool:
-        for future in as_completed([pool.submit(estimate, task, estimator) for task in tasks]):
+        for future in as_completed([pool.submit(estimate, task, estimator, memberships) for task in tasks]):
             yield future.result()
 
 
-def estimate(task: Task, estimator: str) -> Outcome:
+def estimate(task: Task, estimator: str, memberships: Memberships | None = None) -> Outcome:
     """Estimate one drive."""
     try:
         vehicle = load_vehicle(task.vehicle)
-        bank, log = bank_of(estimator, [vehicle]), read_log(task.log)
+        bank, log = bank_of(estimator, [vehicle], memberships), read_log(task.log)
         log = replace(log, signals=corrected(log.signals, vehicle))
         with EstimatesFile(task.out) as file:
             for block in log.blocks(0):

@@ -1,18 +1,42 @@
-"""Estimator banks as the commands make them: by name, with the memberships that come with the package."""
+"""Estimator banks as the commands make them: by name, tuned as shipped or as a file says, or from another package."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+from edge_agent.adaptation.memberships import Memberships
 from edge_agent.app.tuned_memberships import shipped
-from edge_agent.estimators import TUNED, EstimatorBank, create
+from edge_agent.estimators import ESTIMATORS, TUNED, EstimatorBank, create
+from schemas.errors import InputError
+from schemas.runtime import plugins
 from schemas.vehicle import Vehicle
 
 
-def bank_of(estimator: str, vehicles: Sequence[Vehicle]) -> EstimatorBank:
+def known() -> dict[str, str]:
+    """All estimators by name with a line about each, those of other packages too."""
+    others = {name: f"from {point.value}" for name, point in plugins.found(plugins.ESTIMATORS).items()}
+    return others | ESTIMATORS
+
+
+def bank_of(estimator: str, vehicles: Sequence[Vehicle], memberships: Memberships | None = None) -> EstimatorBank:
     """A bank of estimators by name, one per vehicle.
 
+    Args:
+        estimator: a key of `known()`.
+        vehicles: nominal vehicles, N of them.
+        memberships: fuzzy sets in place of the shipped ones.
+
     Raises:
-        InputError: no such estimator, no vehicle, or its tuned memberships cannot be read.
+        InputError: no such estimator, no vehicle, memberships for an estimator that has none, or its tuned ones cannot
+            be read.
     """
-    return create(estimator, vehicles, memberships=shipped(TUNED[estimator]) if estimator in TUNED else None)
+    if estimator not in ESTIMATORS and estimator in plugins.found(plugins.ESTIMATORS):
+        if memberships is not None:
+            raise InputError("memberships", f"{estimator} has no fuzzy sets to replace", "leave them out")
+        bank: EstimatorBank = plugins.loaded(plugins.ESTIMATORS, estimator)(vehicles)
+        return bank
+    if estimator not in ESTIMATORS:
+        raise InputError("estimator", f"{estimator!r} is unknown", f"choose one of {', '.join(known())}")
+    if memberships is None and estimator in TUNED:
+        memberships = shipped(TUNED[estimator])
+    return create(estimator, vehicles, memberships=memberships)

@@ -29,6 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", type=Path, nargs="+", help="signal log (Parquet)")
     parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON) (default: LOG.json beside LOG.parquet)")
     parser.add_argument("--estimator", help="estimator by name (default: the configuration's, aco-fckf)")
+    parser.add_argument("--memberships", type=Path, metavar="FILE", help="fuzzy sets that tune wrote")
     parser.add_argument(
         "--out", type=Path, required=True, help="estimates to write (.parquet, .csv); of several logs, a folder"
     )
@@ -48,6 +49,7 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.app.estimates_file import EstimatesFile
     from edge_agent.app.estimator_factory import bank_of
     from edge_agent.app.plausible import IMPLAUSIBLE, Plausibility
+    from edge_agent.app.tuned_memberships import load as load_memberships
     from edge_agent.cli.common import insist_on_sound
     from edge_agent.inputs.correct import corrected
     from edge_agent.inputs.signal_log import read_log
@@ -57,17 +59,18 @@ def run(args: argparse.Namespace) -> int:
 
     config = load(args.config, AgentConfig)
     estimator = args.estimator or config.estimator
+    memberships = load_memberships(args.memberships).memberships if args.memberships else None
     if len(args.log) > 1 or args.out.is_dir():
         if args.publish:
             raise InputError(
                 "publish", f"{len(args.log)} logs into a folder", "publish one log, to one file, at a time"
             )
         tasks = tasks_of(args.log, args.vehicle, args.out)  # refuses to write over a log
-        return _print_outcomes(backfill(tasks, estimator, args.jobs), len(tasks))
+        return _print_outcomes(backfill(tasks, estimator, args.jobs, memberships), len(tasks))
     path = args.log[0]
     commandline.not_an_input("out", args.out, [path, args.vehicle or beside(path)])
     vehicle = load_vehicle(args.vehicle or beside(path))
-    bank = bank_of(estimator, [vehicle])
+    bank = bank_of(estimator, [vehicle], memberships)
     log = read_log(path)
     start_ns = _start(args.start, log)
     log = replace(log, signals=corrected(log.signals, vehicle))

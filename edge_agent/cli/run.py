@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--source", action="append",
         help="'simulated' (default), a signal log (Parquet), or live ones, as often as there are sources: "
-        "can:INTERFACE/CHANNEL, ros2:ENDPOINT, vss:HOST:PORT, gpsd:HOST:PORT",
+        "can:INTERFACE/CHANNEL, ros2:ENDPOINT, vss:HOST:PORT, gpsd:HOST:PORT, or NAME:ADDRESS of a package of yours",
     )  # fmt: skip
     parser.add_argument("--profile", help="which live signal is which channel: a file, or a shipped one")
     parser.add_argument("--dbc", type=Path, help="CAN database (default: the profile's)")
@@ -45,11 +45,19 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.inputs.live.sources import is_live
     from schemas.config import AgentConfig, load
     from schemas.errors import InputError
+    from schemas.runtime import plugins
+    from schemas.vehicle import load_vehicle
 
     config = load(args.config, AgentConfig)
     sources = args.source or [SIMULATED]
     if all(is_live(source) for source in sources):
         return _live(args, sources, config)
+    if len(sources) == 1 and (kind := sources[0].partition(":")[0]) in plugins.found(plugins.SOURCES):
+        vehicle = load_vehicle(_vehicle_file(args))
+        blocks = plugins.loaded(plugins.SOURCES, kind)(sources[0].partition(":")[2])
+        return drive_live(
+            [vehicle], [checked_name(args.name or vehicle.name)], blocks, config, args.estimator, args.duration
+        )
     if len(sources) > 1:
         raise InputError("source", f"{', '.join(sources)} do not go together", "name live ones, or one log")
     vehicle, name, blocks = _simulated(args) if sources[0] == SIMULATED else _logged(args, Path(sources[0]))

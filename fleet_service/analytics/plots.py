@@ -33,7 +33,7 @@ def draw(table: pa.Table, name: str, about: str, path: Path) -> None:
     """Draw an answer and write it as the ending of the path says (png, svg, pdf)."""
     figure = Figure(figsize=(8.0, 4.8), layout="constrained")
     if table.num_rows:
-        _DRAWN[name](figure, table)
+        _DRAWN.get(name, _first_two)(figure, table)
     else:
         figure.text(0.5, 0.5, "the answer has no rows", ha="center")
     figure.suptitle(f"{name}: {about}", fontsize=11)
@@ -213,6 +213,14 @@ def _replay(figure: Figure, table: pa.Table) -> None:
         patches = paint(axes, shapes[frame == time], _floats(table, "mu")[frame == time])
         axes.set_title(f"{np.datetime64(time, 'us').astype('datetime64[s]')} UTC", fontsize=9)
     figure.colorbar(patches, ax=panels, label=f"{MU}; hatched: {UNKNOWN}", shrink=0.8)
+
+
+def _first_two(figure: Figure, table: pa.Table) -> None:
+    """Of a question that another package brings: its first two numbers against each other."""
+    numbers = [f.name for f in table.schema if pa.types.is_floating(f.type) or pa.types.is_integer(f.type)][:2]
+    axes = figure.subplots()
+    axes.plot(*(_floats(table, name) for name in numbers), "o", color=_DARK)
+    axes.set(xlabel=numbers[0], ylabel=numbers[-1])
 
 
 _DRAWN: Final[dict[str, Callable[[Figure, pa.Table], None]]] = {

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from fleet_service.analytics.options import Options
-from fleet_service.analytics.questions import QUESTIONS, Question
+from fleet_service.analytics.questions import Question, known, question_of
 from fleet_service.cli.common import add_part, span
 from schemas.config import moment
 from schemas.errors import InputError
@@ -25,8 +25,8 @@ USUAL_VEHICLES: Final = 2
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.description = "; ".join(f"{question.name}: {question.about}" for question in QUESTIONS.values())
-    parser.add_argument("question", metavar="NAME", help=" | ".join(QUESTIONS))
+    parser.description = "; ".join(f"{question.name}: {question.about}" for question in known().values())
+    parser.add_argument("question", metavar="NAME", help=" | ".join(known()))
     parser.add_argument("--archive", metavar="DIR", type=Path, required=True, help="what waits in its log is compacted")
     add_part(parser)
     parser.add_argument("--out", metavar="FILE", type=Path, help=f"ends in {', '.join(ENDINGS)}")
@@ -70,9 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _checked(arguments: argparse.Namespace) -> Question:
     """The question; all that can be said before anything is computed is said now."""
-    question = QUESTIONS.get(arguments.question)
-    if question is None:
-        raise InputError("question", f"{arguments.question!r} is none", f"use one of {', '.join(QUESTIONS)}")
+    question = question_of(arguments.question)
     if arguments.out is not None:
         commandline.ending("out", commandline.out_folder("out", arguments.out), ENDINGS)
         if question.colour is None and arguments.out.name.endswith((".html", ".geojson", ".geo.parquet")):

@@ -61,6 +61,17 @@ def ask(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
     return replace(_joined(form, [payload for _, payload in sorted(payloads)]), served=served)
 
 
+def served_table(answer: Answer) -> pa.Table:
+    """The cells of an answer in Arrow.
+
+    Raises:
+        InputError: no service answered.
+    """
+    if not answer.served or answer.table is None:
+        raise InputError("connect", "no service answers for the map", "start one; that is not the same as an empty map")
+    return answer.table
+
+
 def _served(session: zenoh.Session, asked: query.MapQuery) -> bool:
     """Whether any service answers for the map: an empty answer of one is not the silence of none.
 

@@ -79,7 +79,8 @@ ELSEWHERE = {
                "--clock": "test_clocks_that_do_not_meet_are_an_error_with_its_remedy"},
     "replay": {"log": REPLAYED, "--vehicle": REPLAYED, "--estimator": REPLAYED, "--out": REPLAYED, "--config": REPLAYED,
                "--publish": SENT_BY_REPLAY, "--trust": UNFIT, "--name": SENT_BY_REPLAY, "--start": SENT_BY_REPLAY,
-               "--jobs": "test_so_many_drives_are_under_way_at_once"},
+               "--jobs": "test_so_many_drives_are_under_way_at_once",
+               "--memberships": "test_memberships_that_tune_wrote_change_what_replay_says"},
     "check": {"log": FIX, "--vehicle": FIX, "--out": FIX, "--fix": FIX},
     "calibrate": {"log": LEARNED, "--vehicle": LEARNED, "--out": LEARNED, "--trust": LEARNED},
     "run": {"--trust": UNFIT, "--profile": LIVE, "--dbc": LIVE}, "fleet": {},
@@ -119,7 +120,7 @@ def test_every_option_of_every_command_is_in_a_table() -> None:
 def test_the_tests_that_show_an_option_give_it_to_the_command() -> None:
     """In their module, with another value or with none elsewhere; that is read, not run."""
     texts = [path.read_text() for path in sorted(Path(__file__).parent.rglob("test_*.py")) if path != Path(__file__)]
-    texts.append((Path(__file__).parents[1] / "test_commands.py").read_text())
+    texts += [(Path(__file__).parents[1] / f"test_{name}.py").read_text() for name in ("commands", "faces")]
     texts.append(Path(__file__).read_text().partition("def options(")[2])  # behind the tables
     for command, shown in ELSEWHERE.items():
         for option, test in shown.items():

@@ -6,6 +6,9 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from schemas.errors import InputError
+from schemas.runtime import plugins
+
 if TYPE_CHECKING:
     import pyarrow as pa
 
@@ -20,16 +23,20 @@ class Question(NamedTuple):
         about: one line for the help.
         order: column by which the terminal shows rows, descending with a minus in front.
         colour: column that a map colours cells by; None where the answer has no place.
+        answer: what answers it, of a question that another package brings; None: a module here.
     """
 
     name: str
     about: str
     order: str
     colour: str | None
+    answer: Callable[[QueryEngine, Options], pa.Table] | None = None
 
     @property
     def ask(self) -> Callable[[QueryEngine, Options], pa.Table]:
         """What answers it; imported when it is asked, for Ibis is heavy."""
+        if self.answer is not None:
+            return self.answer
         module = import_module(f"fleet_service.analytics.questions.{self.name.replace('-', '_')}")
         found: Callable[[QueryEngine, Options], pa.Table] = module.ask
         return found
@@ -49,3 +56,21 @@ QUESTIONS: Final = {
         Question("replay", "the map as of a moment, or a day of it", "-p_slippery", "mu"),
     )
 }
+
+
+def known() -> dict[str, Question]:
+    """All questions by name, those of other packages too."""
+    others = {name: plugins.loaded(plugins.QUESTIONS, name) for name in plugins.found(plugins.QUESTIONS)}
+    return others | QUESTIONS
+
+
+def question_of(name: str) -> Question:
+    """A question by name.
+
+    Raises:
+        InputError: there is none of that name.
+    """
+    found = known().get(name)
+    if found is None:
+        raise InputError("question", f"{name!r} is none", f"use one of {', '.join(known())}")
+    return found

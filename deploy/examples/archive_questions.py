@@ -1,0 +1,39 @@
+"""The archive in pandas, DuckDB and GeoPandas, beside the same question asked by GripMap.
+
+python deploy/examples/archive_questions.py ARCHIVE FOLDER
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import duckdb
+import geopandas
+import pandas as pd
+
+import fleet_service
+
+
+def main(archive: Path, folder: Path) -> None:
+    """Three ways to the median of the values per cell, and a map for a GIS."""
+    folder.mkdir(parents=True, exist_ok=True)
+    files = f"{archive}/observations/*/*/*.parquet"
+    # A row whose `value` is false says only that mu is at least mu_utilised: it is left out.
+    sql = f"select cell, sector, median(mu) as mu from '{files}' where value group by all"
+    by_duckdb = duckdb.sql(sql).df().set_index(["cell", "sector"]).sort_index()  # type: ignore[union-attr]
+
+    rows = pd.concat(pd.read_parquet(path) for path in sorted(archive.glob("observations/*/*/*.parquet")))
+    by_pandas = rows[rows["value"]].groupby(["cell", "sector"])["mu"].median()
+    print(f"largest difference of the two: {(by_duckdb['mu'] - by_pandas).abs().max():.2g}")
+
+    worst = fleet_service.ask_archive(archive, "worst")
+    print(worst.drop_columns(["members"]).to_pandas().head().to_string(index=False))
+    for ending in ("html", "png", "geo.parquet"):
+        fleet_service.write_answer(worst, "worst", folder / f"worst.{ending}")
+    stretches = geopandas.read_parquet(folder / "worst.geo.parquet")
+    print(f"{len(stretches)} stretches, {stretches.geometry.to_crs(3006).area.sum():.0f} square metres of cells")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2] if len(sys.argv) > 2 else "try/questions"))

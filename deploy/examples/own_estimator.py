@@ -1,0 +1,67 @@
+"""An estimator of one's own: friction is at least what was used, and nothing more is said.
+
+As a plug-in, a package of yours says in its pyproject.toml
+
+    [project.entry-points."gripmap.estimators"]
+    at-least = "my_package:AtLeast"
+
+and `edge-agent replay --estimator at-least`, `run` and `make_bank` know it. Here it is used directly:
+
+python deploy/examples/own_estimator.py
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+import edge_agent
+from edge_agent.estimators.estimates import ONE_FRICTION, Column
+from schemas.signals import S
+from schemas.thresholds import GRAVITY
+
+PRIOR = (0.11, 0.63, 1.14)  # 5 %, 50 %, 95 % of what is believed before anything is known
+
+
+class AtLeast:
+    """A bank: N vehicles side by side; what is kept from call to call is the largest grip used.
+
+    Args:
+        vehicles: nominal vehicles, N of them.
+    """
+
+    def __init__(self, vehicles: Sequence[edge_agent.Vehicle]) -> None:
+        self._used = np.zeros(len(vehicles))
+        self._radius = np.array([vehicle.wheel_radius for vehicle in vehicles])
+
+    def advance(
+        self, t: np.ndarray[Any, Any], signals: np.ndarray[Any, Any], closes: object = None, *, threads: int = 1
+    ) -> edge_agent.Estimates:
+        """t (T, N) [s], signals (T, N, 18) in the order of schemas.signals.CHANNELS; NaN is a missing reading."""
+        del closes, threads  # no visits, one thread
+        values = np.zeros((*t.shape, ONE_FRICTION))
+        pull = np.nan_to_num(np.hypot(signals[..., S.AX], signals[..., S.AY])) / GRAVITY
+        used = np.maximum.accumulate(np.concatenate([self._used[None], pull]), axis=0)[1:]
+        self._used = used[-1]
+        values[..., Column.VX] = np.nan_to_num(np.nanmean(signals[..., S.OMEGA : S.OMEGA + 4], axis=-1) * self._radius)
+        values[..., Column.YAW_RATE] = np.nan_to_num(signals[..., S.YAW_RATE])
+        values[..., Column.VX_STD : Column.SIDESLIP_STD + 1] = 1.0
+        values[..., Column.MU_UTILISED] = used
+        for column, prior in zip((Column.MU_LOWER, Column.MU, Column.MU_UPPER), PRIOR, strict=True):
+            values[..., column] = np.maximum(prior, used)
+        return edge_agent.Estimates(values)
+
+
+def main() -> None:
+    """Try it on a simulated drive."""
+    log, vehicle = edge_agent.simulate_manoeuvre("double-lane-change", mu=0.5, seed=1)
+    signals = np.stack([log[name].to_numpy() for name in edge_agent.CHANNELS], axis=-1)[:, None]
+    t = log["t"].to_numpy()[:, None]
+    found = edge_agent.to_table(t, AtLeast([vehicle]).advance(t, signals))
+    print(found.select(["t", "mu_lower", "mu", "mu_upper"]).slice(600, 1).to_pylist())
+
+
+if __name__ == "__main__":
+    main()

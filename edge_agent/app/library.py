@@ -1,0 +1,121 @@
+"""What a program does with the agent in a few lines: estimate a log, and have the result as a table or a plot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyarrow as pa
+
+from edge_agent.adaptation.memberships import Memberships
+from edge_agent.app import tuned_memberships
+from edge_agent.app.estimates_file import table
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.estimators import Estimates, EstimatorBank
+from edge_agent.inputs import signal_log
+from edge_agent.inputs.correct import corrected
+from edge_agent.inputs.signal_log import SignalLog
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+from schemas.runtime.palette import line_of
+from schemas.tables import ESTIMATES_SCHEMA
+from schemas.vehicle import Vehicle
+from schemas.vehicle import load_vehicle as load_vehicle_file
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+DEFAULT = "aco-fckf"
+
+
+def read_log(path: Path | str) -> SignalLog:
+    """A signal log (Parquet): t (T,) [s] and signals (T, 18) in the order of schemas.signals.CHANNELS, SI units.
+
+    Raises:
+        InputError: it cannot be read, or lacks what is needed; names column, row and fix.
+    """
+    return signal_log.read_log(Path(path))
+
+
+def load_vehicle(path: Path | str) -> Vehicle:
+    """A vehicle file (JSON); InputError names the field that is wrong."""
+    return load_vehicle_file(Path(path))
+
+
+def load_memberships(path: Path | str) -> Memberships:
+    """The fuzzy sets that `edge-agent tune` wrote; InputError names the field that is wrong."""
+    return tuned_memberships.load(path).memberships
+
+
+def make_bank(estimator: str, vehicles: Sequence[Vehicle], *, memberships: Memberships | None = None) -> EstimatorBank:
+    """N estimators side by side, one per vehicle: `bank.advance(t, signals)` with t (T, N) and signals (T, N, 18).
+
+    Raises:
+        InputError: no such estimator, no vehicle, or memberships for an estimator that has none.
+    """
+    return bank_of(estimator, vehicles, memberships)
+
+
+def estimate(
+    log: SignalLog, vehicle: Vehicle, estimator: str = DEFAULT, *, memberships: Memberships | None = None
+) -> pa.Table:
+    """Estimates of a whole log, a row per sample, as schemas.tables.ESTIMATES has them.
+
+    What a calibrated vehicle file knows of its devices is taken off the signals first, as `edge-agent replay` does.
+    """
+    bank = bank_of(estimator, [vehicle], memberships)
+    log = replace(log, signals=corrected(log.signals, vehicle))
+    parts = [table(block.t, bank.advance(block.t, block.signals)) for block in log.blocks(0)]
+    return pa.concat_tables([*parts, ESTIMATES_SCHEMA.empty_table()]).combine_chunks()
+
+
+def to_table(t: FloatArray, estimates: Estimates, vehicle: int = 0) -> pa.Table:
+    """Estimates (T, N) of one of the vehicles as a table; t (T, N) or (T,) [s].
+
+    Raises:
+        InputError: there is no such vehicle.
+    """
+    count = estimates.values.shape[1]
+    if not 0 <= vehicle < count:
+        raise InputError("vehicle", f"{vehicle} is none of {count}", f"give 0 to {count - 1}")
+    time = np.asarray(t if t.ndim == 1 else t[:, vehicle])[:, None]
+    return table(time, Estimates(estimates.values[:, vehicle : vehicle + 1]))
+
+
+def plot(estimates: dict[str, pa.Table], *, truth: pa.Table | None = None, title: str = "") -> Figure:
+    """Speed and friction with its 90 % band over time, of several estimators by name; `truth`: a simulated log.
+
+    Raises:
+        InputError: matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise InputError("plot", "matplotlib is not installed", "pip install matplotlib") from error
+    figure = Figure(figsize=(8, 6), layout="constrained")
+    speed, friction = figure.subplots(2, 1, sharex=True)
+    if truth is not None:
+        wheels = [truth[name].to_numpy() for name in truth.schema.names if name.startswith("true_mu_")]
+        speed.plot(truth["t"], truth["true_vx"], color="k", label="true")
+        friction.plot(truth["t"], np.mean(wheels, axis=0), color="k", label="true, mean of the wheels")
+    for name, found in estimates.items():
+        style, t = line_of(name), found["t"].to_numpy()
+        speed.plot(t, found["vx"].to_numpy(), color=style.colour, linestyle=style.dash, label=name)
+        friction.plot(t, found["mu"].to_numpy(), color=style.colour, linestyle=style.dash, label=f"{name}, median")
+        ends = (found[end].to_numpy() for end in ("mu_lower", "mu_upper"))
+        friction.fill_between(t, *ends, color=style.colour, alpha=0.2, linewidth=0, label="90 % band")
+    speed.set(ylabel="v_x [m/s]", title=title)
+    friction.set(ylabel="peak adhesion μ [1]", xlabel="t [s]", ylim=(0.0, 1.25))
+    for axes in (speed, friction):
+        axes.legend(fontsize="x-small")
+    return figure
+
+
+def estimators() -> Iterator[tuple[str, str]]:
+    """Names of all estimators, those of other packages too, with a line about each."""
+    from edge_agent.app.estimator_factory import known
+
+    yield from known().items()

@@ -1,0 +1,49 @@
+"""The archive asked by a program: an answer is an Arrow table, and pandas, polars and DuckDB are one step away."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pyarrow as pa
+
+from fleet_service.analytics import output
+from fleet_service.analytics.engines import QueryEngine
+from fleet_service.analytics.options import Options
+from fleet_service.analytics.past_map import map_at
+from fleet_service.analytics.questions import question_of
+from fleet_service.archive.export import Box, Extract
+from fleet_service.archive.layout import insist_on_archive
+from schemas.config import moment
+
+
+def _part(since: str | None, until: str | None, bbox: Box | None) -> Extract:
+    begin = 0 if since is None else moment(since, "since")
+    return Extract(begin, time.time_ns() if until is None else moment(until, "until"), bbox)
+
+
+def ask_archive(
+    archive: Path | str, question: str, *, since: str | None = None, until: str | None = None, bbox: Box | None = None,
+    options: Options | None = None, engine: str = "duckdb",
+) -> pa.Table:  # fmt: skip
+    """Ask one of the questions of the compacted files (`fleet-service compact`); times are ISO 8601, UTC.
+
+    Raises:
+        InputError: no such question or archive, nothing in that part, or an option is missing.
+    """
+    root = Path(archive)
+    insist_on_archive(root)
+    asked = question_of(question)
+    return asked.ask(QueryEngine(engine, root, _part(since, until, bbox)), options or Options(report=lambda _: None))
+
+
+def map_of_archive(archive: Path | str, *, at: str | None = None, bbox: Box | None = None) -> pa.Table:
+    """The map as it stood at a time, or now, replayed from the archive, as a GeoParquet table."""
+    root = Path(archive)
+    insist_on_archive(root)
+    return map_at(root, _part(None, at, bbox))
+
+
+def write_answer(table: pa.Table, question: str, path: Path | str) -> None:
+    """Write an answer as the ending says: .parquet, .geo.parquet, .geojson, .csv, .png, .svg, .pdf, .html."""
+    output.write(table, question_of(question), Path(path))

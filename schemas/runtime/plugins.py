@@ -1,0 +1,42 @@
+"""What other distributions bring: entry points, by group and name. A name of our own is never replaced.
+
+    [project.entry-points."gripmap.estimators"]
+    mine = "my_package.estimators:bank"
+
+group                   what stands behind a name
+gripmap.estimators      bank(vehicles) with `advance` as EstimatorBank has it
+gripmap.sources         blocks(address), an iterator of edge_agent.Block; asked for as `--source name:address`
+gripmap.questions       a fleet_service.analytics.questions.Question
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Final
+
+from schemas.errors import InputError
+
+ESTIMATORS: Final = "gripmap.estimators"
+SOURCES: Final = "gripmap.sources"
+QUESTIONS: Final = "gripmap.questions"
+
+
+@cache
+def found(group: str) -> dict[str, EntryPoint]:
+    """The entry points of a group, by name."""
+    return {point.name: point for point in entry_points(group=group)}
+
+
+def loaded(group: str, name: str) -> Any:  # noqa: ANN401 whatever stands behind it
+    """What stands behind a name.
+
+    Raises:
+        InputError: it cannot be imported.
+    """
+    try:
+        return found(group)[name].load()
+    except (ImportError, AttributeError) as error:
+        field = group.rpartition(".")[2].removesuffix("s")
+        where = found(group)[name].value
+        raise InputError(field, f"{name!r} cannot be loaded from {where} ({error})", "mend or remove it") from error

@@ -1,0 +1,98 @@
+"""Every example runs as it stands, and says what its page says."""
+
+from __future__ import annotations
+
+import json
+import time
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from deploy.examples import archive_questions, first_estimate, own_estimator, query_map
+from deploy.router import open_router
+from fleet_service.analytics import synthetic
+from fleet_service.archive.compaction import compact
+from schemas.config import ZenohSettings
+from schemas.runtime.palette import GRIP_RANGE, shade
+from schemas.runtime.zenoh_session import open_session
+from tests.fleet_service.app.test_service import Fleet
+from tests.fleet_service.conftest import running
+from tests.fleet_service.examples import SECOND, batch
+from tests.house import ROOT
+
+FOLDER = ROOT / "deploy" / "examples"
+Output = pytest.CaptureFixture[str]
+
+
+def test_every_example_stands_in_their_readme() -> None:
+    text = (FOLDER / "README.md").read_text()
+    files = [path.name for path in FOLDER.iterdir() if path.suffix in (".py", ".ipynb", ".qml") and path.stem[0] != "_"]
+    assert len(files) > 5
+    assert not [name for name in files if f"`{name}`" not in text]
+
+
+def test_a_first_estimate_makes_a_frame_and_a_plot(tmp_path: Path, capsys: Output) -> None:
+    first_estimate.main(tmp_path)
+    assert capsys.readouterr().out.splitlines()[0].split()[:3] == ["t", "vx", "mu"]
+    assert "<svg" in (tmp_path / "first.svg").read_text()
+
+
+def test_an_estimator_of_one_s_own_says_at_least_what_was_used(capsys: Output) -> None:
+    own_estimator.main()
+    (row,) = json.loads(capsys.readouterr().out.replace("'", '"'))
+    assert row["mu_lower"] <= row["mu"] <= row["mu_upper"]
+    assert row["mu_lower"] > 0.3
+
+
+def test_the_map_is_asked_and_a_tile_decoded(tmp_path: Path, capsys: Output) -> None:
+    session, endpoints = open_router(listen="tcp/127.0.0.1:0")
+    settings = ZenohSettings(connect=endpoints)
+    with session, running(settings, tmp_path):
+        heard: zenoh.Session | None = open_session(settings)
+        assert heard is not None
+        with heard:
+            fleet = Fleet(heard).meet()
+            fleet.settle(*(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(3)))
+            assert query_map.main(endpoints[0]) == 1
+    assert ": 1 cells" in capsys.readouterr().out
+
+
+def test_the_archive_is_the_same_in_pandas_and_duckdb(tmp_path: Path, capsys: Output) -> None:
+    world = synthetic.SyntheticFleet(rows=6000, days=1, vehicles=20, roads=4, length=30, icy=2)
+    synthetic.write(tmp_path / "archive", world, 2000)
+    compact(tmp_path / "archive")
+    archive_questions.main(tmp_path / "archive", tmp_path / "out")
+    said = capsys.readouterr().out
+    assert said.startswith("largest difference of the two: 0")
+    assert "stretches, " in said
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.ipynb")), ids=lambda path: str(path.stem))
+def test_a_notebook_runs_from_its_first_cell_to_its_last(path: Path) -> None:
+    notebook = json.loads(path.read_text())
+    assert notebook["nbformat"] == 4
+    cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert len(cells) >= 4
+    space: dict[str, Any] = {}
+    for cell in cells:
+        exec(compile(cell, str(path), "exec"), space)  # as a kernel would
+    assert not any(cell.get("outputs") for cell in notebook["cells"]), "kept without outputs"
+
+
+def test_the_style_has_the_colours_of_the_maps_and_none_for_what_is_unknown() -> None:
+    text = (FOLDER / "gripmap.qml").read_text()
+    root = ET.fromstring(text[text.index("<qgis") :])
+    rules = {rule.get("label", ""): rule.get("filter", "") for rule in root.iter("rule")}
+    assert '"mu" IS NULL' in rules.values()
+    ice = [int(shade(0.15, *GRIP_RANGE)[k : k + 2], 16) for k in (1, 3, 5)]
+    assert f"{ice[0]},{ice[1]},{ice[2]},255" in text
+    assert text.count("b_diagonal") == 1
+    edges = np.array(
+        [float(word) for rule in rules.values() if "AND" in rule for word in rule.split() if word[0] in "0123456789"]
+    )
+    assert edges.min() == 0.0
+    assert edges.max() >= 1.2

@@ -1,0 +1,161 @@
+"""The public faces: every name is there, documented and reachable; plug-ins of another distribution are found."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+import edge_agent
+import fleet_service
+import gripmap
+from edge_agent.cli import main
+from schemas.errors import InputError
+from schemas.tables import ESTIMATES_SCHEMA
+from tests.house import ROOT
+
+FACES = (edge_agent, fleet_service)
+
+
+@pytest.mark.parametrize("face", FACES, ids=lambda face: str(face.__name__))
+def test_every_name_of_a_face_is_there_and_documented(face: object) -> None:
+    names = face.__all__  # type: ignore[attr-defined]
+    assert list(names) == sorted(names)
+    assert len(names) >= 8
+    for name in names:
+        found = getattr(face, name)
+        assert isinstance(found, (dict, tuple)) or (found.__doc__ or "").strip(), name
+        assert getattr(gripmap, name) is found
+    with pytest.raises(AttributeError, match="its face is"):
+        _ = face.no_such_name  # type: ignore[attr-defined]
+    assert set(names) <= set(dir(gripmap))
+
+
+def test_importing_a_face_loads_nothing_heavy() -> None:
+    heavy = ("numba", "numpy", "pyarrow", "zenoh")
+    words = f"import sys, edge_agent, fleet_service; print([name for name in {heavy} if name in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+def test_a_log_is_estimated_in_three_lines_as_the_command_does(tmp_path: Path) -> None:
+    log, car = tmp_path / "x.parquet", tmp_path / "x.json"
+    assert main(["simulate", "slalom", "--duration", "2", "--out", str(log), "--vehicle-out", str(car)]) == 0
+    assert main(["replay", str(log), "--out", str(tmp_path / "e.parquet"), "--estimator", "ckf"]) in (0, 3)
+    found = edge_agent.estimate(edge_agent.read_log(str(log)), edge_agent.load_vehicle(str(car)), "ckf")
+    assert found.schema.equals(ESTIMATES_SCHEMA)
+    assert found.equals(pq.read_table(tmp_path / "e.parquet"))
+
+
+def test_estimates_of_one_of_many_vehicles_become_a_table() -> None:
+    log, vehicle = edge_agent.simulate_manoeuvre("slalom", duration_s=0.5)
+    signals = np.stack([log[name].to_numpy() for name in edge_agent.CHANNELS], axis=-1)[:, None].repeat(2, axis=1)
+    t = log["t"].to_numpy()[:, None].repeat(2, axis=1)
+    bank = edge_agent.make_bank("ckf", [vehicle, vehicle])
+    found = bank.advance(t, signals)
+    assert edge_agent.to_table(t, found, 1).equals(edge_agent.to_table(t[:, 0], found))
+    with pytest.raises(InputError, match="vehicle: 2 is none of 2"):
+        edge_agent.to_table(t, found, 2)
+
+
+def test_memberships_that_tune_wrote_change_what_replay_says(tmp_path: Path) -> None:
+    from edge_agent.app.tuned_memberships import FOLDER
+
+    document = json.loads((FOLDER / "paper-aco-fckf.json").read_text())
+    document["memberships"] = edge_agent.Memberships().to_json()
+    (tmp_path / "mine.json").write_text(json.dumps(document))
+    log, car = tmp_path / "x.parquet", tmp_path / "x.json"
+    assert main(["simulate", "slalom", "--duration", "2", "--out", str(log), "--vehicle-out", str(car)]) == 0
+    said = []
+    for more in ([], ["--memberships", str(tmp_path / "mine.json")]):
+        words = ["replay", str(log), "--estimator", "paper-aco-fckf", "--out", str(tmp_path / "e.parquet"), *more]
+        assert main(words) in (0, 3)
+        said.append(pq.read_table(tmp_path / "e.parquet")["adaptation"])
+    assert not said[0].equals(said[1])
+    assert main([*words[:2], "--out", str(tmp_path / "e.parquet"), "--estimator", "sr-ukf", *more]) == 2
+
+
+PLUGIN = """
+import numpy as np
+import pyarrow as pa
+from deploy.examples.own_estimator import AtLeast
+from fleet_service import Question
+
+bank = AtLeast
+
+
+def blocks(address):
+    import edge_agent
+    log, _ = edge_agent.simulate_manoeuvre("slalom", duration_s=float(address))
+    signals = np.stack([log[name].to_numpy() for name in edge_agent.CHANNELS], axis=-1)
+    for block in edge_agent.SignalLog(log["t"].to_numpy(), signals, None).blocks(0, 10):
+        yield block
+
+
+busiest = Question("busiest", "rows", "rows", None, lambda engine, options: pa.table({"rows": [engine.rows()]}))
+"""
+POINTS = """[gripmap.estimators]
+at-least = their_plugin:bank
+[gripmap.sources]
+mine = their_plugin:blocks
+[gripmap.questions]
+busiest = their_plugin:busiest
+"""
+
+
+def test_estimator_source_and_question_of_another_distribution_are_found(tmp_path: Path) -> None:
+    from tests.fleet_service.archive.kept import DATA
+
+    about = tmp_path / "their_plugin-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: their-plugin\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(POINTS)
+    (tmp_path / "their_plugin.py").write_text(PLUGIN)
+    log = tmp_path / "x.parquet"
+    drive = ["simulate", "slalom", "--duration", "2", "--out", str(log), "--vehicle-out", str(log.with_suffix(".json"))]
+    assert main(drive) == 0
+
+    def command(*words: str) -> subprocess.CompletedProcess[str]:
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
+        line = f"import sys, gripmap; sys.exit(gripmap.{words[0]}_main())"
+        return subprocess.run(
+            [sys.executable, "-c", line, *words[1:]], capture_output=True, text=True, check=False, env=environment
+        )
+
+    done = command("edge_agent", "replay", str(log), "--estimator", "at-least", "--out", str(tmp_path / "e.parquet"))
+    assert done.returncode in (0, 3), done.stderr
+    assert pq.read_table(tmp_path / "e.parquet")["mu_lower"].to_numpy().max() > 0.11
+    done = command("edge_agent", "replay", str(log), "--estimator", "no", "--out", str(tmp_path / "e.parquet"))
+    assert "at-least" in done.stderr
+    archive = DATA / "v1.0" / "archive"
+    done = command("fleet_service", "analyze", "busiest", "--archive", str(archive), "--as-it-lies", "--json")
+    assert json.loads(done.stdout)["rows"] > 0, done.stderr
+    words = "from schemas.runtime import plugins; b = list(plugins.loaded(plugins.SOURCES, 'mine')('1')); print(len(b))"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
+    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True, env=environment)
+    assert int(done.stdout) >= 10
+
+
+def test_a_plug_in_that_cannot_be_loaded_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    from importlib.metadata import EntryPoint
+
+    from schemas.runtime import plugins
+
+    broken = {"odd": EntryPoint("odd", "no_such_module:bank", plugins.ESTIMATORS)}
+    monkeypatch.setattr(plugins, "found", lambda group: broken)
+    with pytest.raises(InputError, match="estimator: 'odd' cannot be loaded from no_such_module:bank"):
+        edge_agent.make_bank("odd", [])
+
+
+def test_the_faces_are_of_packages_that_say_their_types() -> None:
+    for name in gripmap.FACES:
+        folder = Path(str(importlib.import_module(name).__file__)).parent
+        assert (folder / "py.typed").exists()
+    assert isinstance(pa.__version__, str)
