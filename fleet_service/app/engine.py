@@ -26,11 +26,14 @@ from fleet_service.archive.pseudonyms import Pseudonyms
 from fleet_service.fusion import observations_of
 from fleet_service.fusion.weather import Reports
 from fleet_service.ingest.acks import Acks
-from fleet_service.ingest.dedup import BatchId, SequenceTrackers
+from fleet_service.ingest.dedup import BatchId
 from fleet_service.ingest.inbox import AcceptedBatches, BatchIntake, Message
 from fleet_service.ingest.validation import Clock
 from fleet_service.ingest.weather import WeatherInbox, archived
-from fleet_service.replay.rebuild import Since, past, replay, restore_streams
+from fleet_service.ingest.weather import files as weather_files
+from fleet_service.replay import checkpoints
+from fleet_service.replay.checkpoints import Taken
+from fleet_service.replay.rebuild import Begin, Since, first_day, past, replay, restore_streams
 from fleet_service.replay.restart import image_of, restart
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.encode import cell_table
@@ -53,7 +56,7 @@ SNAPSHOT_SLOTS = 20_000  # at once: the lock is held for 40 ms, and little memor
 
 
 class Engine:
-    """State of one service, rebuilt from its archive; `seen` is the latest time at which it received a report [ns].
+    """State of one service, rebuilt from its archive; `seen` is the latest time that a report told [ns].
 
     Args:
         config: settings.
@@ -79,7 +82,7 @@ class Engine:
         self.report_lag_s = 0.0  # between the end of the newest visit and its arrival
         self.failing = False  # the last segment could not be written
         begin = restart(root, config.lateness_s)
-        self.fusion, since = begin.fusion, begin.received
+        self.fusion, streams = begin.fusion, begin.streams
         self.counts["checkpoints_refused"] += begin.refused
         self.map = MapState(self.fusion)
         self._alerts = Alerts(self.fusion)
@@ -87,29 +90,30 @@ class Engine:
         self._guard = threading.Lock()
         self._tiles = TileCache(self.map, self._guard, config.public_vehicles)
         self._acks = Acks()
-        streams = SequenceTrackers()
+        self._streams = streams
         self._intake = BatchIntake(streams, Pseudonyms(root / "keys"), self.counts, self._acks)
         self._log: SegmentLog[BatchId] = SegmentLog(root, config.name)
         self.weather = WeatherInbox(root, config.name, self.fusion, self.counts)
-        self._last_received = since or 0  # when the last report of any kind came [ns]
         self._checkpoint_wanted = threading.Event()
-        self._checkpoints: queue.SimpleQueue[tuple[dict[str, pa.Table], int]] = queue.SimpleQueue()
+        self._checkpoints: queue.SimpleQueue[Taken] = queue.SimpleQueue()
         used = archived(root, damaged=set_aside)  # before the observations, which it acts on
-        self.fusion.update_weather(used if since is None else archived(root, received_after=since, damaged=set_aside))
+        self.fusion.update_weather(archived(root, known=begin.weather, damaged=set_aside) if begin.cut else used)
         restored = np.array_split(np.arange(self.fusion.size), self.fusion.size // SNAPSHOT_SLOTS + 1)
-        rest = replay(root, self.fusion, Since(received=since), set_aside)
+        matters = Begin(first_day(root), begin.cut)
+        rest = replay(root, self.fusion, Since(matters, streams if begin.cut else None), set_aside)
         for slots in chain(restored, (updated.slots for updated in rest)):
             self._alerts.updated(slots)
             self.map.changed(slots)
-        self.seen = restore_streams(root, streams, set_aside)
+        restore_streams(root, streams, matters, set_aside)
+        self.seen = streams.newest
         self.counts["files_set_aside"] = count_set_aside(root)
         if config.weather is not None:
             self._use(self.weather.begin(config.weather, used, time.time_ns()))
         warm_up()
         pa.default_memory_pool().release_unused()  # the archive went through it
 
-    def checkpoint(self, stop: threading.Event) -> tuple[dict[str, pa.Table], int] | None:
-        """What the fusion knows, and until when everything received is in it [ns]; None if stopped meanwhile.
+    def checkpoint(self, stop: threading.Event) -> Taken | None:
+        """What the service knows, and the segment up to which everything is in it; None if stopped meanwhile.
 
         The worker takes it, right after a segment: then every row that is in it is on disk. Called by another thread.
         """
@@ -119,8 +123,13 @@ class Engine:
                 return self._checkpoints.get(timeout=CHECKPOINT_WAIT_S)
         return None
 
+    def survived(self) -> None:
+        """It has run for a while with what it began from."""
+        checkpoints.survived(self._root)
+
     def close(self) -> None:
         """Give the archive free."""
+        self.survived()
         self._log.close()
         self._lock_file.close()
 
@@ -156,7 +165,6 @@ class Engine:
         """Admit and fuse; returns the alerts that this raises or clears. `slack`: the true time may be so far ahead."""
         clock = Clock(now, int(self._config.clock_ahead_s * NS) + slack, int(self._config.oldest_s * NS))
         out: list[Alert] = []
-        self._last_received = max(self._last_received, now)
         for kind, accepted in self._intake.accept(messages, clock).items():
             if kind is Kind.OBSERVATION:
                 out += self._fuse(accepted)
@@ -179,7 +187,6 @@ class Engine:
 
     def update_weather(self, now: int) -> None:
         """Let the weather act that came since the last call."""
-        self._last_received = max(self._last_received, now)
         self._use(self.weather.take(now))
 
     def _use(self, reports: Reports | None) -> None:
@@ -197,7 +204,9 @@ class Engine:
         if not self.failing and self._checkpoint_wanted.is_set():
             self._checkpoint_wanted.clear()
             with self._guard:
-                self._checkpoints.put((image_of(self.fusion, self._alerts.standing), self._last_received))
+                tables = image_of(self.fusion, self._alerts.standing, self._streams)
+            weather = tuple(path.name for path in weather_files(self._root))
+            self._checkpoints.put(Taken(tables, self._log.newest, weather))
         return acks
 
     def begin_flush(self) -> list[tuple[str, bytes]]:

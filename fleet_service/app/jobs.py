@@ -60,7 +60,7 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path) -> list[Job]
     def checkpoint(stop: threading.Event) -> str | None:
         taken = engine.checkpoint(stop)
         if taken is not None:
-            checkpoints.save(root, *taken)
+            checkpoints.save(root, taken)
         return None
 
     def retention(_: threading.Event) -> str | None:

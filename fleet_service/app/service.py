@@ -37,6 +37,7 @@ from schemas.wire import Alert, Kind
 IDLE_S: Final = 0.05  # longest wait for a message; bounds how late a segment or a tile can be
 STATUS_S: Final = 5.0
 LEAVE_S: Final = 1.5  # of the three seconds in which a service is gone
+SURVIVED_S: Final = 20.0  # a service that is still there has not died of its checkpoint
 LAG_S: Final = 1.0  # of the system's clock that is worth telling
 
 
@@ -63,7 +64,7 @@ class Service:
         self.failure: BaseException | None = None  # of the worker; leaving the session after it may hang
         self._session: zenoh.Session | None = None
         self._stepped_at = self._put_at = self._flushed_at = self._reported_at = time.monotonic()
-        self._reported = 0
+        self._reported, self._began, self._survived = 0, self._stepped_at, False
 
     def run(self, stop: threading.Event) -> None:
         """Serve until `stop` is set; then flush, acknowledge and leave."""
@@ -167,6 +168,9 @@ class Service:
             self._put_tiles(session)
         if now - self._reported_at >= STATUS_S:
             self._status(now)
+        if not self._survived and now - self._began >= SURVIVED_S:
+            self._survived = True
+            self.engine.survived()
 
     def _shut_down(self, session: zenoh.Session) -> None:
         """Take what is waiting, as far as LEAVE_S allows, and settle it; the rest its senders keep."""

@@ -141,8 +141,7 @@ def runs(names: Iterable[str]) -> list[tuple[str, int, int]]:
     """Names of segments, in order of age, as runs of consecutive numbers: SHARD-EPOCH, first, last."""
     out: list[tuple[str, int, int]] = []
     for name in names:
-        epoch, number, shard = layout.age(name)
-        prefix, n = f"{shard}-{epoch}", int(number)
+        prefix, n = Path(name).stem.rpartition("-")[0], layout.age(name)[1]
         if out and out[-1][0] == prefix and out[-1][2] == n - 1:
             out[-1] = (prefix, out[-1][1], n)
         else:

@@ -28,6 +28,13 @@ DAY_NS: Final = 86_400_000_000_000
 _EPOCH: Final = date(1970, 1, 1)
 
 
+class Cut(NamedTuple):
+    """A place in the log: everything up to this segment. Names only grow, whatever the clock does."""
+
+    epoch: int
+    number: int
+
+
 class Partition(NamedTuple):
     """A folder of compacted rows: days since 1970 and z7 zone."""
 
@@ -97,7 +104,7 @@ def segment_name(prefix: str, number: int) -> str:
     return f"{prefix}-{number:08d}.parquet"
 
 
-def age(name: str) -> tuple[str, str, str]:
+def age(name: str) -> tuple[int, int, str]:
     """Sorts segments, and the files that hold their rows, from old to new: epoch, number, shard."""
     shard, epoch, number = Path(name).stem.rsplit("-", 2)
-    return epoch, number, shard
+    return int(epoch), int(number), shard

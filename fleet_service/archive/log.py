@@ -12,6 +12,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from fleet_service.archive.layout import Cut
 from fleet_service.archive.segments import Rows, Writer
 from schemas.wire import Kind
 
@@ -59,6 +60,11 @@ class SegmentLog(Generic[Batch]):
         self._load: _Load[Batch] = _Load()  # what was handed over
         self._written: Future[None] | None = None
         self._thread = ThreadPoolExecutor(1, "segments")
+
+    @property
+    def newest(self) -> Cut:
+        """The segment that was written last."""
+        return self._writer.newest
 
     @property
     def rows(self) -> int:

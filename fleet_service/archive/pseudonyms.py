@@ -5,6 +5,7 @@ The month is that of a batch's first record, so that a batch that is sent again 
 
 from __future__ import annotations
 
+import errno
 import secrets
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.numeric import IntArray
-from schemas.runtime.durable import written
+from schemas.runtime.durable import sync_directory, written
 
 KEY_BYTES: Final = 32
 _DIGEST_BYTES: Final = 8  # 64 bits: a collision among 10⁶ vehicles has probability 3e-8
@@ -71,10 +72,29 @@ class Pseudonyms:
             path = self._folder / f"{month}.key"
             if not path.exists():
                 self._make(path)
-            self._keys[month] = path.read_bytes()
+            self._keys[month] = _checked(path)
         return self._keys[month]
 
     def _make(self, path: Path) -> None:
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         with written(path, 0o600) as file:
-            file.write(secrets.token_bytes(KEY_BYTES))
+            key = secrets.token_bytes(KEY_BYTES)
+            file.write(key + _check(key))
+        sync_directory(self._folder.parent)  # without it power loss forgets the key, and acknowledged batches with it
+
+
+def _checked(path: Path) -> bytes:
+    """A key, as it was made; those of a former version have no digest.
+
+    Raises:
+        OSError: it is damaged: other pseudonyms would be made, and every batch would come in once more.
+    """
+    data = path.read_bytes()
+    key, check = data[:KEY_BYTES], data[KEY_BYTES:]
+    if len(key) < KEY_BYTES or (check and check != _check(key)):
+        raise OSError(errno.EIO, "the key is damaged; bring it back from a copy", str(path))
+    return key
+
+
+def _check(key: bytes) -> bytes:
+    return blake2b(key, digest_size=_DIGEST_BYTES).digest()

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Sequence
+from functools import reduce
+from operator import and_
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -29,6 +31,20 @@ SOURCES: Final = b"gripmap.sources"
 _TURNS: Final = 100  # a reader that is overtaken by so many compactions has another trouble
 
 
+class Wanted(NamedTuple):
+    """Which rows: with these columns (all, if None), where a filter holds, measured within these days (both count),
+    and written after a place in the log. May yield more than was written after it: the rest of a compacted file."""
+
+    columns: Sequence[str] | None = None
+    where: pc.Expression | None = None
+    days: tuple[int | None, int | None] = (None, None)
+    after: layout.Cut | None = None
+
+    def newer(self, path: Path) -> bool:
+        """Whether a segment, or a file that is named by its newest one, was written after the place."""
+        return self.after is None or layout.age(path.name)[:2] > self.after
+
+
 def read(
     root: Path,
     kind: Kind,
@@ -45,38 +61,65 @@ def read(
         columns: all, if None.
         where: rows wanted; row groups that cannot hold any are skipped.
         days: first and last day of measurement wanted; may yield more.
-        damaged: is called with a damaged file.
+        damaged: is told of a damaged file.
 
     Raises:
         InputError: a file is of a newer major version.
         OSError: the system cannot read.
     """
-    schema = segments.SCHEMAS[kind]
-    wanted = list(columns) if columns is not None else schema.names
-    needed = list(dict.fromkeys([*wanted, layout.TIME[kind], "cell"]))
-    fresh = _inbox(root, kind, needed, where, damaged)
-    files = list(layout.compacted(root, kind, *days))
-    done = compacted(files, {path.name for path, _ in fresh})
-    for path, table in fresh:
-        yield without(table, kind, done.get(path.name, set())).select(wanted)
-    fresh.clear()
-    for path in files:
-        try:
-            part = load(path, schema, wanted, where, damaged=damaged)
-        except FileNotFoundError:  # its day was retired meanwhile
-            continue
+    yield from read_wanted(root, kind, Wanted(columns, where, days), damaged)
+
+
+def read_wanted(root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = pass_over) -> Iterator[pa.Table]:
+    """As `read`."""
+    listing = Listing(root, kind, wanted, damaged)
+    yield from listing.inbox()
+    for path in listing.files:
+        part = listing.load(path)
         if part is not None and part.num_rows:
             yield part
 
 
-def _inbox(
-    root: Path, kind: Kind, columns: list[str], where: pc.Expression | None, damaged: Damaged
-) -> list[tuple[Path, pa.Table]]:
+class Listing:
+    """The rows of an archive as they were found at once: the inbox, and the compacted files, which are read later.
+
+    Args:
+        as of `read`.
+    """
+
+    def __init__(self, root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = pass_over) -> None:
+        self.kind, self._wanted, self._damaged = kind, wanted, damaged
+        self._schema = segments.SCHEMAS[kind]
+        self._names = list(wanted.columns) if wanted.columns is not None else self._schema.names
+        needed = list(dict.fromkeys([*self._names, layout.TIME[kind], "cell"]))
+        self._fresh = _inbox(root, kind, wanted._replace(columns=needed), damaged)
+        files = list(layout.compacted(root, kind, *wanted.days))
+        self._done = compacted(files, {path.name for path, _ in self._fresh})
+        self.files = [path for path in files if wanted.newer(path)]
+
+    def inbox(self) -> Iterator[pa.Table]:
+        """Rows that no compacted file holds; once."""
+        fresh, self._fresh = self._fresh, []
+        for path, table in fresh:
+            yield without(table, self.kind, self._done.get(path.name, set())).select(self._names)
+
+    def load(self, path: Path, where: pc.Expression | None = None) -> pa.Table | None:
+        """Rows of one of the files, where this filter holds too; None if it is damaged, or its day was retired."""
+        both = [one for one in (self._wanted.where, where) if one is not None]
+        try:
+            return load(path, self._schema, self._names, reduce(and_, both) if both else None, damaged=self._damaged)
+        except FileNotFoundError:
+            return None
+
+
+def _inbox(root: Path, kind: Kind, wanted: Wanted, damaged: Damaged) -> list[tuple[Path, pa.Table]]:
     for _ in range(_TURNS):
         try:
-            paths = segments.paths(root, kind)
+            paths = [path for path in segments.paths(root, kind) if wanted.newer(path)]
             schema = segments.SCHEMAS[kind]
-            loaded = [(path, load(path, schema, columns, where, whole=True, damaged=damaged)) for path in paths]
+            loaded = [
+                (path, load(path, schema, wanted.columns, wanted.where, whole=True, damaged=damaged)) for path in paths
+            ]
         except FileNotFoundError:  # compacted meanwhile
             continue
         return [(path, table) for path, table in loaded if table is not None]

@@ -42,7 +42,7 @@ def folder(root: Path, kind: Kind) -> Path:
 
 def paths(root: Path, kind: Kind) -> list[Path]:
     """Segments of a kind, oldest first within a shard."""
-    return sorted(folder(root, kind).glob("*.parquet"))
+    return sorted(folder(root, kind).glob("*.parquet"), key=lambda path: layout.age(path.name))
 
 
 class Writer:
@@ -65,8 +65,13 @@ class Writer:
         self._unsynced: set[Path] = set()
         # Compacted rows are known by the names of their segments, so that these may not be used again either.
         named = [path for kind in SCHEMAS for path in (*paths(root, kind), *layout.compacted(root, kind))]
-        used = [int(layout.age(path.name)[0]) for path in named]
+        used = [layout.age(path.name)[0] for path in named]
         self._epoch = max([int(time.time()), *(epoch + 1 for epoch in used)])
+
+    @property
+    def newest(self) -> layout.Cut:
+        """The segment that was written last."""
+        return layout.Cut(self._epoch, self._seq)
 
     def write(self, kind: Kind, rows: Rows) -> Path:
         """Write one segment from columns (n,), durable after `sync`.

@@ -6,16 +6,17 @@ and a stream whose newest record is older than the service accepts is forgotten.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Final
 
 import numpy as np
 
-from schemas.numeric import IntArray
+from schemas.numeric import BoolArray, IntArray
 from schemas.wire import Kind
 
 # Batches above the first that is missing: an agent sends old ones first, so that it has some hundreds after an outage.
 MAX_GAPS: Final = 1 << 16
+_KINDS: Final = tuple(Kind)
 _NONE: Final[frozenset[int]] = frozenset()
 StreamKey = tuple[int, int, Kind, int]  # number of the vehicle's pseudonym, boot, kind, region
 
@@ -56,6 +57,11 @@ class SequenceTracker:
         if time > self.newest:
             self.newest = time
         return True
+
+    def reach(self, last: int, time: int) -> None:
+        """Everything from the watermark to `last` was accepted."""
+        self.raise_to(last + 1)
+        self.newest = max(self.newest, time)
 
     def raise_to(self, first_held: int) -> None:
         """Older than `first_held` never comes."""
@@ -98,6 +104,49 @@ class SequenceTrackers:
     def __iter__(self) -> Iterator[SequenceTracker]:
         return iter(self._streams.values())
 
+    @property
+    def newest(self) -> int:
+        """Time of the newest accepted batch of all [ns], or 0."""
+        return max((stream.newest for stream in self._streams.values()), default=0)
+
+    def accepted(self, kind: Kind, names: IntArray) -> BoolArray:
+        """Which batches were accepted: `names` is (n, 4) of vehicle, boot, region and seq."""
+        get = self._streams.get
+        found = (get((vehicle, boot, kind, region)) for vehicle, boot, region, _ in names.tolist())
+        return np.array(
+            [one is not None and one.accepted(seq) for one, seq in zip(found, names[:, 3].tolist(), strict=True)], bool
+        )
+
+    def columns(self) -> tuple[dict[str, IntArray], IntArray]:
+        """All streams as columns (n,), `above` being how many seqs of the second value are each one's."""
+        streams = list(self._streams.values())
+        above = [sorted(stream.seen) for stream in streams]
+        table = {
+            "vehicle": [stream.key[0] for stream in streams], "boot": [stream.key[1] for stream in streams],
+            "kind": [_KINDS.index(stream.key[2]) for stream in streams],
+            "region": [stream.key[3] for stream in streams], "low": [stream.low for stream in streams],
+            "newest": [stream.newest for stream in streams], "above": [len(seqs) for seqs in above],
+        }  # fmt: skip
+        return (
+            {name: np.array(values, np.int64) for name, values in table.items()},
+            np.array([seq for seqs in above for seq in seqs], np.int64),
+        )
+
+    @staticmethod
+    def of(columns: Mapping[str, IntArray], above: IntArray) -> SequenceTrackers:
+        """The streams of these columns, as `columns` gives them."""
+        out, at, seqs = SequenceTrackers(), 0, above.tolist()
+        order = ("vehicle", "boot", "kind", "region", "low", "newest", "above")
+        for vehicle, boot, kind, region, low, newest, n in zip(
+            *(columns[name].tolist() for name in order), strict=True
+        ):
+            stream = out[vehicle, boot, _KINDS[kind], region]
+            stream.low, stream.newest = low, newest
+            if n:
+                stream.seen = set(seqs[at : at + n])
+                at += n
+        return out
+
     def forget(self, before: int) -> None:
         """Drop streams without a batch from `before` [ns] on: one that came again would be refused as too old."""
         self._streams = {key: stream for key, stream in self._streams.items() if stream.newest >= before}
@@ -117,5 +166,10 @@ class SequenceTrackers:
             stream = self[int(names[0, start]), int(names[1, start]), kind, int(names[2, start])]
             stream.raise_to(int(first_held[start:stop].max()))
             newest = int(time[start:stop].max())
-            for one in np.unique(seq[start:stop]).tolist():
-                stream.accept(one, newest)
+            some = np.unique(seq[start:stop])
+            first, last = int(some[0]), int(some[-1])
+            if first <= stream.low + 1 and last - first == len(some) - 1:  # as most often: a run that goes on
+                stream.reach(last, newest)
+            else:
+                for one in some.tolist():
+                    stream.accept(one, newest)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -128,10 +129,11 @@ def _reports(table: pa.Table) -> Reports:
 def archived(
     root: Path,
     received_until: int | None = None,
-    received_after: int | None = None,
+    known: Collection[str] = (),
     damaged: Damaged = pass_over,
 ) -> Reports:
-    """Every report that a map used, in the order in which they came, as far as received in that time [ns].
+    """Every report that a map used, in the order in which they came, as far as received until a time [ns], and of
+    files whose names are not `known`.
 
     `damaged` is called with a damaged file: the roads of its reports age by the clock.
 
@@ -139,15 +141,18 @@ def archived(
         InputError: a file is of a newer major version.
         OSError: the archive cannot be read.
     """
-    paths = sorted((root / FOLDER).glob("*.parquet"), key=lambda p: p.stem[-20:])
+    paths = [path for path in files(root) if path.name not in known]
     parts = [load(path, tables.WEATHER_ARCHIVE, whole=True, damaged=damaged) for path in paths]
     table = pa.concat_tables([tables.WEATHER_ARCHIVE.empty_table(), *(part for part in parts if part is not None)])
-    received = table["received_at"].cast(tables.NS).cast(pa.int64()).to_numpy()
     if received_until is not None:
+        received = table["received_at"].cast(tables.NS).cast(pa.int64()).to_numpy()
         table = table.filter(pa.array(received <= received_until))
-    elif received_after is not None:
-        table = table.filter(pa.array(received > received_after))
     return _reports(table)
+
+
+def files(root: Path) -> list[Path]:
+    """Files of weather, in the order in which they came."""
+    return sorted((root / FOLDER).glob("*.parquet"), key=lambda path: path.stem[-20:])
 
 
 def read_file(path: Path) -> list[tuple[int, Report]]:

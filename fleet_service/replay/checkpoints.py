@@ -1,46 +1,76 @@
-"""Checkpoints: what a service knew when everything received until a moment was on disk; a restart replays the rest.
+"""Checkpoints: what a service knew when everything up to a segment was on disk; a restart replays the rest.
 
-    checkpoints/RECEIVED/NAME.arrow      RECEIVED is that moment in ns
+    checkpoints/EPOCH-NUMBER/NAME.arrow          the newest segment that is in it
+    checkpoints/EPOCH-NUMBER/manifest.json       a digest of every file, and the weather that it knows
 
-A folder appears when it is whole. The log decides; a checkpoint that is missing, damaged or of another version only
-costs the time of a replay.
+A folder appears when it is whole. Compiled code follows the numbers in a checkpoint without asking: nothing of it is
+used before all digests were found right, and one with which a service died several times before it had run for a moment
+is not tried again. The log decides: a checkpoint that is missing, damaged or of another version only costs the time of
+a replay.
 """
 
 from __future__ import annotations
 
+import json
 import shutil
+from collections.abc import Sequence
+from contextlib import suppress
+from hashlib import blake2b
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 import pyarrow as pa
 
-from fleet_service.archive.layout import CHECKPOINTS
+from fleet_service.archive.layout import CHECKPOINTS, Cut
 from fleet_service.archive.version import KEY, VERSION
+from schemas.errors import InputError
 from schemas.runtime.durable import sync_directory, written
 
 KEPT: Final = 2  # the newest, and the one before, should the newest be damaged
+TRIES: Final = 4  # a service that is killed again and again, by whatever, begins from the log at last
 _DRAFT: Final = ".draft"
+_MANIFEST: Final = "manifest.json"
+_TRIED: Final = "tried"
+_CHUNK: Final = 1 << 22
 
 
-def save(root: Path, tables: dict[str, pa.Table], received: int) -> Path:
-    """Keep a checkpoint of everything received until a moment [ns], and the one before it.
+class Taken(NamedTuple):
+    """What is to be kept.
+
+    Attributes:
+        tables: by name.
+        cut: everything up to this segment is in them.
+        weather: names of the files of weather that are.
+    """
+
+    tables: dict[str, pa.Table]
+    cut: Cut
+    weather: tuple[str, ...] = ()
+
+
+def save(root: Path, taken: Taken) -> Path:
+    """Keep a checkpoint, and the one before it.
 
     Raises:
         OSError: the disk is full; the checkpoints before stay.
     """
     folder = root / CHECKPOINTS
-    draft, path = folder / _DRAFT, folder / f"{received:020d}"
+    draft, path = folder / _DRAFT, folder / f"{taken.cut.epoch:010d}-{taken.cut.number:012d}"
     shutil.rmtree(draft, ignore_errors=True)
     draft.mkdir(parents=True)
-    for name, table in tables.items():
+    for name, table in taken.tables.items():
         with written(draft / f"{name}.arrow", named=False) as file:
             metadata = {**(table.schema.metadata or {}), KEY.encode(): str(VERSION).encode()}
             with pa.ipc.new_file(file, table.schema.with_metadata(metadata)) as writer:
                 writer.write_table(table.replace_schema_metadata(metadata))
+    content = {"files": {file.name: digest(file) for file in sorted(draft.iterdir())}, "weather": list(taken.weather)}
+    with written(draft / _MANIFEST, named=False) as file:
+        file.write(json.dumps({"content": content, "digest": _digest_of(content)}).encode())
     sync_directory(draft)
     shutil.rmtree(path, ignore_errors=True)
     draft.rename(path)
     sync_directory(folder)
+    sync_directory(root)
     for old in _folders(root)[:-KEPT]:
         shutil.rmtree(old, ignore_errors=True)
     return path
@@ -51,17 +81,65 @@ def newest(root: Path) -> list[Path]:
     return _folders(root)[::-1]
 
 
-def load(path: Path) -> tuple[dict[str, pa.Table], int]:
-    """Tables of a checkpoint by name, and until when everything received is in it [ns].
+def load(path: Path) -> Taken:
+    """A checkpoint, whole and as it was written.
 
     Raises:
-        OSError, pa.ArrowInvalid: it is damaged.
+        InputError: it is damaged, of a former form, or a service died with it too often.
+        OSError: it cannot be read.
     """
+    try:
+        manifest = json.loads((path / _MANIFEST).read_bytes())
+        content: dict[str, Any] = manifest["content"]
+        right = manifest["digest"] == _digest_of(content)
+    except (ValueError, KeyError, TypeError, FileNotFoundError) as error:
+        raise _refused(path, "has no manifest that can be read") from error
+    if not right or any(digest(path / name) != wanted for name, wanted in content["files"].items()):
+        raise _refused(path, "is damaged")
+    if _tries(path) >= TRIES:
+        raise _refused(path, f"was begun from {TRIES} times by a service that died at once")
     tables = {}
-    for file in sorted(path.glob("*.arrow")):
-        with pa.memory_map(str(file)) as source:
-            tables[file.stem] = pa.ipc.open_file(source).read_all()
-    return tables, int(path.name)
+    for name in content["files"]:
+        with pa.memory_map(str(path / name)) as source:
+            tables[Path(name).stem] = pa.ipc.open_file(source).read_all()
+    epoch, number = path.name.split("-")
+    return Taken(tables, Cut(int(epoch), int(number)), tuple(content["weather"]))
+
+
+def begin(path: Path) -> None:
+    """Note that a service begins from a checkpoint; `survived` takes it back."""
+    with suppress(OSError):  # a full disk does not keep a service from its start
+        (path / _TRIED).write_text(str(_tries(path) + 1))
+
+
+def survived(root: Path) -> None:
+    """The service runs well with what it began from."""
+    for path in _folders(root):
+        (path / _TRIED).unlink(missing_ok=True)
+
+
+def digest(path: Path) -> str:
+    """Hash of a file; of none, where it is gone."""
+    state = blake2b(digest_size=16)
+    with suppress(FileNotFoundError), path.open("rb") as file:
+        while chunk := file.read(_CHUNK):
+            state.update(chunk)
+    return state.hexdigest()
+
+
+def _tries(path: Path) -> int:
+    try:
+        return int((path / _TRIED).read_text())
+    except (OSError, ValueError):
+        return 0
+
+
+def _digest_of(content: Sequence[Any] | dict[str, Any]) -> str:
+    return blake2b(json.dumps(content, sort_keys=True).encode(), digest_size=16).hexdigest()
+
+
+def _refused(path: Path, problem: str) -> InputError:
+    return InputError("checkpoint", f"{path.name} {problem}", "the one before it, or the log, is taken instead")
 
 
 def _folders(root: Path) -> list[Path]:

@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
+import pyarrow.parquet as pq
 
 from fleet_service.archive import layout, reading, segments
 from fleet_service.archive.load import Damaged, pass_over
@@ -31,47 +31,66 @@ COLUMNS: Final = [
     *("mu_utilised", "log_likelihood", *IDENTITY, "row", "received_at", "late", "weight"),
 ]  # of what the fusion takes
 Box = tuple[float, float, float, float]  # west, south, east, north [deg]
+# Days of observations that show in the map, and of batches that may come again (ServiceConfig.oldest_s is 30 days).
+MAP_DAYS: Final = 31
+PART_ROWS: Final = 1_000_000  # of a replay at once: 300 MB while they are sorted
 MARGIN_DEG: Final = 0.002  # around a box: over 100 m, more than a visit's position error moves what it tells
 
 
-def restore_streams(root: Path, streams: SequenceTrackers, damaged: Damaged = pass_over) -> int:
-    """Note every archived batch as admitted; returns the latest time at which one was received [ns], or 0."""
-    seen = 0
+class Begin(NamedTuple):
+    """Where an archive begins to matter: the first day of measurement, and the place in the log after which it does."""
+
+    day: int | None = None
+    after: layout.Cut | None = None
+
+
+def restore_streams(
+    root: Path, streams: SequenceTrackers, begin: Begin = Begin(), damaged: Damaged = pass_over  # noqa: B008 immutable
+) -> None:  # fmt: skip
+    """Note every archived batch as admitted, file by file.
+
+    Args:
+        root: of the archive.
+        streams: those that are noted already; brought up to date.
+        begin: where the archive begins to matter.
+        damaged: is told of a damaged file.
+    """
     for kind, first in _FIRST_TIME.items():
-        columns = (*IDENTITY, "first_held", first, "received_at")
-        tables = list(reading.read(root, kind, columns, damaged=damaged))
-        table = pa.concat_tables(tables) if tables else segments.SCHEMAS[kind].empty_table()
-        seen = max(seen, int(segments.nanoseconds(table["received_at"]).max(initial=0)))
-        vehicle = _numbers(table["vehicle"].to_numpy().astype(str))
-        boot, region, seq, first_held = (table[name].to_numpy() for name in (*IDENTITY[1:], "first_held"))
-        streams.restore(kind, vehicle, boot, region, seq, first_held, segments.nanoseconds(table[first]))
-    return seen
+        columns = (*IDENTITY, "first_held", first)
+        wanted = reading.Wanted(columns, days=(begin.day, None), after=begin.after)
+        for table in reading.read_wanted(root, kind, wanted, damaged):
+            boot, region, seq, first_held = (table[name].to_numpy() for name in (*IDENTITY[1:], "first_held"))
+            time = segments.nanoseconds(table[first])
+            streams.restore(kind, numbers(table["vehicle"]), boot, region, seq, first_held, time)
 
 
-def _numbers(pseudonyms: NDArray[np.str_]) -> IntArray:
-    distinct, index = np.unique(pseudonyms, return_inverse=True)
-    return np.array([number(p) for p in distinct.tolist()], np.int64)[index]
+def numbers(pseudonyms: pa.ChunkedArray[Any] | pa.Array[Any]) -> IntArray:
+    """Pseudonyms (n,) as numbers."""
+    chunked = pseudonyms if isinstance(pseudonyms, pa.ChunkedArray) else pa.chunked_array([pseudonyms])
+    coded = chunked.combine_chunks().dictionary_encode()
+    if not len(coded):
+        return np.zeros(0, np.int64)
+    each = np.array([number(pseudonym) for pseudonym in coded.dictionary.to_pylist()], np.int64)
+    return np.asarray(each[coded.indices.to_numpy()])
 
 
 class Since(NamedTuple):
-    """Which rows a replay takes: received after `received` and until `until` [ns], near `box` [deg].
+    """Which rows a replay takes: from a place in the log and a day on, received until `until` [ns], near `box` [deg].
 
     Cells do not depend on each other once weights are known, so that those well inside a box come out as in a whole
-    replay.
+    replay. Of compacted files that reach over the place in the log, the batches that `known` has are left out.
     """
 
-    received: int | None = None
+    begin: Begin = Begin()
+    known: SequenceTrackers | None = None
     until: int | None = None
     box: Box | None = None
 
     def where(self) -> pc.Expression | None:
         """The rows as a filter, or None for all."""
         parts = []
-        received_at = pc.field("received_at")
-        if self.received is not None:
-            parts.append(received_at > _time(self.received))
         if self.until is not None:
-            parts.append(received_at <= _time(self.until))
+            parts.append(pc.field("received_at") <= _time(self.until))
         if self.box is not None:
             west, south, east, north = self.box
             parts.append((pc.field("longitude") > west - MARGIN_DEG) & (pc.field("longitude") < east + MARGIN_DEG))
@@ -91,9 +110,18 @@ def past(root: Path, lateness_s: float, until: int, box: Box | None = None) -> F
     """
     fusion = Fusion(lateness_s)
     fusion.update_weather(archived(root, received_until=until))
-    for _ in replay(root, fusion, Since(until=until, box=box)):
+    for _ in replay(root, fusion, Since(Begin(until // layout.DAY_NS - MAP_DAYS), until=until, box=box)):
         pass  # the alerts of then are history
     return fusion
+
+
+def first_day(root: Path) -> int | None:
+    """The first day that matters to a service: MAP_DAYS before the last that the archive has rows of.
+
+    Neither batches that are older come again (ServiceConfig.oldest_s), nor does anything of them show in the map.
+    """
+    found = [layout.day_of(folder) for kind in Kind for folder in layout.days(root, layout.TABLES[kind])]
+    return max(found) - MAP_DAYS if found else None
 
 
 def replay(
@@ -104,20 +132,60 @@ def replay(
 ) -> Iterator[Updated]:
     """Replay the archive into `fusion` in order of time, with the weights that were used; yields once per epoch.
 
+    A day is read at a time, a large one in parts, so that memory does not grow with the archive.
+
     Args:
         root: of the archive.
-        fusion: a new one, or one that holds everything that was received before.
+        fusion: a new one, or one that holds everything before `since`.
         since: the rows wanted.
-        damaged: is called with a damaged file.
+        damaged: is told of a damaged file.
     """
-    days = (None, None if since.until is None else since.until // layout.DAY_NS + 1)
-    tables = list(reading.read(root, Kind.OBSERVATION, COLUMNS, since.where(), days, damaged))
-    if not tables:
-        return
-    table = pa.concat_tables(tables)
-    rows = segments.rows_of(table.sort_by("leave_time"))
-    o = observations_of(rows, _numbers(rows["vehicle"].astype(str)))
-    borders = np.flatnonzero(np.diff(o.time // EPOCH_NS)) + 1
-    for part in np.split(np.arange(len(o.time)), borders):
-        if len(part):
-            yield fusion.update(o.take(part), rows["weight"][part], rows["late"][part].astype(bool))
+    last = None if since.until is None else since.until // layout.DAY_NS + 1
+    wanted = reading.Wanted(COLUMNS, since.where(), (since.begin.day, last), since.begin.after)
+    for table in in_order(reading.Listing(root, Kind.OBSERVATION, wanted, damaged)):
+        vehicle = numbers(table["vehicle"])
+        rows = segments.rows_of(table.drop_columns(["vehicle"]))
+        new = np.ones(len(vehicle), bool)
+        if since.known is not None:
+            names = np.stack([vehicle, rows["boot"], rows["region"], rows["seq"]], axis=1)
+            distinct, index = np.unique(names, axis=0, return_inverse=True)
+            new = ~since.known.accepted(Kind.OBSERVATION, distinct)[index.reshape(-1)]
+        weight, late = rows["weight"][new], rows["late"][new].astype(bool)
+        o = observations_of({name: column[new] for name, column in rows.items()}, vehicle[new])
+        borders = np.flatnonzero(np.diff(o.time // EPOCH_NS)) + 1
+        for part in np.split(np.arange(len(o.time)), borders):
+            if len(part):
+                yield fusion.update(o.take(part), weight[part], late[part])
+
+
+def in_order(listing: reading.Listing) -> Iterator[pa.Table]:
+    """The rows of a listing by rising time of measurement, PART_ROWS at a time or so, cut between epochs."""
+    time = layout.TIME[listing.kind]
+    fresh = [table for table in listing.inbox() if table.num_rows]
+    inbox = pa.concat_tables(fresh).sort_by(time) if fresh else None
+    inbox_days = np.zeros(0, np.int64) if inbox is None else segments.nanoseconds(inbox[time]) // layout.DAY_NS
+    files: dict[int, list[Path]] = {day: [] for day in np.unique(inbox_days).tolist()}
+    for path in listing.files:
+        files.setdefault(layout.partition_of(path).day, []).append(path)
+    for day in sorted(files):
+        begin, end = np.searchsorted(inbox_days, [day, day + 1]).tolist()
+        mine = None if inbox is None else inbox.slice(begin, end - begin)
+        rows = end - begin + sum(_rows_of(path) for path in files[day])
+        parts = max(1, min(-(-rows // PART_ROWS), layout.DAY_NS // EPOCH_NS))
+        borders = (
+            np.linspace(0, layout.DAY_NS // EPOCH_NS, parts + 1).astype(np.int64) * EPOCH_NS
+        ) + day * layout.DAY_NS
+        for low, high in zip(borders[:-1].tolist(), borders[1:].tolist(), strict=True):
+            within = (pc.field(time) >= _time(low)) & (pc.field(time) < _time(high)) if parts > 1 else None
+            tables = [] if mine is None else [mine if within is None else mine.filter(within)]
+            tables += [table for path in files[day] if (table := listing.load(path, within)) is not None]
+            if sum(table.num_rows for table in tables):
+                yield pa.concat_tables(tables).sort_by(time)
+
+
+def _rows_of(path: Path) -> int:
+    """Rows of a file by its footer; 0 if it has none that can be read, or is gone."""
+    try:
+        return int(pq.read_metadata(path).num_rows)
+    except (OSError, pa.ArrowInvalid):
+        return 0

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import asdict
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import pyarrow as pa
 
+from fleet_service.archive.layout import Cut
 from fleet_service.fusion import Fusion
+from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.replay import checkpoints
 from fleet_service.replay.checkpoint_tables import fusion_from, tables_of
-from schemas.errors import InputError
 from schemas.wire import Alert
 
-ALERTS: Final = "alerts"  # table of a checkpoint, beside those of the fusion
+log = logging.getLogger(__name__)
+# Tables of a checkpoint beside those of the fusion.
+ALERTS: Final = "alerts"
+STREAMS: Final = "streams"
+ABOVE: Final = "streams_above"
 
 
 class Restart(NamedTuple):
@@ -22,14 +28,18 @@ class Restart(NamedTuple):
 
     Attributes:
         fusion: of the checkpoint, or a new one.
+        streams: batches that were admitted then.
         standing: alerts that stood then.
-        received: everything received until then is in it [ns]; None: nothing is.
+        cut: everything up to this segment is in it; None: nothing is.
+        weather: names of the files of weather that are in it.
         refused: checkpoints that could not be read: damaged, or of another version.
     """
 
     fusion: Fusion
+    streams: SequenceTrackers
     standing: list[Alert]
-    received: int | None
+    cut: Cut | None
+    weather: frozenset[str]
     refused: int
 
 
@@ -38,14 +48,27 @@ def restart(root: Path, lateness_s: float) -> Restart:
     refused = 0
     for path in checkpoints.newest(root):
         try:
-            tables, received = checkpoints.load(path)
+            taken = checkpoints.load(path)
+            tables = dict(taken.tables)
             standing = [Alert(**row) for row in tables.pop(ALERTS).to_pylist()]
-            return Restart(fusion_from(tables, lateness_s), standing, received, refused)
-        except (OSError, pa.ArrowInvalid, InputError, KeyError, TypeError):
+            above = tables.pop(ABOVE)["seq"].to_numpy()
+            columns = tables.pop(STREAMS)
+            streams = SequenceTrackers.of({name: columns[name].to_numpy() for name in columns.column_names}, above)
+            fusion = fusion_from(tables, lateness_s)
+        except Exception as error:  # noqa: BLE001 whatever is wrong with it, the log has it all
+            log.warning("checkpoint %s is not begun from: %s", path.name, error)
             refused += 1
-    return Restart(Fusion(lateness_s), [], None, refused)
+            continue
+        checkpoints.begin(path)
+        return Restart(fusion, streams, standing, taken.cut, frozenset(taken.weather), refused)
+    return Restart(Fusion(lateness_s), SequenceTrackers(), [], None, frozenset(), refused)
 
 
-def image_of(fusion: Fusion, standing: list[Alert]) -> dict[str, pa.Table]:
+def image_of(fusion: Fusion, standing: list[Alert], streams: SequenceTrackers) -> dict[str, pa.Table]:
     """Tables of a checkpoint: what `restart` finds again."""
-    return tables_of(fusion) | {ALERTS: pa.Table.from_pylist([asdict(alert) for alert in standing])}
+    columns, above = streams.columns()
+    return tables_of(fusion) | {
+        ALERTS: pa.Table.from_pylist([asdict(alert) for alert in standing]),
+        STREAMS: pa.table({name: pa.array(column) for name, column in columns.items()}),
+        ABOVE: pa.table({"seq": pa.array(above)}),
+    }

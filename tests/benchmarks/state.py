@@ -17,8 +17,11 @@ from typing import Final
 
 from deploy.router import open_router
 from fleet_service.app.engine import Engine
+from fleet_service.archive.layout import Cut
+from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay import checkpoints
+from fleet_service.replay.checkpoints import Taken
 from fleet_service.replay.restart import image_of
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
@@ -40,7 +43,7 @@ def state() -> list[Figure]:
         folder = Path(name)
         root = folder / "archive"
         fusion, _ = filled(CELLS, 3, SPAN_S)
-        checkpoints.save(root, image_of(fusion, []), now)
+        checkpoints.save(root, Taken(image_of(fusion, [], SequenceTrackers()), Cut(0, 0)))
         del fusion
         with closing(Engine(ServiceConfig(), root)) as engine:
             took, held = checkpoint_s(engine, root, messages(SINCE, 10, now), now)
@@ -78,7 +81,7 @@ def checkpoint_s(engine: Engine, root: Path, sent: list[Message], now: int) -> t
     began = time.perf_counter()
     taken = engine.checkpoint(threading.Event())
     assert taken is not None
-    checkpoints.save(root, *taken)
+    checkpoints.save(root, taken)
     took, busy = time.perf_counter() - began, len(turns)
     saved.set()
     worker.join()

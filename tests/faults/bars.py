@@ -40,6 +40,9 @@ BARS: Final = {
     "faults.away.lost": Bar("batches", 0),
     "faults.away.drain_share": Bar("of what the service takes", 0.8, "more"),
     "faults.away.backlog": Bar("batches a car", 1000, "more"),
+    "faults.bitrot.unnoticed": Bar("damages", 0),
+    "faults.bitrot.crash_loops": Bar("damages", 0),
+    "faults.bitrot.tried": Bar("damages", 20, "more"),
     "soak.memory_slope_mb_per_10min": Bar("MB per 10 min", 1),
     "soak.handles_growth": Bar("handles", 0),
 }

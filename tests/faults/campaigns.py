@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from typing import Final
 
-from tests.faults import away, compaction, crash_model, flood, fuzz, kill, outages, security, truncation
+from tests.faults import away, bitrot, compaction, crash_model, flood, fuzz, kill, outages, security, truncation
 from tests.faults.frame import Campaign
 
 CAMPAIGNS: Final = (
     Campaign("crash-model", crash_model.run, ("faults.crash_model.violations",)),
     Campaign("compaction", compaction.run, ("faults.compaction.incomplete_reads",)),
     Campaign("truncation", truncation.run, ("faults.truncation.lost_rows",)),
+    Campaign(
+        "bitrot",
+        bitrot.run,
+        ("faults.bitrot.unnoticed", "faults.bitrot.crash_loops", "faults.bitrot.tried"),
+    ),
     Campaign(
         "kill",
         kill.run,

@@ -127,7 +127,7 @@ def make(root: Path) -> dict[str, Any]:
                 compact(root)
                 rollup.complete(root)
                 snapshots.write(root, engine.whole_map(now_of(turn)), now_of(turn))
-                checkpoints.save(root, *taken(engine))
+                checkpoints.save(root, taken(engine))
         rows = {str(kind): engine.counts[kind] for kind in Kind}
         return map_of(engine, now_of(ROUNDS)) | {"alerts": engine.alerts, "late": engine.counts["late"], "rows": rows}
 

@@ -71,7 +71,7 @@ def test_a_service_on_the_kept_archive_has_the_map_that_it_was_made_with(old: Pa
     if begin == "log":
         drop_checkpoints(old)
     with closing(Engine(ServiceConfig(), old)) as engine:
-        assert engine.counts["checkpoints_refused"] == 0
+        assert engine.counts["checkpoints_refused"] == (begin == "checkpoint"), "it has no digests: the log is replayed"
         same(map_of(engine, MADE["at"]), MADE)
         assert engine.alerts == MADE["alerts"] > 0
         engine.ingest([m for turn in range(ROUNDS) for m in messages(turn)], now_of(ROUNDS))

@@ -1,0 +1,133 @@
+"""One bit changed in a file, of every kind that service and agent keep: it is noticed, or it changes nothing.
+
+Each time a copy of an archive is damaged and a service begins from it; its map and its rows are compared with those of
+the whole archive, and what differs must have been counted. Spools likewise: what an agent sends is what was stored.
+"""
+
+from __future__ import annotations
+
+import logging
+import random
+import shutil
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from edge_agent.publish.batching import Draft
+from edge_agent.publish.outbox import Outbox
+from fleet_service.app.engine import Engine
+from fleet_service.archive import reading
+from schemas.config import ServiceConfig
+from schemas.errors import InputError
+from schemas.runtime.figures import Figure
+from schemas.wire import Kind
+from tests.faults.bars import figure
+from tests.faults.frame import Site
+from tests.fleet_service.archive.kept import ROUNDS, make, map_of, messages, now_of
+
+KINDS: Final = {
+    "inbox": "inbox/*.parquet", "states in the inbox": "inbox/states/*.parquet",
+    "observations": "observations/*/*/*.parquet", "states": "states/*/*/*.parquet", "weather": "weather/*.parquet",
+    "key": "keys/*", "checkpoint": "checkpoints/*/*", "roll-up": "rollup/*/*/*/*.parquet", "map": "map/*/*.parquet",
+}  # fmt: skip
+BATCHES: Final = 40  # of a spool
+
+
+def run(site: Site) -> list[Figure]:
+    """Some bits of each kind of file."""
+    logging.getLogger("fleet_service").setLevel(logging.ERROR)  # every damage says so
+    logging.getLogger("edge_agent").setLevel(logging.ERROR)
+    random_, each = random.Random(site.seed), site.of(40, 1)
+    whole = site.folder / "whole"
+    make(whole)
+    right = _found(whole, whole)
+    unnoticed, loops, tried = [], [], 0
+    for kind, pattern in KINDS.items():
+        for _ in range(each):
+            copy = site.folder / "copy"
+            shutil.rmtree(copy, ignore_errors=True)
+            shutil.copytree(whole, copy)
+            path = random_.choice(sorted(copy.glob(pattern)))
+            bit = _flip(path, random_)
+            tried += 1
+            try:
+                found = _found(copy, whole)
+            except InputError:
+                if kind != "key":  # without its key an archive is another one: only a person can decide
+                    loops.append(f"{kind}: {path.name} bit {bit}")
+            except Exception as error:  # noqa: BLE001 whatever ends a service at its start ends it at each
+                loops.append(f"{kind}: {path.name} bit {bit}: {error!r}")
+            else:
+                if not found["counted"] and not _same(found, right):
+                    unnoticed.append(f"{kind}: {path.name} bit {bit}")
+    spools, wrong = _spools(site, random_, site.of(200, 15))
+    for line in (*unnoticed, *loops, *wrong):
+        site.say(line)
+    return [
+        figure("faults.bitrot.unnoticed", len(unnoticed) + len(wrong)),
+        figure("faults.bitrot.crash_loops", len(loops)),
+        figure("faults.bitrot.tried", tried + spools),
+    ]
+
+
+def _flip(path: Path, random_: random.Random) -> int:
+    data = bytearray(path.read_bytes())
+    bit = random_.randrange(8 * len(data))
+    data[bit // 8] ^= 1 << bit % 8
+    path.write_bytes(data)
+    return bit
+
+
+def _found(root: Path, whole: Path) -> dict[str, Any]:
+    """Map, rows and what was counted by a service that begins here, and hears every batch again."""
+    with closing(Engine(ServiceConfig(), root)) as engine:
+        for turn in range(ROUNDS):
+            if root != whole:
+                engine.ingest(list(messages(turn)), now_of(ROUNDS))
+        engine.flush()
+        counts = engine.counts
+        told: list[Path] = []
+        rows = {kind: _rows(root, kind, told) for kind in Kind}
+        counted = counts["files_set_aside"] + counts["checkpoints_refused"] + counts["key_failures"] + len(told)
+        return {"map": map_of(engine, now_of(ROUNDS)), "rows": rows, "counted": counted}
+
+
+def _rows(root: Path, kind: Kind, told: list[Path]) -> list[tuple[str, int, int]]:
+    columns = ("vehicle", "seq", "row")
+    return sorted(
+        row
+        for table in reading.read(root, kind, columns, damaged=lambda path, _: told.append(path))
+        for row in zip(*(table[name].to_pylist() for name in columns), strict=True)
+    )
+
+
+def _same(found: dict[str, Any], right: dict[str, Any]) -> bool:
+    beliefs = [np.asarray(one["map"]["beliefs"]) for one in (found, right)]
+    return (
+        found["rows"] == right["rows"]
+        and beliefs[0].shape == beliefs[1].shape
+        and bool(np.allclose(*beliefs, rtol=0.0, atol=1e-6))
+    )
+
+
+def _spools(site: Site, random_: random.Random, times: int) -> tuple[int, list[str]]:
+    """Bits of a spool; what was found wrong and not noticed."""
+    path, wrong = site.folder / "whole.sqlite", []
+    outbox = Outbox(path, boot=5)
+    payloads = {seq: random_.randbytes(random_.choice((80, 400))) for seq in range(1, BATCHES + 1)}
+    outbox.store([Draft("car-a", Kind.OBSERVATION, 1, 2, lambda s, f: payloads[s]) for _ in payloads], 0.0)
+    outbox.close()
+    for number in range(times):
+        copy = site.folder / f"spool-{number}.sqlite"
+        shutil.copyfile(path, copy)
+        bit = _flip(copy, random_)
+        outbox = Outbox(copy, boot=6)
+        held = {batch.seq: batch.payload for batch in outbox.held() if batch.stream.vehicle == "car-a"}
+        lost = payloads.keys() - held.keys()
+        counted = outbox.counts.damages + outbox.counts.damaged
+        if any(payloads.get(seq) != payload for seq, payload in held.items()) or (lost and not counted):
+            wrong.append(f"spool: bit {bit}")
+        outbox.close()
+    return times, wrong
