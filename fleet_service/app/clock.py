@@ -1,22 +1,49 @@
-"""The service's clock, which goes on through jumps of the system's.
+"""The service's clock: neither a jump of the system's nor a wrong one at the start makes it lose or refuse anything.
 
-A wall clock that jumps back an hour would put every honest vehicle an hour into the future, and have its reports
-refused for good; so the time never falls behind what has passed since the start. One that jumps forward makes the map
-look old, which is honest, until it jumps back. After a restart with a clock that is behind the archive (no battery, no
-time server yet) reports up to the time that has already been seen are not in the future.
+A wall clock may jump: a time server corrects it, a machine wakes up, a hand slips. So time goes on evenly from the
+start, and a jump of more than JUMP_NS is only followed once reports say so: the vehicles that drive now tell the time,
+and the clock that more of them agree with is right. Until then nothing is refused for its time that may be right by the
+other one; it is not acknowledged either, so that its sender keeps it.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Final, NamedTuple
+
+from schemas.thresholds import NS
+
+JUMP_NS: Final = 60 * NS  # a step that a time server takes at once, and no report minds
+NEAR_NS: Final = 600 * NS  # of a report that tells the time: younger than that, and not from a backlog
+VOTE_NS: Final = 5 * NS  # in which every vehicle that drives has been heard
+OFF_NS: Final = 86_400 * NS  # longer than that a service is seldom off: its clock may as well be wrong
+ANY: Final = 1 << 61  # ns; how far a clock may be off of which nothing is known
+
+
+class Moment(NamedTuple):
+    """What the service takes for the time, all in ns.
+
+    Attributes:
+        now: the time.
+        slack: how far beyond it a report may lie, by what the archive has seen.
+        doubt: how much further one may lie without being refused for good.
+        least: the true time is not before.
+        sure: whether so much is known that what is standing may end by time alone.
+    """
+
+    now: int
+    slack: int = 0
+    doubt: int = 0
+    least: int | None = None
+    sure: bool = True
 
 
 class SteadyClock:
     """Time of the service [ns UTC].
 
     Args:
-        seen: latest time at which a report was received before this start, 0 if none was.
+        seen: latest time that a report told before this start, 0 if none did.
         wall, steady: the system's clocks [ns]; `steady` never jumps, its zero does not matter.
     """
 
@@ -28,16 +55,47 @@ class SteadyClock:
     ) -> None:
         self._wall, self._steady = wall, steady
         self._zero = wall() - steady()
-        self._behind = max(0, seen - wall())
+        self._seen, self._began = seen, steady()
+        self._confirmed = False
+        self._sure = 0 <= wall() - seen <= OFF_NS
+        self._doubted: int | None = None  # since when the wall clock is elsewhere, by the steady one
+        self._votes: dict[str, bool] = {}  # of vehicles, for the wall clock
 
     def now(self) -> int:
-        """The time; may jump forward with the wall clock, and back only to what has passed since the start."""
-        return max(self._wall(), self._zero + self._steady())
+        """The time; follows small steps forward of the wall clock, and larger ones when reports agree."""
+        even, wall = self._zero + self._steady(), self._wall()
+        if abs(wall - even) <= JUMP_NS:
+            self._doubted = None
+            self._votes.clear()
+            self._zero += max(wall - even, 0)
+            return max(wall, even)
+        if self._doubted is None:
+            self._doubted = self._steady()
+        return even
 
-    def slack(self) -> int:
-        """How far beyond `now` the true time may lie [ns], by what the archive has seen."""
-        return max(0, self._zero + self._steady() + self._behind - self.now())
+    def moment(self) -> Moment:
+        """The time, and how sure it is."""
+        now, wall, seen = self.now(), self._wall(), self._seen + self._steady() - self._began
+        slack = max(0, seen - now) if self._seen else 0
+        if self._confirmed:
+            return Moment(now, slack, max(0, wall - now - slack), min(now, wall))
+        return Moment(now, slack, ANY, min(now, wall, seen) if self._seen else 0, self._sure)
+
+    def heard(self, times: Mapping[str, int]) -> None:
+        """Vehicles that were just heard, and the times that they told [ns]."""
+        now, wall = self.now(), self._wall()
+        if self._doubted is None:
+            self._confirmed = self._confirmed or any(abs(told - now) <= NEAR_NS for told in times.values())
+            return
+        for vehicle, told in times.items():
+            if abs(told - wall) <= NEAR_NS:
+                self._votes[vehicle] = True
+            elif abs(told - now) <= NEAR_NS:
+                self._votes[vehicle] = False
+        if self._steady() - self._doubted >= VOTE_NS and 2 * sum(self._votes.values()) > len(self._votes):
+            self._zero, self._confirmed = wall - self._steady(), True
 
     def lag(self) -> int:
-        """How far the wall clock is behind [ns]: the length of a jump back."""
-        return self.now() + self.slack() - self._wall()
+        """How far the wall clock is behind [ns], or ahead if negative: the length of a jump that is not followed."""
+        now = self.now()
+        return max(now, self._seen if self._seen > now else now) - self._wall()

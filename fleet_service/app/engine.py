@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from fleet_service.app.clock import Moment
 from fleet_service.app.precompile import warm_up
 from fleet_service.archive.files import lock
 from fleet_service.archive.load import count_set_aside, set_aside
@@ -161,9 +162,11 @@ class Engine:
                 tiles.setdefault(int(grid.tile_of(alert.cell)), []).append(alert)
         return [(tile, wire.encode_standing(alerts)) for tile, alerts in tiles.items() if wanted(tile)]
 
-    def ingest(self, messages: Sequence[Message], now: int, slack: int = 0) -> list[Alert]:
-        """Admit and fuse; returns the alerts that this raises or clears. `slack`: the true time may be so far ahead."""
-        clock = Clock(now, int(self._config.clock_ahead_s * NS) + slack, int(self._config.oldest_s * NS))
+    def ingest(self, messages: Sequence[Message], at: int | Moment) -> list[Alert]:
+        """Admit and fuse; returns the alerts that this raises or clears. `at`: the time, for sure if it is a number."""
+        at = at if isinstance(at, Moment) else Moment(at)
+        now, ahead = at.now, int(self._config.clock_ahead_s * NS) + at.slack
+        clock = Clock(now, ahead, int(self._config.oldest_s * NS), at.doubt, at.least)
         out: list[Alert] = []
         for kind, accepted in self._intake.accept(messages, clock).items():
             if kind is Kind.OBSERVATION:
@@ -171,6 +174,11 @@ class Engine:
             self.counts[kind] += len(accepted.rows["row"])
             self._log.add(kind, accepted.rows, accepted.batches)
         return out
+
+    @property
+    def times(self) -> dict[str, int]:
+        """The newest time that each vehicle told in the last `ingest` [ns]."""
+        return self._intake.times
 
     def _fuse(self, accepted: AcceptedBatches) -> list[Alert]:
         rows = accepted.rows

@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from fleet_service.app.clock import Moment
 from fleet_service.app.engine import Engine
 from fleet_service.archive import segments, snapshots
 from fleet_service.archive.load import count_set_aside
@@ -22,6 +23,7 @@ from fleet_service.replay import checkpoints
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
 from schemas.runtime.process import trim_memory
+from schemas.thresholds import NS
 from schemas.wire import Kind
 
 ROUND_ROWS: Final = 250_000  # of one round of compaction: a second of work, 150 MB
@@ -40,8 +42,8 @@ class Job(NamedTuple):
     work: Callable[[threading.Event], str | None]
 
 
-def archive_jobs(engine: Engine, config: ServiceConfig, root: Path) -> list[Job]:
-    """What keeps an archive in order, as the settings say."""
+def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Callable[[], Moment]) -> list[Job]:
+    """What keeps an archive in order, as the settings say; `moment` is the service's time."""
 
     def compaction(stop: threading.Event) -> str | None:
         if not config.put_to and not any(segments.paths(root, kind) for kind in Kind):
@@ -51,7 +53,7 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path) -> list[Job]
         return output and f"compacted: {output}"
 
     def snapshot(_: threading.Event) -> str | None:
-        now = time.time_ns()
+        now = moment().now
         table = engine.whole_map(now)
         if table.num_rows:
             snapshots.write(root, table, now)
@@ -64,7 +66,10 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path) -> list[Job]
         return None
 
     def retention(_: threading.Event) -> str | None:
-        done = retire(root, config.raw_days, datetime.now(UTC).date())
+        at = moment()
+        if not at.sure:
+            return "retention waits: no report has confirmed the clock yet"
+        done = retire(root, config.raw_days, datetime.fromtimestamp(at.now // NS, UTC).date())
         return f"retired: {done.days} days" if done.days else None
 
     def inventory(_: threading.Event) -> str | None:

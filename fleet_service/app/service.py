@@ -84,7 +84,11 @@ class Service:
     def _serve(self, session: zenoh.Session, stop: threading.Event, address: str) -> None:
         with (
             session,
-            upkeep(archive_jobs(self.engine, self._config, self._root), self.engine.counts, self._log_line),
+            upkeep(
+                archive_jobs(self.engine, self._config, self._root, self._clock.moment),
+                self.engine.counts,
+                self._log_line,
+            ),
             self._declared(session),
         ):
             self._session = session
@@ -164,7 +168,8 @@ class Service:
             self.engine.update_weather(self._clock.now())
         if now - self._put_at >= self._config.put_s:
             self._put_at = now
-            self._put_alerts(session, self.engine.fade_alerts(self._clock.now()))
+            if (at := self._clock.moment()).sure:
+                self._put_alerts(session, self.engine.fade_alerts(at.now))
             self._put_tiles(session)
         if now - self._reported_at >= STATUS_S:
             self._status(now)
@@ -186,7 +191,7 @@ class Service:
 
     def _take(self, session: zenoh.Session, messages: list[Message]) -> None:
         if messages:
-            self._put_alerts(session, self.engine.ingest(messages, self._clock.now(), self._clock.slack()))
+            self._put_alerts(session, take(self.engine, self._clock, messages))
 
     def _acknowledge(self, session: zenoh.Session, acks: list[tuple[str, bytes]]) -> None:
         for vehicle, ack in acks:
@@ -211,11 +216,19 @@ class Service:
             f"{self.engine.fusion.size} cells, {self.engine.alerts} alerts, queue {len(self.inbox)}"
             + (f"; {rest}" if rest else "")
             + (f"; the system's clock is {behind:.0f} s behind" if behind >= LAG_S else "")
+            + (f"; the system's clock has jumped {-behind:.0f} s ahead, no report agrees" if behind <= -LAG_S else "")
         )
         self._log_line(Line(text, cells=self.engine.fusion.size, queue=len(self.inbox), counts=dict(counts)))
 
     def _answer(self, wanted: MapQuery, near: Callable[[int], bool], only: int | None) -> Iterator[tuple[int, bytes]]:
         return self.engine.answer(wanted, near, self._clock.now(), only)
+
+
+def take(engine: Engine, clock: SteadyClock, messages: list[Message]) -> list[Alert]:
+    """Let an engine take messages now, and the clock hear what time they tell."""
+    alerts = engine.ingest(messages, clock.moment())
+    clock.heard(engine.times)
+    return alerts
 
 
 def put(session: zenoh.Session, key: str, payload: bytes, encoding: str) -> None:

@@ -24,6 +24,7 @@ from fleet_service.ingest.dedup import BatchId, SequenceTracker, SequenceTracker
 from fleet_service.ingest.rate_limit import RateLimiter
 from fleet_service.ingest.validation import Clock, Refusal
 from schemas.grid import cell_of
+from schemas.keys import Parsed
 from schemas.numeric import BoolArray, IntArray
 from schemas.runtime.batch_decoder import decode_many
 from schemas.thresholds import NS
@@ -125,12 +126,14 @@ class BatchIntake:
         self._pending: set[BatchId] = set()  # accepted, not yet on disk
         self._known: dict[Kind, dict[tuple[str, int, int, int], SequenceTracker]] = {kind: {} for kind in Kind}
         self._forgot = 0
+        self.times: dict[str, int] = {}  # newest that each vehicle told in the last call [ns]
 
     def accept(self, messages: Sequence[Message], clock: Clock) -> dict[Kind, AcceptedBatches]:
         """Rows of the good and new batches, by kind."""
-        if clock.now - self._forgot > FORGET_NS:
+        self.times.clear()
+        if abs(clock.now - self._forgot) > FORGET_NS:
             self._forgot = clock.now
-            self._streams.forget(clock.now - clock.oldest)
+            self._streams.forget(clock.horizon)
             for known in self._known.values():
                 known.clear()
         out = {}
@@ -157,10 +160,19 @@ class BatchIntake:
         keyed = [owner for owner in found_owners if owner is not None]
         owners = keyed if len(found.indices) == len(keyed) else [keyed[place] for place in found.indices]
         broken, rules = validation.check_heads(kind, owners, found.heads, time, clock)
+        self._tell_time(owners, time)
         for place in np.flatnonzero(broken >= 0).tolist():
-            self._refuse(str(owners[place].name), found.heads.at(place), rules[broken[place]])
+            if rules[broken[place]].rule == "time" and 0 < int(time[place]) - clock.now - clock.ahead <= clock.doubt:
+                self._counts["clock_doubted"] += 1  # neither let in nor refused: its sender keeps it
+            else:
+                self._refuse(str(owners[place].name), found.heads.at(place), rules[broken[place]])
         new = self._new(kind, found.heads, time, broken < 0)
         return self._rows(kind, new, time, found, clock) if new else AcceptedBatches([], {})
+
+    def _tell_time(self, owners: Sequence[Parsed], time: IntArray) -> None:
+        for owner, told in zip(owners, time.tolist(), strict=True):
+            name = str(owner.name)
+            self.times[name] = max(self.times.get(name, 0), told)
 
     def _new(self, kind: Kind, heads: Heads, time: IntArray, good: BoolArray) -> dict[BatchId, int]:
         """Those of the good batches that were not accepted before, each once, and their places."""

@@ -54,6 +54,13 @@ class Clock(NamedTuple):
     now: int
     ahead: int
     oldest: int
+    doubt: int = 0  # beyond `ahead`: neither accepted nor refused
+    least: int | None = None  # the true time is not before; None: it is `now`
+
+    @property
+    def horizon(self) -> int:
+        """Older records are refused, and what is known of their streams is forgotten."""
+        return (self.now if self.least is None else min(self.least, self.now)) - self.oldest
 
 
 class Refusal(NamedTuple):
@@ -186,4 +193,4 @@ def _broken_state(columns: Columns, clock: Clock) -> list[tuple[NDArray[np.bool_
 
 
 def _untimely(first: IntArray, last: IntArray, clock: Clock) -> NDArray[np.bool_]:
-    return (first < clock.now - clock.oldest) | (last > clock.now + clock.ahead)
+    return (first < clock.horizon) | (last > clock.now + clock.ahead)

@@ -43,6 +43,11 @@ BARS: Final = {
     "faults.bitrot.unnoticed": Bar("damages", 0),
     "faults.bitrot.crash_loops": Bar("damages", 0),
     "faults.bitrot.tried": Bar("damages", 20, "more"),
+    "faults.clocks.rejected": Bar("batches", 0),
+    "faults.clocks.doubled": Bar("rows", 0),
+    "faults.clocks.retired": Bar("rows", 0),
+    "faults.clocks.alerts_lost": Bar("times", 0),
+    "faults.clocks.sent": Bar("batches", 2000, "more"),
     "soak.memory_slope_mb_per_10min": Bar("MB per 10 min", 1),
     "soak.handles_growth": Bar("handles", 0),
 }

@@ -104,12 +104,8 @@ def _rows(root: Path, kind: Kind, told: list[Path]) -> list[tuple[str, int, int]
 
 
 def _same(found: dict[str, Any], right: dict[str, Any]) -> bool:
-    beliefs = [np.asarray(one["map"]["beliefs"]) for one in (found, right)]
-    return (
-        found["rows"] == right["rows"]
-        and beliefs[0].shape == beliefs[1].shape
-        and bool(np.allclose(*beliefs, rtol=0.0, atol=1e-6))
-    )
+    now, then = (np.asarray(one["map"]["beliefs"]) for one in (found, right))
+    return bool(found["rows"] == right["rows"] and now.shape == then.shape and np.allclose(now, then, 0.0, 1e-6))
 
 
 def _spools(site: Site, random_: random.Random, times: int) -> tuple[int, list[str]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from tests.faults import away, bitrot, compaction, crash_model, flood, fuzz, kill, outages, security, truncation
+from tests.faults import away, bitrot, clocks, compaction, crash_model, flood, fuzz, kill, outages, security, truncation
 from tests.faults.frame import Campaign
 
 CAMPAIGNS: Final = (
@@ -15,6 +15,14 @@ CAMPAIGNS: Final = (
         "bitrot",
         bitrot.run,
         ("faults.bitrot.unnoticed", "faults.bitrot.crash_loops", "faults.bitrot.tried"),
+    ),
+    Campaign(
+        "clocks",
+        clocks.run,
+        (
+            *("faults.clocks.rejected", "faults.clocks.doubled", "faults.clocks.retired"),
+            *("faults.clocks.alerts_lost", "faults.clocks.sent"),
+        ),
     ),
     Campaign(
         "kill",

@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from fleet_service.app import jobs, service
+from fleet_service.app.clock import SteadyClock
 from fleet_service.app.engine import Engine
 from fleet_service.app.service import Service
 from fleet_service.ingest.inbox import Message
@@ -47,13 +48,15 @@ def of_engine(look: Callable[[Engine], object]) -> Show:
 
 def of_jobs(config: ServiceConfig, root: Path) -> object:
     with closing(Engine(config, root)) as engine:
-        return {job.name: job.every_s for job in jobs.archive_jobs(engine, config, root)}
+        return {job.name: job.every_s for job in jobs.archive_jobs(engine, config, root, SteadyClock().moment)}
 
 
 def of_compaction(config: ServiceConfig, root: Path) -> object:
     shutil.copytree(DATA / "v1.0" / "archive", root)
     with closing(Engine(config, root)) as engine:
-        (compaction,) = (job for job in jobs.archive_jobs(engine, config, root) if job.name == "compaction")
+        (compaction,) = (
+            job for job in jobs.archive_jobs(engine, config, root, SteadyClock().moment) if job.name == "compaction"
+        )
         assert compaction.work(threading.Event())
     return sorted(path.name for path in root.parent.joinpath("there").rglob("*.parquet"))
 

@@ -9,15 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from fleet_service.app.clock import SteadyClock
+from fleet_service.app.clock import Moment, SteadyClock
 from fleet_service.app.engine import Engine
+from fleet_service.app.service import take
 from fleet_service.ingest.inbox import Message
 from schemas import wire
 from schemas.config import ServiceConfig
 from schemas.wire import Kind
 from tests.fleet_service.examples import SECOND, batch, key
 
-HOUR, DAY = 3600 * SECOND, 86_400 * SECOND
+HOUR, DAY, YEAR = 3600 * SECOND, 86_400 * SECOND, 365 * 86_400 * SECOND
 
 
 @dataclass
@@ -35,18 +36,44 @@ class System:
         return SteadyClock(seen, lambda: self.wall, lambda: self.steady)
 
 
-def test_a_jump_back_is_not_followed_and_one_forward_only_until_it_is_taken_back() -> None:
+def test_a_jump_back_is_not_followed_nor_one_ahead_that_no_report_agrees_with() -> None:
     start = time.time_ns()
     system = System(start)
     clock = system.clock()
     system.passes(SECOND)
-    assert (clock.now(), clock.slack(), clock.lag()) == (start + SECOND, 0, 0)
+    clock.heard({"car-a": system.wall})
+    assert clock.moment() == Moment(start + SECOND, 0, 0, start + SECOND)
     system.passes(SECOND, jump=-HOUR)
     assert (clock.now(), clock.lag()) == (start + 2 * SECOND, HOUR)
-    system.passes(SECOND, jump=HOUR + DAY)
-    assert clock.now() == start + 3 * SECOND + DAY
-    system.passes(SECOND, jump=-DAY)
-    assert (clock.now(), clock.slack(), clock.lag()) == (start + 4 * SECOND, 0, 0)
+    system.passes(SECOND, jump=HOUR + YEAR)
+    assert (clock.now(), clock.moment().doubt, clock.lag()) == (start + 3 * SECOND, YEAR, -YEAR)
+    for _ in range(20):
+        system.passes(SECOND)
+        clock.heard({"car-a": system.wall - YEAR, "car-b": system.wall - YEAR, "liar": system.wall})
+    assert clock.now() == start + 23 * SECOND
+    system.passes(SECOND, jump=-YEAR)
+    assert clock.moment() == Moment(start + 24 * SECOND, 0, 0, start + 24 * SECOND)
+
+
+@pytest.mark.parametrize("wrong", [-30 * 365, 365])
+def test_a_clock_that_was_wrong_and_is_put_right_is_followed_when_most_reports_agree(wrong: int) -> None:
+    true = time.time_ns()
+    system = System(true + wrong * DAY)
+    clock = system.clock()
+    assert clock.moment().doubt > 40 * YEAR, "nothing is known: nothing is refused"
+    assert clock.moment().least == 0
+    system.passes(SECOND, jump=-wrong * DAY)
+    for second in range(1, 12):
+        system.passes(SECOND)
+        clock.heard({"car-a": true + second * SECOND, "car-b": true + second * SECOND, "parked": true - HOUR})
+    assert clock.moment() == Moment(system.wall, 0, 0, system.wall)
+
+
+def test_a_small_step_ahead_is_followed_at_once() -> None:
+    system = System(time.time_ns())
+    clock = system.clock()
+    system.passes(SECOND, jump=20 * SECOND)
+    assert clock.now() == system.wall
 
 
 def test_after_a_restart_what_was_seen_before_is_not_the_future() -> None:
@@ -54,9 +81,22 @@ def test_after_a_restart_what_was_seen_before_is_not_the_future() -> None:
     system = System(seen - HOUR)
     clock = system.clock(seen)
     system.passes(SECOND)
-    assert (clock.now(), clock.slack(), clock.lag()) == (seen - HOUR + SECOND, HOUR, HOUR)
-    system.passes(SECOND, jump=HOUR)
-    assert (clock.now(), clock.slack()) == (seen + 2 * SECOND, 0)
+    at = clock.moment()
+    assert (at.now, at.slack, at.least, clock.lag()) == (
+        seen - HOUR + SECOND,
+        HOUR,
+        seen - HOUR + SECOND,
+        HOUR - SECOND,
+    )
+    assert not at.sure
+
+
+def test_after_a_restart_a_year_ahead_nothing_is_too_old_and_nothing_ends_by_time() -> None:
+    seen = time.time_ns()
+    clock = System(seen + YEAR).clock(seen)
+    assert clock.moment().least == seen
+    assert not clock.moment().sure
+    assert System(seen + HOUR).clock(seen).moment().sure, "off for an hour is nothing unusual"
 
 
 def message(seq: int, at: int) -> Message:
@@ -64,7 +104,7 @@ def message(seq: int, at: int) -> Message:
     return Message(Kind.OBSERVATION, key("sim-001"), wire.encode(sent), wire.ENCODING[Kind.OBSERVATION])
 
 
-@pytest.mark.parametrize("jump", [-HOUR, DAY, 0])
+@pytest.mark.parametrize("jump", [-YEAR, -HOUR, DAY, YEAR, 0])
 def test_honest_reports_are_kept_through_jumps_and_restarts_of_the_service(tmp_path: Path, jump: int) -> None:
     true = time.time_ns()
     system = System(true)
@@ -72,7 +112,7 @@ def test_honest_reports_are_kept_through_jumps_and_restarts_of_the_service(tmp_p
         with closing(Engine(ServiceConfig(), tmp_path)) as engine:
             clock = system.clock(engine.seen)
             for step in range(2):
-                engine.ingest([message(1 + 2 * start + step, true)], clock.now(), clock.slack())
+                take(engine, clock, [message(1 + 2 * start + step, true)])
                 engine.flush()
                 true += SECOND
                 system.passes(SECOND, jump=jump * (start == step == 0))

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from fleet_service.app.clock import SteadyClock
 from fleet_service.app.engine import Engine
 from fleet_service.app.jobs import Job, archive_jobs, upkeep
 from fleet_service.archive.compaction import compacting
@@ -86,7 +87,7 @@ def test_a_compaction_that_fails_is_said_and_one_that_runs_is_stopped_with_the_s
             [Message(Kind.OBSERVATION, key("sim-001"), wire.encode(batch("sim-001", 1, now(), [0.8])), "")], now()
         )
         engine.flush()
-        compaction, *_ = archive_jobs(engine, ServiceConfig(), tmp_path)
+        compaction, *_ = archive_jobs(engine, ServiceConfig(), tmp_path, SteadyClock().moment)
         with compacting(tmp_path), pytest.raises(InputError, match="being compacted"):
             compaction.work(threading.Event())
         stopped = threading.Event()

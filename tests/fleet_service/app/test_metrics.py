@@ -11,6 +11,7 @@ import zenoh
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 
 from fleet_service.app import metrics
+from fleet_service.app.clock import SteadyClock
 from fleet_service.app.engine import Engine
 from fleet_service.app.jobs import archive_jobs
 from fleet_service.app.metrics import Pulse
@@ -67,7 +68,9 @@ def test_damaged_files_are_counted_by_a_job_and_not_by_who_reads_the_metrics(tmp
     for name in ("inbox/a.parquet.bad", "weather/b.parquet.bad"):
         (tmp_path / name).touch()
     assert damaged() == 0, "a scrape walks through no archive"
-    (inventory,) = (job for job in archive_jobs(engine, config, tmp_path) if job.name == "inventory")
+    (inventory,) = (
+        job for job in archive_jobs(engine, config, tmp_path, SteadyClock().moment) if job.name == "inventory"
+    )
     inventory.work(threading.Event())
     assert damaged() == 2
     engine.close()

@@ -1,0 +1,154 @@
+"""A service's clock a year ahead or back for a minute, while it runs or at its start; vehicles go on, and sit on ice.
+
+The clock is the service's own, on made-up clocks of the machine; messages, engine, archive, checkpoint, retention and
+restart are real. Each case: vehicles find ice, the clock jumps, they go on and send some batches again; then a restart.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import pyarrow as pa
+
+from fleet_service.app.clock import SteadyClock
+from fleet_service.app.engine import Engine
+from fleet_service.app.jobs import archive_jobs
+from fleet_service.app.service import take
+from fleet_service.archive import reading
+from fleet_service.archive.compaction import compact
+from fleet_service.ingest.inbox import Message
+from schemas import wire
+from schemas.config import ServiceConfig
+from schemas.runtime.figures import Figure
+from schemas.thresholds import NS
+from schemas.wire import Kind
+from tests.faults.bars import figure
+from tests.faults.frame import Site
+from tests.fleet_service.examples import batch, key
+from tests.fleet_service.replay.test_checkpoints import keep
+
+YEAR: Final = 365 * 86_400 * NS
+VEHICLES: Final = 6
+CONFIG: Final = ServiceConfig(raw_days=31)
+
+
+class Case(NamedTuple):
+    """By how much the clock is off, and when."""
+
+    jump: int
+    at_start: bool
+
+
+@dataclass
+class Machine:
+    """Its clocks [ns]; the true time, and by how much the wall clock is off."""
+
+    true: int
+    off: int = 0
+
+    def clock(self, seen: int) -> SteadyClock:
+        """A service's clock on it."""
+        return SteadyClock(seen, lambda: self.true + self.off, lambda: self.true)
+
+
+@dataclass
+class Found:
+    """What went wrong, summed up over cases."""
+
+    sent: int = 0
+    rejected: int = 0
+    doubled: int = 0
+    retired: int = 0
+    lost: int = 0
+    alerts_lost: int = 0
+
+
+def run(site: Site) -> list[Figure]:
+    """A year ahead, a year back, thirty years back as without a battery; at run and at start."""
+    cases = [Case(jump, at_start) for jump in (YEAR, -YEAR, -30 * YEAR) for at_start in (False, True)]
+    found = Found()
+    for number, case in enumerate(cases):
+        _one(site.folder / str(number), case, found, site.of(60, 20))
+        site.say(f"{case}: {found}")
+    return [
+        figure("faults.clocks.rejected", found.rejected),
+        figure("faults.clocks.doubled", found.doubled),
+        figure("faults.clocks.retired", found.retired + found.lost),
+        figure("faults.clocks.alerts_lost", found.alerts_lost),
+        figure("faults.clocks.sent", found.sent),
+    ]
+
+
+def _one(root: Path, case: Case, found: Found, seconds: int) -> None:
+    machine, seq = Machine(time.time_ns()), 0
+
+    def drive(engine: Engine, clock: SteadyClock, steps: int) -> None:
+        """All report each second, and send what they sent before once more; then the service does its jobs."""
+        nonlocal seq
+        for _ in range(steps):
+            machine.true += NS
+            seq += 1
+            found.sent += VEHICLES
+            for again in (max(seq - 5, 1), seq):
+                take(engine, clock, [_message(v, again, machine.true - (seq - again) * NS) for v in range(VEHICLES)])
+            engine.flush()
+            if clock.moment().sure:
+                engine.fade_alerts(clock.now())
+
+    def live(off: int, steps: int, check: Callable[[Engine], None] | None = None) -> None:
+        machine.off = off
+        with closing(Engine(CONFIG, root)) as engine:
+            clock = machine.clock(engine.seen)
+            if check is not None:
+                check(engine)
+            drive(engine, clock, steps)
+            if not case.at_start:
+                machine.off = case.jump
+                drive(engine, clock, seconds)
+                _retire(root, engine, clock)
+                machine.off = 0
+                drive(engine, clock, seconds)
+            if case.at_start and off:
+                _retire(root, engine, clock)
+                machine.off = 0
+                drive(engine, clock, seconds)
+            keep(engine, root)
+            compact(root)
+            drive(engine, clock, 3)
+            found.rejected += sum(n for name, n in engine.counts.items() if name.startswith("refused"))
+            found.alerts_lost += engine.alerts == 0
+
+    def stands(engine: Engine) -> None:
+        found.alerts_lost += engine.alerts == 0
+
+    live(0, seconds)
+    live(case.jump if case.at_start else 0, seconds, stands)
+    live(0, 3, stands)
+    rows = _rows(root)
+    found.doubled += sum(n - 1 for n in rows.values())
+    found.lost += VEHICLES * seq - len(rows)
+
+
+def _retire(root: Path, engine: Engine, clock: SteadyClock) -> None:
+    """Retention as the service does it."""
+    jobs = archive_jobs(engine, CONFIG, root, clock.moment)
+    next(job for job in jobs if job.name == "retention").work(threading.Event())
+
+
+def _message(vehicle: int, seq: int, at: int) -> Message:
+    one = batch(f"sim-{vehicle:03}", seq, at, [0.15])
+    return Message(Kind.OBSERVATION, key(one.vehicle), wire.encode(one), wire.ENCODING[Kind.OBSERVATION])
+
+
+def _rows(root: Path) -> Counter[tuple[int, int]]:
+    """How often each batch's row is in the archive; a vehicle has another pseudonym in another month."""
+    tables = list(reading.read(root, Kind.OBSERVATION, ["boot", "seq"]))
+    table = pa.concat_tables(tables)
+    return Counter(zip(table["boot"].to_numpy().tolist(), table["seq"].to_numpy().tolist(), strict=True))
