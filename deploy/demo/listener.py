@@ -37,8 +37,10 @@ class Listener:
             self.tiles[str(sample.key_expr)] = read_tile(sample.payload.to_bytes())
 
     def _on_alert(self, sample: zenoh.Sample) -> None:
+        alert = wire.decode_alert(sample.payload.to_bytes())
         with self._lock:
-            self.alerts.append((time.time_ns(), wire.decode_alert(sample.payload.to_bytes())))
+            if all(alert != known for _, known in self.alerts):  # one that stands is put again and again
+                self.alerts.append((time.time_ns(), alert))
 
     def close(self) -> None:
         """End the session; a session that is left open keeps the interpreter from ending."""

@@ -21,7 +21,7 @@ OFF_NS: Final = 86_400 * NS  # longer than that a service is seldom off: its clo
 ANY: Final = 1 << 61  # ns; how far a clock may be off of which nothing is known
 
 
-class Moment(NamedTuple):
+class TimeNow(NamedTuple):
     """What the service takes for the time, all in ns.
 
     Attributes:
@@ -73,13 +73,13 @@ class SteadyClock:
             self._doubted = self._steady()
         return even
 
-    def moment(self) -> Moment:
+    def moment(self) -> TimeNow:
         """The time, and how sure it is."""
         now, wall, seen = self.now(), self._wall(), self._seen + self._steady() - self._began
         slack = max(0, seen - now) if self._seen else 0
         if self._confirmed:
-            return Moment(now, slack, max(0, wall - now - slack), min(now, wall))
-        return Moment(now, slack, ANY, min(now, wall, seen) if self._seen else 0, self._sure)
+            return TimeNow(now, slack, max(0, wall - now - slack), min(now, wall))
+        return TimeNow(now, slack, ANY, min(now, wall, seen) if self._seen else 0, self._sure)
 
     def heard(self, times: Mapping[str, int]) -> None:
         """Vehicles that were just heard, and the times that they told [ns]."""

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.app.clock import Moment
+from fleet_service.app.clock import TimeNow
 from fleet_service.app.precompile import warm_up
 from fleet_service.archive.files import lock
 from fleet_service.archive.load import count_set_aside, set_aside
@@ -53,6 +53,7 @@ from schemas.wire import Alert, Kind
 # Rows that wait for the disk at the most; beyond, nothing is taken from the queue until a segment is written.
 WAITING_ROWS = 1_000_000
 CHECKPOINT_WAIT_S = 0.2  # between two looks whether the service stops
+CHECKPOINT_MOST_S = 10.0  # for a good segment; a full disk gives none, and other jobs make room
 SNAPSHOT_SLOTS = 20_000  # at once: the lock is held for 40 ms, and little memory is needed
 
 
@@ -81,6 +82,7 @@ class Engine:
         """Begin with what the archive holds."""
         self.counts: Counter[str] = Counter()
         self.report_lag_s = 0.0  # between the end of the newest visit and its arrival
+        self._turn = 0  # of the alerts that are told again
         self.failing = False  # the last segment could not be written
         begin = restart(root, config.lateness_s)
         self.fusion, streams = begin.fusion, begin.streams
@@ -119,9 +121,13 @@ class Engine:
         The worker takes it, right after a segment: then every row that is in it is on disk. Called by another thread.
         """
         self._checkpoint_wanted.set()
+        deadline = time.monotonic() + CHECKPOINT_MOST_S
         while not stop.is_set():
             with suppress(queue.Empty):
                 return self._checkpoints.get(timeout=CHECKPOINT_WAIT_S)
+            if time.monotonic() > deadline:
+                self._checkpoint_wanted.clear()
+                raise OSError("no segment could be written for so long")
         return None
 
     def survived(self) -> None:
@@ -145,6 +151,11 @@ class Engine:
         return self._log.unsettled
 
     @property
+    def hangs_s(self) -> float:
+        """For how long a segment that is being written has not ended [s]."""
+        return self._log.hangs_s
+
+    @property
     def alerts(self) -> int:
         """Cells under an alert."""
         return len(self._alerts.raised)
@@ -162,9 +173,18 @@ class Engine:
                 tiles.setdefault(int(grid.tile_of(alert.cell)), []).append(alert)
         return [(tile, wire.encode_standing(alerts)) for tile, alerts in tiles.items() if wanted(tile)]
 
-    def ingest(self, messages: Sequence[Message], at: int | Moment) -> list[Alert]:
+    def repeated(self, most: int) -> list[Alert]:
+        """Alerts that stand, so many at the most and in turn: who was away hears them too."""
+        with self._guard:
+            standing = self._alerts.standing
+        self._turn = self._turn % max(len(standing), 1)
+        out = standing[self._turn : self._turn + most]
+        self._turn += len(out)
+        return out
+
+    def ingest(self, messages: Sequence[Message], at: int | TimeNow) -> list[Alert]:
         """Admit and fuse; returns the alerts that this raises or clears. `at`: the time, for sure if it is a number."""
-        at = at if isinstance(at, Moment) else Moment(at)
+        at = at if isinstance(at, TimeNow) else TimeNow(at)
         now, ahead = at.now, int(self._config.clock_ahead_s * NS) + at.slack
         clock = Clock(now, ahead, int(self._config.oldest_s * NS), at.doubt, at.least)
         out: list[Alert] = []

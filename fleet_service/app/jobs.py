@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import subprocess
 import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from fleet_service.app.clock import Moment
+from fleet_service.app.clock import TimeNow
 from fleet_service.app.engine import Engine
-from fleet_service.archive import segments, snapshots
+from fleet_service.archive import reserve, segments, snapshots
 from fleet_service.archive.load import count_set_aside
 from fleet_service.archive.retention import retire
 from fleet_service.replay import checkpoints
@@ -26,11 +26,13 @@ from schemas.runtime.process import trim_memory
 from schemas.thresholds import NS
 from schemas.wire import Kind
 
+log = logging.getLogger(__name__)
 ROUND_ROWS: Final = 250_000  # of one round of compaction: a second of work, 150 MB
 LOOK_S: Final = 0.1  # between two looks whether a compaction has ended, or shall
 INVENTORY_S: Final = 300.0  # thousands of files are looked through in a tenth of a second
 DAY_S: Final = 86_400.0
 SOON_S: Final = 60.0  # after the start; the first turn of a job does not wait for its whole interval
+HANGS_S: Final = 1800.0  # a compaction of a day's backlog takes minutes
 _NICE: Final = 10  # the worker goes first
 
 
@@ -42,10 +44,11 @@ class Job(NamedTuple):
     work: Callable[[threading.Event], str | None]
 
 
-def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Callable[[], Moment]) -> list[Job]:
+def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Callable[[], TimeNow]) -> list[Job]:
     """What keeps an archive in order, as the settings say; `moment` is the service's time."""
 
     def compaction(stop: threading.Event) -> str | None:
+        reserve.keep(root)
         if not config.put_to and not any(segments.paths(root, kind) for kind in Kind):
             return None
         words = ["compact", "--archive", str(root), "--round-rows", str(ROUND_ROWS)]
@@ -76,11 +79,24 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
         engine.counts["files_set_aside"] = count_set_aside(root)
         return None
 
+    def with_room(work: Callable[[threading.Event], str | None]) -> Callable[[threading.Event], str | None]:
+        """On a full disk a job that makes room has the reserve to work with."""
+
+        def done(stop: threading.Event) -> str | None:
+            try:
+                return work(stop)
+            except (OSError, InputError):
+                if not reserve.give(root):
+                    raise
+                return work(stop)
+
+        return done
+
     return [
-        Job("compaction", config.compact_s, compaction),
+        Job("compaction", config.compact_s, with_room(compaction)),
         Job("checkpoint", config.checkpoint_s, checkpoint),
         Job("snapshot", config.snapshot_s, snapshot),
-        Job("retention", DAY_S if config.raw_days else 0.0, retention),
+        Job("retention", DAY_S if config.raw_days else 0.0, with_room(retention)),
         Job("inventory", INVENTORY_S, inventory),
     ]
 
@@ -106,32 +122,64 @@ def _beside(words: Sequence[str], stop: threading.Event) -> str | None:
     return output.strip()
 
 
-@contextmanager
-def upkeep(jobs: Sequence[Job], counts: Counter[str], log_line: Callable[[str], None]) -> Iterator[None]:
-    """Do the jobs in turn while the block runs; what fails is counted as `NAME_failures` and tried again next time."""
-    stop = threading.Event()
-    thread = threading.Thread(target=_keep, args=([job for job in jobs if job.every_s], counts, log_line, stop))
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
+class Upkeep:
+    """The jobs while they are done, in a thread of their own.
 
+    Attributes:
+        failed: how often in a row each job has failed that failed the last time.
+    """
 
-def _keep(jobs: Sequence[Job], counts: Counter[str], log_line: Callable[[str], None], stop: threading.Event) -> None:
-    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)  # of this thread alone, on Linux
-    began = time.monotonic()
-    due = {job: began + min(job.every_s, SOON_S) for job in jobs}
-    while due and not stop.wait(max(min(due.values()) - time.monotonic(), 0.0)):
-        job = min(due, key=lambda job: due[job])
-        due[job] = time.monotonic() + job.every_s
+    def __init__(self, jobs: Sequence[Job], counts: Counter[str], log_line: Callable[[str], None]) -> None:
+        self._jobs = [job for job in jobs if job.every_s]
+        self._counts, self._log_line = counts, log_line
+        self.failed: dict[str, int] = {}
+        self._stop = threading.Event()
+        self._busy: tuple[str, float] | None = None
+        self._thread = threading.Thread(target=self._keep, name="upkeep")
+
+    def troubles(self) -> list[str]:
+        """What is not as it should be."""
+        found = [f"{name} failed {times} times in a row" for name, times in list(self.failed.items())]
+        busy = self._busy
+        if busy is not None and time.monotonic() - busy[1] > HANGS_S:
+            found.append(f"{busy[0]} has not ended for {time.monotonic() - busy[1]:.0f} s")
+        if self._thread.ident is not None and not self._thread.is_alive() and not self._stop.is_set():
+            found.append("upkeep has ended; start the service again")
+        return found
+
+    def __enter__(self) -> Upkeep:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _keep(self) -> None:
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)  # of this thread alone, on Linux
+        began = time.monotonic()
+        due = {job: began + min(job.every_s, SOON_S) for job in self._jobs}
+        while due and not self._stop.wait(max(min(due.values()) - time.monotonic(), 0.0)):
+            job = min(due, key=lambda job: due[job])
+            again_s = job.every_s if self._done(job) else min(job.every_s, SOON_S)
+            due[job] = time.monotonic() + again_s
+
+    def _done(self, job: Job) -> bool:
+        """Do one turn of a job; whether it went well. Whatever is wrong with it, the others must go on."""
+        self._busy = (job.name, time.monotonic())
         try:
-            line = job.work(stop)
-            counts[f"{job.name}_runs"] += 1
-        except (OSError, InputError) as error:
-            counts[f"{job.name}_failures"] += 1
-            line = f"{job.name} failed: {error}"
+            line = job.work(self._stop)
+            self._counts[f"{job.name}_runs"] += 1
+            self.failed.pop(job.name, None)
+            well = True
+        except Exception as error:
+            self._counts[f"{job.name}_failures"] += 1
+            self.failed[job.name] = self.failed.get(job.name, 0) + 1
+            line, well = f"{job.name} failed: {error}", False
+            if not isinstance(error, (OSError, InputError)):
+                log.exception("%s failed", job.name)
+        self._busy = None
         trim_memory()
         if line:
-            log_line(line)
+            self._log_line(line)
+        return well

@@ -13,12 +13,17 @@ from schemas.runtime.metrics import Metric, gauge
 from schemas.wire import Kind
 
 STALLED_S: Final = 5.0  # without a turn of the worker, which takes milliseconds
+CLOCK_S: Final = 60.0  # the system's clock is elsewhere by so much: a time server is missing
 FULL: Final = 0.9  # of the queue
 _FAMILIES: Final = (  # prefix of the counts, name, label, text
     ("refused.", "refused_messages", "reason", "batches that were refused, by reason"),
     ("bad_queries.", "bad_queries", "field", "queries that were refused, by parameter"),
 )
 _SINGLE: Final = {
+    "key_failures": "batches without a key for their month: it is damaged, or cannot be written",
+    "too_many_gaps": "batches with too many missing before them",
+    "clock_doubted": "batches neither let in nor refused, since the time is in doubt",
+    "checkpoints_refused": "checkpoints that were damaged, of another version, or died of",
     "duplicates": "batches that came again",
     "overload": "messages dropped because the queue was full",
     "limited": "messages dropped because their vehicle sent too much",
@@ -68,6 +73,10 @@ def troubles(engine: Engine, pulse: Pulse, config: ServiceConfig) -> list[str]:
     found = [] if pulse.routers else ["no router is connected"]
     if pulse.turn_age_s > STALLED_S:
         found.append(f"the worker has done nothing for {pulse.turn_age_s:.0f} s")
+    if engine.hangs_s > STALLED_S:
+        found.append(f"a segment is being written for {engine.hangs_s:.0f} s")
+    if abs(pulse.clock_lag_s) > CLOCK_S:
+        found.append(f"the system's clock is {abs(pulse.clock_lag_s):.0f} s off by what is known")
     if engine.failing:
         found.append("segments cannot be written")
     if pulse.queued > FULL * config.queue_batches:

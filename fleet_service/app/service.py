@@ -19,7 +19,7 @@ import zenoh
 
 from fleet_service.app.clock import SteadyClock
 from fleet_service.app.engine import Engine
-from fleet_service.app.jobs import archive_jobs, upkeep
+from fleet_service.app.jobs import Upkeep, archive_jobs
 from fleet_service.app.metrics import Pulse, metrics, troubles
 from fleet_service.enrolment.fleet import Enrolment
 from fleet_service.ingest.inbox import Inbox, Message
@@ -29,12 +29,15 @@ from fleet_service.serve.queryable import MapQueryable
 from schemas import grid, keys, wire
 from schemas.config import ServiceConfig, load
 from schemas.query import MapQuery
-from schemas.runtime import zenoh_session
+from schemas.runtime import watchdog, zenoh_session
 from schemas.runtime.metrics import serving
 from schemas.runtime.process import Line
 from schemas.wire import Alert, Kind
 
 IDLE_S: Final = 0.05  # longest wait for a message; bounds how late a segment or a tile can be
+REPEAT_S: Final = 2.0  # between two puts of alerts that stand: who comes back waits less than 5 s for them
+REPEATED: Final = 1000  # alerts in such a turn, 150 kB; more go in turn
+HANGS_S: Final = 60.0  # of a segment that is being written: the disk is gone, and systemd is to start anew
 STATUS_S: Final = 5.0
 LEAVE_S: Final = 1.5  # of the three seconds in which a service is gone
 SURVIVED_S: Final = 20.0  # a service that is still there has not died of its checkpoint
@@ -61,9 +64,11 @@ class Service:
         limits = RateLimiter(config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, known, self.engine.counts)
         self._replies = MapQueryable(self._answer, self.engine.counts)
         self.inbox = Inbox(config.queue_batches, self.engine.counts, limits)
+        jobs = archive_jobs(self.engine, config, root, self._clock.moment)
+        self._upkeep = Upkeep(jobs, self.engine.counts, log_line)
         self.failure: BaseException | None = None  # of the worker; leaving the session after it may hang
         self._session: zenoh.Session | None = None
-        self._stepped_at = self._put_at = self._flushed_at = self._reported_at = time.monotonic()
+        self._stepped_at = self._put_at = self._flushed_at = self._reported_at = self._repeated_at = time.monotonic()
         self._reported, self._began, self._survived = 0, self._stepped_at, False
 
     def run(self, stop: threading.Event) -> None:
@@ -82,15 +87,7 @@ class Service:
         return 1 if self.failure is not None or self.engine.unsettled else 0
 
     def _serve(self, session: zenoh.Session, stop: threading.Event, address: str) -> None:
-        with (
-            session,
-            upkeep(
-                archive_jobs(self.engine, self._config, self._root, self._clock.moment),
-                self.engine.counts,
-                self._log_line,
-            ),
-            self._declared(session),
-        ):
+        with session, self._upkeep, self._declared(session):
             self._session = session
             self._log_line(f"ready: {self._config.name}, {self.engine.fusion.size} cells from the archive{address}")
             try:
@@ -112,7 +109,8 @@ class Service:
 
         return serving(
             config.metrics_host, config.metrics_port,
-            lambda: metrics(engine, pulse(), config, root), lambda: troubles(engine, pulse(), config),
+            lambda: metrics(engine, pulse(), config, root),
+            lambda: troubles(engine, pulse(), config) + self._upkeep.troubles(),
         )  # fmt: skip
 
     @contextmanager
@@ -171,8 +169,13 @@ class Service:
             if (at := self._clock.moment()).sure:
                 self._put_alerts(session, self.engine.fade_alerts(at.now))
             self._put_tiles(session)
+        if now - self._repeated_at >= REPEAT_S:
+            self._repeated_at = now
+            self._put_alerts(session, self.engine.repeated(REPEATED))
         if now - self._reported_at >= STATUS_S:
             self._status(now)
+            if self.engine.hangs_s < HANGS_S:
+                watchdog.alive()
         if not self._survived and now - self._began >= SURVIVED_S:
             self._survived = True
             self.engine.survived()

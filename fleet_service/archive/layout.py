@@ -11,6 +11,7 @@ The date is that of the measurement (UTC). NAME is that of the newest segment wh
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from datetime import date, timedelta
 from pathlib import Path
@@ -26,6 +27,7 @@ TIME: Final = {Kind.OBSERVATION: "leave_time", Kind.STATE: "time"}  # of the mea
 CHECKPOINTS: Final = "checkpoints"  # a folder
 DAY_NS: Final = 86_400_000_000_000
 _EPOCH: Final = date(1970, 1, 1)
+_DAY: Final = re.compile(r"date=\d{4}-(0[1-9]|1[0-2])-(0[1-9]|[12]\d|3[01])")  # and no copy that somebody made of one
 
 
 class Cut(NamedTuple):
@@ -91,7 +93,7 @@ def compacted(root: Path, kind: Kind, since_day: int | None = None, until_day: i
 
 def days(root: Path, table: str, since_day: int | None = None, until_day: int | None = None) -> list[Path]:
     """Folders of a table's days, in order."""
-    found = sorted((root / table).glob("date=*"))
+    found = sorted(path for path in (root / table).glob("date=*") if _DAY.fullmatch(path.name))
     return [
         folder
         for folder in found

@@ -5,6 +5,7 @@ Segments are written in a thread of their own, so that messages are taken meanwh
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -59,12 +60,18 @@ class SegmentLog(Generic[Batch]):
         self._next: _Load[Batch] = _Load()
         self._load: _Load[Batch] = _Load()  # what was handed over
         self._written: Future[None] | None = None
+        self._begun = 0.0
         self._thread = ThreadPoolExecutor(1, "segments")
 
     @property
     def newest(self) -> Cut:
         """The segment that was written last."""
         return self._writer.newest
+
+    @property
+    def hangs_s(self) -> float:
+        """For how long the write that was begun has not ended [s]."""
+        return 0.0 if self._written is None or self._written.done() else time.monotonic() - self._begun
 
     @property
     def rows(self) -> int:
@@ -91,6 +98,7 @@ class SegmentLog(Generic[Batch]):
         if self._written is None:
             self._load.take(self._next)
             self._next = _Load()
+            self._begun = time.monotonic()
             self._written = self._thread.submit(self._load.write, self._writer)
 
     def end(self) -> list[Batch]:

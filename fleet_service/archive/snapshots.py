@@ -38,7 +38,7 @@ def write(root: Path, table: pa.Table, now: int) -> Path:
 
 
 def time_of(path: Path) -> int:
-    """Moment [ns] of a snapshot."""
+    """TimeNow [ns] of a snapshot."""
     return int(datetime.strptime(path.stem, _NAME).replace(tzinfo=UTC).timestamp()) * NS
 
 

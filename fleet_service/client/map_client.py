@@ -161,9 +161,21 @@ def watch(connection: ZenohSettings, bbox: str | None, stop: threading.Event, sa
         if tile is not None:
             say(_tile_line(tile, decode_tile(sample.payload.to_bytes())))
 
+    known: set[wire.Alert] = set()
+
     def alerted(sample: zenoh.Sample) -> None:
         if near(str(sample.key_expr)) is not None:
-            say(_alert_line(wire.decode_alert(sample.payload.to_bytes())))
+            tell(wire.decode_alert(sample.payload.to_bytes()))
+
+    def tell(alert: wire.Alert) -> None:
+        """Say what is news: an alert is put again and again while it stands."""
+        place = {one for one in list(known) if (one.cell, one.sector) == (alert.cell, alert.sector)}
+        if alert.raised and alert in place:
+            return
+        known.difference_update(place)
+        if alert.raised:
+            known.add(alert)
+        say(_alert_line(alert))
 
     session = zenoh_session.open_session(connection, stop)
     if session is None:
@@ -174,7 +186,7 @@ def watch(connection: ZenohSettings, bbox: str | None, stop: threading.Event, sa
         for reply in session.get(f"{keys.ROOT}/alert/**"):  # after the subscription: none is missed in between
             if reply.ok is not None and near(str(reply.ok.key_expr)) is not None:
                 for alert in wire.decode_standing(reply.ok.payload.to_bytes()):
-                    say(_alert_line(alert))
+                    tell(alert)
         say("watching")
         stop.wait()
 

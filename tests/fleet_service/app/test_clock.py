@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fleet_service.app.clock import Moment, SteadyClock
+from fleet_service.app.clock import SteadyClock, TimeNow
 from fleet_service.app.engine import Engine
 from fleet_service.app.service import take
 from fleet_service.ingest.inbox import Message
@@ -42,7 +42,7 @@ def test_a_jump_back_is_not_followed_nor_one_ahead_that_no_report_agrees_with() 
     clock = system.clock()
     system.passes(SECOND)
     clock.heard({"car-a": system.wall})
-    assert clock.moment() == Moment(start + SECOND, 0, 0, start + SECOND)
+    assert clock.moment() == TimeNow(start + SECOND, 0, 0, start + SECOND)
     system.passes(SECOND, jump=-HOUR)
     assert (clock.now(), clock.lag()) == (start + 2 * SECOND, HOUR)
     system.passes(SECOND, jump=HOUR + YEAR)
@@ -52,7 +52,7 @@ def test_a_jump_back_is_not_followed_nor_one_ahead_that_no_report_agrees_with() 
         clock.heard({"car-a": system.wall - YEAR, "car-b": system.wall - YEAR, "liar": system.wall})
     assert clock.now() == start + 23 * SECOND
     system.passes(SECOND, jump=-YEAR)
-    assert clock.moment() == Moment(start + 24 * SECOND, 0, 0, start + 24 * SECOND)
+    assert clock.moment() == TimeNow(start + 24 * SECOND, 0, 0, start + 24 * SECOND)
 
 
 @pytest.mark.parametrize("wrong", [-30 * 365, 365])
@@ -66,7 +66,7 @@ def test_a_clock_that_was_wrong_and_is_put_right_is_followed_when_most_reports_a
     for second in range(1, 12):
         system.passes(SECOND)
         clock.heard({"car-a": true + second * SECOND, "car-b": true + second * SECOND, "parked": true - HOUR})
-    assert clock.moment() == Moment(system.wall, 0, 0, system.wall)
+    assert clock.moment() == TimeNow(system.wall, 0, 0, system.wall)
 
 
 def test_a_small_step_ahead_is_followed_at_once() -> None:

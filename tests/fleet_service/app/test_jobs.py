@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 from collections import Counter
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import zenoh
 
+from fleet_service.app import engine as engine_module
 from fleet_service.app.clock import SteadyClock
 from fleet_service.app.engine import Engine
-from fleet_service.app.jobs import Job, archive_jobs, upkeep
+from fleet_service.app.jobs import Job, Upkeep, archive_jobs
+from fleet_service.archive import layout, reserve
 from fleet_service.archive.compaction import compacting
 from fleet_service.cli import main
 from fleet_service.ingest.inbox import Message
@@ -55,16 +59,57 @@ def test_a_job_that_fails_is_counted_said_and_done_again(tmp_path: Path) -> None
 
     counts: Counter[str] = Counter()
     lines: list[str] = []
-    with upkeep([Job("mending", 0.001, work)], counts, lines.append):
+    with Upkeep([Job("mending", 0.001, work)], counts, lines.append):
         until(lambda: len(turns) > 2)
     assert counts["mending_failures"] == 1
     assert lines == ["mending failed: no disk", "well"]
 
 
+def test_a_job_that_fails_in_a_way_nobody_foresaw_ends_no_other_and_is_a_trouble(tmp_path: Path) -> None:
+    turns: list[int] = []
+
+    def work(stop: threading.Event) -> str | None:
+        raise ValueError("Invalid isoformat string: '2026-01-31 (copy)'")
+
+    counts: Counter[str] = Counter()
+    jobs = [Job("broken", 0.001, work), Job("other", 0.001, lambda _: turns.append(1))]
+    with Upkeep(jobs, counts, lambda _: None) as upkeep:
+        until(lambda: len(turns) > 5 and counts["broken_failures"] > 5)
+        assert upkeep.troubles()[0].startswith("broken failed ")
+
+
+def test_a_copy_of_a_days_folder_is_none_of_the_archive(tmp_path: Path) -> None:
+    for name in ("date=2026-01-31 (copy)", "date=2026-01-31", "date=2026-99-99"):
+        (tmp_path / "observations" / name).mkdir(parents=True)
+    assert [path.name for path in layout.days(tmp_path, "observations")] == ["date=2026-01-31"]
+
+
+def test_a_checkpoint_that_no_good_segment_comes_for_does_not_keep_the_jobs_that_make_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine_module, "CHECKPOINT_MOST_S", 0.05)
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine, pytest.raises(OSError, match="no segment"):
+        engine.checkpoint(threading.Event())  # the worker, which nobody is here, flushes nothing
+
+
+def test_on_a_full_disk_the_jobs_that_make_room_have_the_reserve(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reserve, "SIZE", 1 << 16)
+    reserve.keep(tmp_path)
+    assert (tmp_path / "reserve").stat().st_size == 1 << 16
+    assert not reserve.give(tmp_path), "there is room"
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
+    assert reserve.give(tmp_path)
+    assert not (tmp_path / "reserve").exists()
+    reserve.keep(tmp_path)
+    assert not (tmp_path / "reserve").exists()
+
+
 def test_a_job_of_no_interval_is_never_done(tmp_path: Path) -> None:
     done: Callable[[threading.Event], str | None] = lambda _: "done"  # noqa: E731
     lines: list[str] = []
-    with upkeep([Job("never", 0.0, done)], Counter(), lines.append):
+    with Upkeep([Job("never", 0.0, done)], Counter(), lines.append):
         pass
     assert not lines
 

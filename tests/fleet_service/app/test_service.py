@@ -39,9 +39,9 @@ class Fleet:
         self.acks = 0
         session.declare_subscriber(f"{keys.ROOT}/ack/*", self._acked)
         session.declare_subscriber(f"{keys.ROOT}/map/**", self._tile)
-        session.declare_subscriber(
-            f"{keys.ROOT}/alert/**", lambda s: self.alerts.put(wire.decode_alert(s.payload.to_bytes()))
-        )
+        self.repeated = 0
+        self._last: dict[tuple[int, int], wire.Alert] = {}
+        session.declare_subscriber(f"{keys.ROOT}/alert/**", self._alerted)
 
     def meet(self, *regions: int) -> Fleet:
         """Wait until services for the regions hear what is published and asked."""
@@ -63,6 +63,14 @@ class Fleet:
                 self.durable[vehicle].update(range(first, last + 1))
             self.rejected += [(vehicle, *refused) for refused in stream.rejected]
         self.acks += 1
+
+    def _alerted(self, sample: zenoh.Sample) -> None:
+        alert = wire.decode_alert(sample.payload.to_bytes())
+        if self._last.get((alert.cell, alert.sector)) == alert:
+            self.repeated += 1  # it stands still
+        else:
+            self._last[alert.cell, alert.sector] = alert
+            self.alerts.put(alert)
 
     def _tile(self, sample: zenoh.Sample) -> None:
         self.tiles.put((str(sample.key_expr), pa.ipc.open_stream(sample.payload.to_bytes()).read_all()))

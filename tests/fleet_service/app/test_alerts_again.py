@@ -1,0 +1,29 @@
+"""An alert that stands is told again: who was away, or behind a router that was restarted, hears it."""
+
+from __future__ import annotations
+
+import pytest
+import zenoh
+
+from tests.fleet_service.app.test_service import Fleet, seconds
+from tests.fleet_service.conftest import Running
+from tests.fleet_service.examples import batch
+
+
+@pytest.fixture
+def fleet(service: Running, session: zenoh.Session) -> Fleet:
+    return Fleet(session).meet()
+
+
+def test_an_alert_that_stands_is_put_again_for_who_was_away_and_one_that_is_cleared_is_not(fleet: Fleet) -> None:
+    moments = seconds()
+    fleet.settle(*(batch(f"sim-{k:03}", 1, next(moments), [0.2]) for k in range(3)))
+    raised = fleet.alerts.get(timeout=10.0)
+    late = Fleet(fleet.session)
+    assert late.alerts.get(timeout=10.0) == raised
+    for k in range(10):
+        fleet.settle(batch(f"sim-{100 + k}", 1, next(moments), [0.85]))
+    assert not late.alerts.get(timeout=10.0).raised
+    before = late.repeated
+    fleet.settle(batch("sim-200", 1, next(moments), [0.85]))
+    assert late.repeated == before
