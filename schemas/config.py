@@ -119,10 +119,10 @@ class ServiceConfig(MonitoringSettings):
         default=20_000, ge=1, description="batches waiting at the most; more wait unacknowledged"
     )
     vehicle_kb_s: Positive = Field(
-        default=250.0, description="[kB/s] that a vehicle may send in the long run, 1500 records; more waits with it"
+        default=40.0, description="[kB/s] that a vehicle may send in the long run, 250 records; more waits with it"
     )
     vehicle_burst_kb: Positive = Field(
-        default=1000.0, ge=64.0, description="[kB] at once, as after an outage; the largest batch must fit"
+        default=2000.0, ge=64.0, description="[kB] at once, as after an outage of an hour; the largest batch must fit"
     )
     fleet: Path | None = Field(
         default=None, description="enrolment file; reports of vehicles that are not on it are not looked at"

@@ -5,7 +5,7 @@ A batch is due when it is full, when its oldest record has waited long enough, o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Final, NamedTuple
@@ -14,8 +14,12 @@ import numpy as np
 
 from edge_agent.observe.observation_builder import RecordBlock
 from schemas import grid
+from schemas.numeric import IntArray
+from schemas.thresholds import NS
 from schemas.wire import Batch, Columns, Kind, encode
 
+SPAN_NS: Final = 600 * NS  # of a batch; a service refuses an hour
+_TIME: Final = {Kind.OBSERVATION: "leave_time", Kind.STATE: "time"}
 UNNUMBERED: Final = 0  # the outbox numbers a batch when it takes it in
 
 
@@ -87,8 +91,8 @@ class Batcher:
                 continue
             del self._groups[place]
             joined = {name: np.concatenate([part[name] for part in group.parts]) for name in group.parts[0]}
-            starts = range(0, ready, self._rows)
-            drafts += [self._draft(place, _slice(joined, at, min(at + self._rows, ready))) for at in starts]
+            for first, last in _runs(joined[_TIME[place.kind]], ready, self._rows):
+                drafts.append(self._draft(place, _slice(joined, first, last)))
             if ready < group.rows:
                 rest = _slice(joined, ready, group.rows)
                 self._groups[place] = _Group(now, rows=group.rows - ready, parts=[rest])
@@ -98,6 +102,15 @@ class Batcher:
         name = self._names[place.vehicle]
         batch = Batch(place.kind, name, self._boot, place.region, UNNUMBERED, UNNUMBERED, columns, self._estimator)
         return Draft(name, place.kind, place.region, batch.rows, partial(_encoded, batch))
+
+
+def _runs(time: IntArray, ready: int, rows: int) -> Iterator[tuple[int, int]]:
+    """First and last place of each batch: so many rows, and no longer a time, as a drive that is filled in has it."""
+    first = 0
+    for at in range(1, ready + 1):
+        if at == ready or at - first == rows or abs(int(time[at]) - int(time[first])) > SPAN_NS:
+            yield first, at
+            first = at
 
 
 def _slice(columns: Columns, first: int, last: int) -> Columns:

@@ -24,9 +24,11 @@ from fleet_service.archive.files import lock
 from fleet_service.archive.load import count_set_aside, set_aside
 from fleet_service.archive.log import SegmentLog
 from fleet_service.archive.pseudonyms import Pseudonyms
+from fleet_service.archive.segments import Rows
 from fleet_service.fusion import observations_of
 from fleet_service.fusion.weather import Reports
 from fleet_service.ingest.acks import Acks
+from fleet_service.ingest.budgets import NEW_CELLS_AT_ONCE, NEW_CELLS_PER_HOUR, Bucket, Tracks
 from fleet_service.ingest.dedup import BatchId
 from fleet_service.ingest.inbox import AcceptedBatches, BatchIntake, Message
 from fleet_service.ingest.validation import Clock
@@ -44,7 +46,7 @@ from fleet_service.serve.tile_cache import TileCache
 from schemas import grid, wire
 from schemas.config import ServiceConfig, nanoseconds
 from schemas.errors import InputError
-from schemas.numeric import IntArray
+from schemas.numeric import BoolArray, IntArray
 from schemas.query import MapQuery
 from schemas.tables import MAP_SCHEMA
 from schemas.thresholds import NS
@@ -82,6 +84,7 @@ class Engine:
         """Begin with what the archive holds."""
         self.counts: Counter[str] = Counter()
         self.report_lag_s = 0.0  # between the end of the newest visit and its arrival
+        self._tracks, self._places = Tracks(), Bucket(NEW_CELLS_AT_ONCE, NEW_CELLS_PER_HOUR)
         self._turn = 0  # of the alerts that are told again
         self.failing = False  # the last segment could not be written
         begin = restart(root, config.lateness_s)
@@ -204,14 +207,30 @@ class Engine:
         rows = accepted.rows
         self.report_lag_s = float((rows["received_at"] - rows["leave_time"]).min()) * 1e-9
         with self._guard:
-            updated = self.fusion.update(observations_of(rows, rows["vehicle_number"]))
+            heard = np.flatnonzero(~self._beyond(rows))
+            updated = self.fusion.update(observations_of(rows, rows["witness"]).take(heard))
             self.map.changed(updated.slots)
             raised = self._alerts.updated(updated.slots)
             if raised:
                 self._tiles.acknowledge()
-        rows["late"], rows["weight"] = updated.late, updated.weight
+        rows["late"], rows["weight"] = np.ones(len(rows["row"]), bool), np.zeros(len(rows["row"]), np.float32)
+        rows["late"][heard], rows["weight"][heard] = updated.late, updated.weight
         self.counts["late"] += int(updated.late.sum())
         return raised
+
+    def _beyond(self, rows: Rows) -> BoolArray:
+        """Which rows are archived and not fused: their vehicle cannot be there, or makes too many new places."""
+        witness = rows["witness"]
+        beyond = self._tracks.impossible(witness, rows["leave_time"], rows["latitude"], rows["longitude"])
+        self.counts["implausible_moves"] += int(beyond.sum())
+        new = np.flatnonzero((self.fusion.slots_of(rows["cell"], rows["sector"].astype(np.int64)) < 0) & ~beyond)
+        for vehicle in np.unique(witness[new]).tolist():
+            mine = new[witness[new] == vehicle]
+            _, place = np.unique(rows["cell"][mine], return_inverse=True)
+            given = self._places.take(vehicle, int(place.max()) + 1, float(rows["received_at"][0]) / NS)
+            beyond[mine[place >= given]] = True
+            self.counts["too_many_places"] += int((place >= given).sum())
+        return beyond
 
     def update_weather(self, now: int) -> None:
         """Let the weather act that came since the last call."""

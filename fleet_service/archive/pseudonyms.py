@@ -43,7 +43,7 @@ class Pseudonyms:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
+        self.folder = folder
         self._keys: dict[str, bytes] = {}
         self._known: dict[tuple[str, str], str] = {}
         self._month_of_day: dict[int, str] = {}
@@ -67,20 +67,29 @@ class Pseudonyms:
             month = self._month_of_day[day] = f"{datetime.fromtimestamp(day * 86400, UTC):%Y-%m}"
         return month
 
+    def month(self, time: int) -> str:
+        """The month (2026-01) whose key is used at a time [ns]."""
+        return self._month(time // _DAY_NS)
+
     def _key(self, month: str) -> bytes:
         if month not in self._keys:
-            path = self._folder / f"{month}.key"
-            if not path.exists():
-                self._make(path)
-            self._keys[month] = _checked(path)
+            self._keys[month] = kept_key(self.folder / f"{month}.key")
         return self._keys[month]
 
-    def _make(self, path: Path) -> None:
-        self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+
+def kept_key(path: Path) -> bytes:
+    """A key in a file of mode 600, made if there is none.
+
+    Raises:
+        OSError: it can neither be read nor written, or is damaged.
+    """
+    if not path.exists():
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with written(path, 0o600) as file:
             key = secrets.token_bytes(KEY_BYTES)
             file.write(key + _check(key))
-        sync_directory(self._folder.parent)  # without it power loss forgets the key, and acknowledged batches with it
+        sync_directory(path.parent.parent)  # else power loss forgets the key, and acknowledged batches with it
+    return _checked(path)
 
 
 def _checked(path: Path) -> bytes:

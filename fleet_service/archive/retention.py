@@ -13,12 +13,12 @@ from typing import Final, NamedTuple
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_service.archive import layout, reading, rollup
+from fleet_service.archive import layout, reading, rollup, witnesses
 from fleet_service.archive.compaction import compact, compacting
 from fleet_service.archive.files import COMPACTED, lock, put_in_place
 from fleet_service.archive.layout import TABLES
 from fleet_service.archive.load import content
-from fleet_service.archive.pseudonyms import Pseudonyms
+from fleet_service.archive.pseudonyms import Pseudonyms, number
 from fleet_service.archive.version import KEY
 from schemas.errors import InputError
 from schemas.runtime.durable import sync_directory
@@ -82,6 +82,7 @@ def forget_period(root: Path, month: str) -> None:
     """
     with lock(root):
         key = key_of(root, month)
+        witnesses.forget(key.parent, month)
         key.unlink()
         sync_directory(key.parent)
 
@@ -99,6 +100,7 @@ def forget_vehicle(root: Path, vehicle: str, month: str) -> int:
         compact(root)
         noon = (first - date(1970, 1, 1)).days * layout.DAY_NS + layout.DAY_NS // 2
         pseudonym = Pseudonyms(root / _KEYS).of(vehicle, noon)
+        witnesses.forget(root / _KEYS, month, number(pseudonym))
         with compacting(root):
             drop_checkpoints(root)  # what it reported is in them
             return sum(

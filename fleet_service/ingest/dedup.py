@@ -27,15 +27,16 @@ class SequenceTracker:
     Attributes:
         key: its name.
         vehicle: enrolled name of the sender; empty until it is heard.
+        witness: number that the map knows it by, in every month; 0 until it is heard.
         low: every seq up to here is settled, or will never come.
         seen: the accepted ones above.
         newest: time of the newest accepted batch's first record [ns].
     """
 
-    __slots__ = ("key", "low", "newest", "seen", "vehicle")
+    __slots__ = ("key", "low", "newest", "seen", "vehicle", "witness")
 
     def __init__(self, key: StreamKey) -> None:
-        self.key, self.vehicle = key, ""
+        self.key, self.vehicle, self.witness = key, "", 0
         self.low, self.newest = 0, 0
         self.seen: set[int] | frozenset[int] = _NONE
 
@@ -97,6 +98,9 @@ class SequenceTrackers:
         if stream is None:
             stream = self._streams[key] = SequenceTracker(key)
         return stream
+
+    def __contains__(self, key: StreamKey) -> bool:
+        return key in self._streams
 
     def __len__(self) -> int:
         return len(self._streams)

@@ -10,16 +10,20 @@ import queue
 from collections import Counter
 from collections.abc import Callable, Sequence
 from itertools import compress
+from threading import Lock
 from time import sleep
 from typing import Final, NamedTuple
 
 import numpy as np
 import zenoh
 
+from fleet_service.archive.layout import TIME
 from fleet_service.archive.pseudonyms import Pseudonyms, number, texts
 from fleet_service.archive.segments import Rows, stepped
+from fleet_service.archive.witnesses import Witnesses
 from fleet_service.ingest import validation
 from fleet_service.ingest.acks import Acks
+from fleet_service.ingest.budgets import STREAMS_AT_ONCE, STREAMS_PER_HOUR, Bucket
 from fleet_service.ingest.dedup import BatchId, SequenceTracker, SequenceTrackers
 from fleet_service.ingest.rate_limit import RateLimiter
 from fleet_service.ingest.validation import Clock, Refusal
@@ -41,6 +45,7 @@ STEP_BYTES: Final = 768 * 1024
 # interpreter is free for answers.
 GATHER_S: Final = 0.01
 GATHERED: Final = 64  # messages
+QUEUE_BYTES: Final = 64 << 20  # that wait at the most: half a minute's work, whatever the number of messages
 DAY_NS: Final = 86_400 * NS
 FORGET_NS: Final = 600 * NS  # between two looks for streams too old to matter
 
@@ -66,23 +71,27 @@ class Inbox:
     def __init__(self, capacity: int, counts: Counter[str], limits: RateLimiter) -> None:
         self._queue: queue.SimpleQueue[Message] = queue.SimpleQueue()  # without locks in Python, a fifth of the cost
         self._capacity, self._counts, self._limits = capacity, counts, limits
+        self._bytes, self._guard = 0, Lock()
 
     def callback(self, kind: Kind) -> Callable[[zenoh.Sample], None]:
         """The subscriber's callback for one kind."""
 
         def take(sample: zenoh.Sample) -> None:
             key, payload = str(sample.key_expr), sample.payload
-            if sample.kind == zenoh.SampleKind.PUT and self._limits.allows(key, len(payload)):
-                self.put(Message(kind, key, payload.to_bytes(), str(sample.encoding)))
+            encoding = str(sample.encoding)
+            if sample.kind == zenoh.SampleKind.PUT and self._limits.allows(key, len(payload), encoding):
+                self.put(Message(kind, key, payload.to_bytes(), encoding))
 
         return take
 
     def put(self, message: Message) -> None:
         """Enqueue, or drop and count."""
-        if self._queue.qsize() < self._capacity:
-            self._queue.put(message)
-        else:
+        if self._queue.qsize() >= self._capacity or self._bytes >= QUEUE_BYTES:
             self._counts["overload"] += 1
+            return
+        with self._guard:
+            self._bytes += len(message.payload)
+        self._queue.put(message)
 
     def drain(self, wait_s: float) -> list[Message]:
         """What is there, as much as a step takes; waits up to `wait_s` for the first, and then a moment for more."""
@@ -98,6 +107,8 @@ class Inbox:
                 size += len(out[-1].payload)
         except queue.Empty:
             pass
+        with self._guard:
+            self._bytes -= sum(len(message.payload) for message in out)
         return out
 
     def __len__(self) -> int:
@@ -123,14 +134,17 @@ class BatchIntake:
 
     def __init__(self, streams: SequenceTrackers, pseudonyms: Pseudonyms, counts: Counter[str], acks: Acks) -> None:
         self._streams, self._pseudonyms, self._counts, self._acks = streams, pseudonyms, counts, acks
+        self._witnesses = Witnesses(pseudonyms.folder)
+        self._budget = Bucket(STREAMS_AT_ONCE, STREAMS_PER_HOUR)
         self._pending: set[BatchId] = set()  # accepted, not yet on disk
         self._known: dict[Kind, dict[tuple[str, int, int, int], SequenceTracker]] = {kind: {} for kind in Kind}
-        self._forgot = 0
+        self._forgot, self._now = 0, 0.0
         self.times: dict[str, int] = {}  # newest that each vehicle told in the last call [ns]
 
     def accept(self, messages: Sequence[Message], clock: Clock) -> dict[Kind, AcceptedBatches]:
         """Rows of the good and new batches, by kind."""
         self.times.clear()
+        self._now = clock.now / NS
         if abs(clock.now - self._forgot) > FORGET_NS:
             self._forgot = clock.now
             self._streams.forget(clock.horizon)
@@ -200,16 +214,21 @@ class BatchIntake:
         return out
 
     def _look_up(self, kind: Kind, name: tuple[str, int, int, int], time: int) -> SequenceTracker | None:
-        """The stream of a (vehicle, boot, region, day); None without a key: the vehicle keeps its batch until the disk
-        is well again."""
+        """The stream of a (vehicle, boot, region, day); None without a key, or if the vehicle opens too many: it keeps
+        its batch until the disk is well again, or the hour is over."""
         vehicle, boot, region, _ = name
         try:
-            pseudonym = self._pseudonyms.of(vehicle, time)
+            pseudonym = number(self._pseudonyms.of(vehicle, time))
+            witness = self._witnesses.of(vehicle, self._pseudonyms.month(time), pseudonym)
         except OSError:
             self._counts["key_failures"] += 1
             return None
-        stream = self._known[kind][name] = self._streams[number(pseudonym), boot, kind, region]
-        stream.vehicle = vehicle
+        key = (pseudonym, boot, kind, region)
+        if key not in self._streams and not self._budget.take(witness, 1, self._now):
+            self._counts["too_many_streams"] += 1
+            return None
+        stream = self._known[kind][name] = self._streams[key]
+        stream.vehicle, stream.witness = vehicle, witness
         return stream
 
     def _rows(
@@ -228,6 +247,9 @@ class BatchIntake:
                 good[place] = False
                 refusal = rules[broken[index]]._replace(row=int(rows["row"][index]))
                 self._refuse(batches[place][0].vehicle, heads.at(place), refusal)
+        for place in np.flatnonzero(validation.too_long(rows[TIME[kind]], sizes) & good).tolist():
+            good[place] = False
+            self._refuse(batches[place][0].vehicle, heads.at(place), validation.TOO_LONG)
         first = time[list(new.values())].tolist()
         for place, at in compress(enumerate(first), good.tolist()):
             stream, seq = batches[place]
@@ -265,7 +287,8 @@ def _named(kind: Kind, batches: list[BatchId], heads: Heads, rows: Rows, sizes: 
     """Rows with what their batches say of themselves, as the archive wants them."""
     numbers = np.array([stream.key[0] for stream, _ in batches], np.int64)
     identity = {
-        "vehicle": texts(numbers), "vehicle_number": numbers, "estimator": np.array(heads.estimator, np.bytes_),
+        "vehicle": texts(numbers), "witness": np.array([stream.witness for stream, _ in batches], np.int64),
+        "estimator": np.array(heads.estimator, np.bytes_),
         "boot": heads.boot, "seq": heads.seq, "first_held": heads.first_held,
     }  # fmt: skip
     rows |= {name: np.repeat(values, sizes) for name, values in identity.items()}

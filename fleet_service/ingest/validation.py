@@ -27,6 +27,7 @@ from schemas.wire.batches import Heads
 
 BATCH: Final = -1  # row number of a refusal that concerns the batch as a whole
 MAX_VISIT_NS: Final = 86_400_000_000_000  # a car may park in its cell for a day
+MAX_SPAN_NS: Final = 3_600_000_000_000  # of a batch; agents cut at ten minutes, and flush each second
 YAW_TOLERANCE: Final = np.radians(75.0)  # between yaw and the sector's axis: 45° and what a bend turns in one visit
 ESTIMATOR_PATTERN: Final = r"[a-z0-9][a-z0-9-]{0,63}"
 KEYS_REMEMBERED: Final = 1 << 16  # a vehicle has two; reading one costs as much as all else that is asked of a message
@@ -150,6 +151,17 @@ def check_rows(kind: Kind, columns: Columns, region: IntArray, clock: Clock) -> 
     broken += [rows for rows, _, _ in extra]
     rules += [Refusal(rule, 0, reason) for _, rule, reason in extra]
     return _first(broken), tuple(rules)
+
+
+TOO_LONG: Final = Refusal("time", BATCH, "time: more than an hour between the batch's records; send one each second")
+
+
+def too_long(time: IntArray, sizes: IntArray) -> NDArray[np.bool_]:
+    """Which batches span more than MAX_SPAN_NS: times (n,) of all rows [ns], rows of each batch (k,)."""
+    if not len(time):
+        return np.zeros(len(sizes), bool)
+    starts = np.cumsum(sizes) - sizes
+    return np.asarray(np.maximum.reduceat(time, starts) - np.minimum.reduceat(time, starts) > MAX_SPAN_NS)
 
 
 def _broken_ranges(kind: Kind, columns: Columns) -> tuple[list[NDArray[np.bool_]], list[Refusal]]:

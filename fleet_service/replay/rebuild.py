@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 from fleet_service.archive import layout, reading, segments
 from fleet_service.archive.load import Damaged, pass_over
 from fleet_service.archive.pseudonyms import number
+from fleet_service.archive.witnesses import numbers_of
 from fleet_service.fusion import Fusion, Updated, observations_of
 from fleet_service.fusion.constants import EPOCH_NS
 from fleet_service.ingest.dedup import SequenceTrackers
@@ -151,7 +152,8 @@ def replay(
             distinct, index = np.unique(names, axis=0, return_inverse=True)
             new = ~since.known.accepted(Kind.OBSERVATION, distinct)[index.reshape(-1)]
         weight, late = rows["weight"][new], rows["late"][new].astype(bool)
-        o = observations_of({name: column[new] for name, column in rows.items()}, vehicle[new])
+        witness = numbers_of(root / "keys", vehicle[new])
+        o = observations_of({name: column[new] for name, column in rows.items()}, witness)
         borders = np.flatnonzero(np.diff(o.time // EPOCH_NS)) + 1
         for part in np.split(np.arange(len(o.time)), borders):
             if len(part):

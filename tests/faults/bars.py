@@ -48,6 +48,11 @@ BARS: Final = {
     "faults.clocks.retired": Bar("rows", 0),
     "faults.clocks.alerts_lost": Bar("times", 0),
     "faults.clocks.sent": Bar("batches", 2000, "more"),
+    "faults.insider.alerts_alone": Bar("alerts", 0),
+    "faults.insider.mb_per_hour": Bar("MB an hour", 20),
+    "faults.insider.honest_delay_s": Bar("s", 2),
+    "faults.insider.messages": Bar("messages/s of the insider", 5, "more"),
+    "faults.insider.honest_lost": Bar("-", 0),
     "soak.memory_slope_mb_per_10min": Bar("MB per 10 min", 1),
     "soak.handles_growth": Bar("handles", 0),
 }

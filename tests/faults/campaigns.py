@@ -4,7 +4,20 @@ from __future__ import annotations
 
 from typing import Final
 
-from tests.faults import away, bitrot, clocks, compaction, crash_model, flood, fuzz, kill, outages, security, truncation
+from tests.faults import (
+    away,
+    bitrot,
+    clocks,
+    compaction,
+    crash_model,
+    flood,
+    fuzz,
+    insider,
+    kill,
+    outages,
+    security,
+    truncation,
+)
 from tests.faults.frame import Campaign
 
 CAMPAIGNS: Final = (
@@ -40,5 +53,13 @@ CAMPAIGNS: Final = (
     Campaign("disk-full", outages.disk_full, ("faults.disk_full.false_acks", "faults.disk_full.recovered")),
     Campaign("security", security.run, ("faults.security.breaches",)),
     Campaign("fuzz", fuzz.run, ("faults.fuzz.crashes", "faults.fuzz.admitted_out_of_range", "faults.fuzz.honest_lost")),
+    Campaign(
+        "insider",
+        insider.run,
+        (
+            *("faults.insider.alerts_alone", "faults.insider.mb_per_hour", "faults.insider.honest_delay_s"),
+            *("faults.insider.messages", "faults.insider.honest_lost"),
+        ),
+    ),
     Campaign("flood", flood.run, ("faults.flood.honest_delay_s", "faults.flood.map_difference")),
 )

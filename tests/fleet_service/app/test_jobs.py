@@ -115,12 +115,14 @@ def test_a_job_of_no_interval_is_never_done(tmp_path: Path) -> None:
 
 
 def test_the_command_says_when_another_compacts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "inbox").mkdir()
     with compacting(tmp_path):
         assert main(["compact", "--archive", str(tmp_path)]) == 2
     assert capsys.readouterr().err.startswith("error: archive: ")
 
 
 def test_rounds_of_no_rows_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "inbox").mkdir()
     assert main(["compact", "--archive", str(tmp_path), "--round-rows", "0"]) == 2
     assert capsys.readouterr().err.startswith("error: round-rows: ")
 

@@ -1,0 +1,97 @@
+"""Who a vehicle is to the map: one number for ever, while the archive knows it by another name in each month.
+
+    keys/witness.key            of the service: a vehicle's number is its name's keyed hash
+    keys/2026-01.witnesses      which pseudonym of the month is whose number; goes with the month's key
+
+One car must not be two witnesses because a month ended, or because it says so. The second file is for restarts and
+replays, which see pseudonyms; a line that is lost or damaged makes one vehicle two again there, and nothing else.
+"""
+
+from __future__ import annotations
+
+import re
+from hashlib import blake2b
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from fleet_service.archive.pseudonyms import kept_key
+from schemas.numeric import IntArray
+
+ENDING: Final = ".witnesses"
+_KEY: Final = "witness.key"
+_LINE: Final = 24  # bytes: pseudonym, number, check
+_SECRET: Final = 0o600
+_MONTH: Final = re.compile(r"\d{4}-\d{2}")
+
+
+class Witnesses:
+    """Numbers of vehicles.
+
+    Args:
+        folder: where the keys lie.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._key: bytes | None = None
+        self._known: set[int] | None = None
+
+    def of(self, vehicle: str, month: str, pseudonym: int) -> int:
+        """Number of a vehicle, which has this pseudonym in this month (2026-01).
+
+        Raises:
+            OSError: the key can neither be read nor written.
+        """
+        if self._key is None or self._known is None:
+            self._key = kept_key(self._folder / _KEY)
+            self._known = set(read(self._folder))
+        number = int.from_bytes(blake2b(vehicle.encode(), key=self._key, digest_size=8).digest(), signed=True)
+        if pseudonym not in self._known:
+            path = self._folder / f"{month}{ENDING}"
+            path.touch(_SECRET)
+            with path.open("ab") as file:
+                file.write(_line(pseudonym, number))
+            self._known.add(pseudonym)
+        return number
+
+
+def read(folder: Path) -> dict[int, int]:
+    """Numbers by pseudonym, of all months; without lines that are damaged."""
+    out = {}
+    for path in sorted(folder.glob(f"*{ENDING}")):
+        if _MONTH.fullmatch(path.stem):
+            data = path.read_bytes()
+            for at in range(0, len(data) - _LINE + 1, _LINE):
+                pseudonym, number = (int.from_bytes(data[at + k : at + k + 8], signed=True) for k in (0, 8))
+                if data[at : at + _LINE] == _line(pseudonym, number):
+                    out[pseudonym] = number
+    return out
+
+
+def numbers_of(folder: Path, pseudonyms: IntArray) -> IntArray:
+    """Numbers of pseudonyms (n,); one that is not known is its own."""
+    known = read(folder)
+    if not known or not len(pseudonyms):
+        return pseudonyms
+    distinct, index = np.unique(pseudonyms, return_inverse=True)
+    return np.asarray(np.array([known.get(one, one) for one in distinct.tolist()], np.int64)[index])
+
+
+def forget(folder: Path, month: str, pseudonym: int | None = None) -> None:
+    """Remove one vehicle's line of a month, or all of them."""
+    path = folder / f"{month}{ENDING}"
+    if not path.exists():
+        return
+    if pseudonym is None:
+        path.unlink()
+        return
+    data = path.read_bytes()
+    lines = [data[at : at + _LINE] for at in range(0, len(data), _LINE)]
+    path.write_bytes(b"".join(line for line in lines if int.from_bytes(line[:8], signed=True) != pseudonym))
+
+
+def _line(pseudonym: int, number: int) -> bytes:
+    both = pseudonym.to_bytes(8, signed=True) + number.to_bytes(8, signed=True)
+    return both + blake2b(both, digest_size=8).digest()

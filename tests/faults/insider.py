@@ -1,0 +1,152 @@
+"""One enrolled car that does all that a valid car may, for a made-up hour, beside ten honest ones on their road.
+
+It sends as much as its limit lets through: visits all over a region and the world, a boot for each batch, JSON, batches
+with a foot in another month, its own reports again under other numbers, and ice on a road that is its own. Engine,
+limits and archive are the service's; only time is made up. What it did is a figure too.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import Counter
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from fleet_service.app.engine import Engine
+from fleet_service.ingest.inbox import Message
+from fleet_service.ingest.rate_limit import RateLimiter
+from schemas import grid, keys, wire
+from schemas.config import ServiceConfig
+from schemas.runtime.figures import Figure
+from schemas.thresholds import NS
+from schemas.wire import Batch, Kind
+from tests.faults.bars import figure
+from tests.faults.frame import Site
+from tests.fleet_service.examples import LATITUDE, LONGITUDE, batch
+
+CAR: Final = "car-666"
+HONEST: Final = tuple(f"car-{k:03}" for k in range(10))
+ICE: Final = (LATITUDE + 0.01, LONGITUDE + 0.01)  # a road that nobody else drives
+MONTH_NS: Final = 29 * 86_400 * NS
+WARM_S: Final = 60  # until pools and windows are what they are
+
+
+def run(site: Site) -> list[Figure]:
+    """An hour, or four minutes in a quick run."""
+    seconds, counts = site.of(3600, 240), Counter[str]()
+    random_, start, longest, sent = np.random.default_rng(site.seed), time.time_ns() - 4000 * NS, 0.0, 0
+    at = 0.0
+    config = ServiceConfig()
+    limits = RateLimiter(config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, None, counts, lambda: at)
+    with closing(Engine(config, site.folder / "archive")) as engine:
+        warm = 0.0
+        for first in range(6):  # what is compiled at first use is no harm that it does
+            engine.ingest([_attack(first, 0, start - NS, random_)], start - NS)
+        for second in range(seconds):
+            at, now = float(second), start + second * NS
+            honest = [_message(_visit(name, second + 1, now, second)) for name in HONEST]
+            attack = []
+            while True:
+                one = _attack(sent, second, now, random_)
+                if not limits.allows(one.key, len(one.payload), one.encoding):
+                    break
+                attack.append(one)
+                sent += 1
+            began = time.perf_counter()
+            engine.ingest(attack + honest, now)
+            engine.flush()
+            longest = max(longest, time.perf_counter() - began)
+            if second == WARM_S:
+                warm = _memory_mb()
+        grown = (_memory_mb() - warm) / (seconds - WARM_S) * 3600
+        alone = sum(_alone(alert.latitude, alert.longitude) for alert in engine.repeated(10**6))
+        settled = engine.counts[Kind.OBSERVATION]
+        ours = {name: n for name, n in engine.counts.items() if n}
+    site.say(f"{sent} messages of the insider, {settled} observations; {ours}")
+    return [
+        figure("faults.insider.alerts_alone", alone),
+        figure("faults.insider.mb_per_hour", grown),
+        figure("faults.insider.honest_delay_s", longest),
+        figure("faults.insider.messages", sent / seconds),
+        figure("faults.insider.honest_lost", int(settled < len(HONEST) * seconds)),
+    ]
+
+
+def _attack(number: int, second: int, now: int, random_: np.random.Generator) -> Message:
+    """The next of what it may do, in turn."""
+    seq, what = number + 1, number % 6
+    if what == 0:  # places all over the region
+        return _message(_scattered(seq, now, random_, 0.05))
+    if what == 1:  # ... and over the world
+        return _message(_scattered(seq, now, random_, 60.0))
+    if what == 2:  # a stream for each batch
+        return _message(replace(_visit(CAR, 1, now, second), boot=int(random_.integers(1, 1 << 62))))
+    if what == 3:  # text, which is dear to read
+        one = _scattered(seq, now, random_, 0.001)
+        return _text(one)
+    if what == 4:  # a foot in another month, on its own ice
+        old = now - MONTH_NS
+        one = _ice(seq, now, 2)
+        leave = np.array([old, now])
+        return _message(replace(one, columns=one.columns | {"leave_time": leave, "enter_time": leave - NS}))
+    return _message(_ice(seq, now, 1))  # and its own report, again and again
+
+
+def _ice(seq: int, now: int, rows: int) -> Batch:
+    cell = int(grid.cell_of(*ICE))
+    where = {"latitude": np.full(rows, ICE[0]), "longitude": np.full(rows, ICE[1]), "cell": np.full(rows, cell)}
+    one = batch(CAR, seq, now, [0.15] * rows)
+    return replace(one, region=int(grid.region_of(cell)), columns=one.columns | where)
+
+
+def _visit(name: str, seq: int, now: int, second: int) -> Batch:
+    """An honest visit; they go round a road of twenty cells at 12 m/s."""
+    longitude = LONGITUDE + 2e-4 * ((second + sum(name.encode())) % 20)
+    one = batch(name, seq, now, [0.8])
+    cell = grid.cell_of(LATITUDE, longitude)
+    return replace(one, columns=one.columns | {"longitude": np.array([longitude]), "cell": np.array([cell])})
+
+
+def _scattered(seq: int, now: int, random_: np.random.Generator, degrees: float) -> Batch:
+    """Visits of fifty cells anywhere near a place; a batch has the region of its first."""
+    spread = random_.uniform(-degrees, degrees, (2, 50))
+    latitude, longitude = np.clip(LATITUDE + spread[0], -80.0, 80.0), LONGITUDE + spread[1]
+    cell = grid.cell_of(latitude, longitude)
+    region = grid.region_of(cell)
+    mine = region == region[0]
+    one = batch(CAR, seq, now, [0.5] * int(mine.sum()))
+    where = {"latitude": latitude[mine], "longitude": longitude[mine], "cell": cell[mine]}
+    same = np.full(int(mine.sum()), now)
+    where |= {"leave_time": same, "enter_time": same - NS}
+    return replace(one, region=int(region[0]), columns=one.columns | where)
+
+
+def _message(one: Batch) -> Message:
+    place = keys.observation_key(one.region, one.vehicle)
+    return Message(one.kind, place, wire.encode(one), wire.ENCODING[one.kind])
+
+
+def _text(one: Batch) -> Message:
+    """A batch as a person would write it."""
+    text = {
+        "vehicle": one.vehicle, "boot": str(one.boot), "seq": str(one.seq), "region": str(one.region),
+        "enter_time": [str(t) for t in one.columns["enter_time"].tolist()],
+        **{name: one.columns[name].tolist() for name in ("latitude", "longitude", "yaw", "mu", "mu_utilised")},
+    }  # fmt: skip
+    place = keys.observation_key(one.region, one.vehicle)
+    return Message(one.kind, place, json.dumps(text).encode(), "application/json")
+
+
+def _alone(latitude: float, longitude: float) -> bool:
+    """Whether an alert is where only the insider says to have been."""
+    return abs(latitude - LATITUDE) > 1e-3 or not -1e-3 <= longitude - LONGITUDE <= 5e-3
+
+
+def _memory_mb() -> float:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:")) / 1024

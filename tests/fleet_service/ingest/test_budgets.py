@@ -1,0 +1,164 @@
+"""One valid car is one witness, and cannot fill a service, whatever a valid car may send."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleet_service.app.engine import Engine
+from fleet_service.archive.pseudonyms import Pseudonyms, number
+from fleet_service.archive.retention import drop_checkpoints, forget_period
+from fleet_service.archive.witnesses import Witnesses, read
+from fleet_service.ingest.budgets import FASTEST, NEW_CELLS_AT_ONCE, STREAMS_AT_ONCE, Bucket, Tracks
+from fleet_service.ingest.inbox import Message
+from schemas import grid, keys, wire
+from schemas.config import ServiceConfig
+from schemas.numeric import FloatArray
+from schemas.wire import Batch, Kind
+from tests.fleet_service.examples import SECOND, batch
+
+
+def message(sent: Batch) -> Message:
+    return Message(
+        sent.kind, keys.observation_key(sent.region, sent.vehicle), wire.encode(sent), wire.ENCODING[sent.kind]
+    )
+
+
+@pytest.fixture
+def engine(tmp_path: Path) -> Iterator[Engine]:
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        yield engine
+
+
+def months(now: int) -> tuple[int, int]:
+    """The last second of a month and the first of the next, as near as they were [ns]."""
+    first = datetime.fromtimestamp(now / SECOND, UTC).replace(day=1, hour=0, minute=0, second=0, microsecond=0)
+    at = int(first.timestamp()) * SECOND
+    return at - SECOND, at + 2 * SECOND
+
+
+def test_one_car_is_one_witness_over_midnight_of_a_month_live_and_after_a_replay(tmp_path: Path) -> None:
+    before, after = months(time.time_ns())
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        for seq, at in enumerate((before, after), 1):
+            engine.ingest([message(batch("car-001", seq, at, [0.15]))], after)
+        engine.flush()
+        assert engine.alerts == 0
+        assert engine.fusion.live.vehicles[0] == 1
+    assert len(set(read(tmp_path / "keys"))) == 2, "two pseudonyms on disk"
+    drop_checkpoints(tmp_path)
+    with closing(Engine(ServiceConfig(), tmp_path)) as again:
+        assert again.fusion.live.vehicles[0] == 1
+        assert again.alerts == 0
+
+
+def test_a_car_with_one_foot_in_last_month_raises_no_alert_alone(engine: Engine) -> None:
+    """A batch's pseudonym is of its first record's month, and the first may be long ago."""
+    now = time.time_ns()
+    for seq in range(1, 40):
+        old = now - 29 * 86_400 * SECOND
+        leave = [old, now - SECOND] if seq % 2 else [now - 2 * SECOND, now - SECOND]
+        one = batch("car-001", seq, now, [0.15, 0.15], leave_time=leave, enter_time=np.array(leave) - SECOND)
+        engine.ingest([message(one)], now)
+    assert engine.alerts == 0
+    assert engine.counts["refused.time"] == 20, "a batch spans no month"
+    assert engine.fusion.live.vehicles[: engine.fusion.size].max() == 1
+
+
+def test_a_line_of_the_witnesses_that_is_damaged_is_left_out(tmp_path: Path) -> None:
+    pseudonyms, witnesses, now = Pseudonyms(tmp_path), Witnesses(tmp_path), time.time_ns()
+    names = {f"car-{k:03}": number(pseudonyms.of(f"car-{k:03}", now)) for k in range(3)}
+    known = {p: witnesses.of(name, pseudonyms.month(now), p) for name, p in names.items()}
+    assert read(tmp_path) == known
+    path = next(tmp_path.glob("*.witnesses"))
+    data = bytearray(path.read_bytes())
+    data[30] ^= 1
+    path.write_bytes(data)
+    assert len(read(tmp_path)) == 2
+    assert Witnesses(tmp_path).of("car-000", pseudonyms.month(now), names["car-000"]) == known[names["car-000"]]
+    assert path.stat().st_mode & 0o077 == 0
+
+
+def everywhere(seq: int, count: int, now: int) -> Batch:
+    """Visits to as many new cells side by side, one after the other at 12 m/s."""
+    at = np.arange(count) + seq * count
+    latitude, longitude = 57.60 + 2e-4 * (at // 400), 11.75 + 2e-4 * (at % 400)
+    leave = now - np.arange(count)[::-1] * SECOND
+    cell = grid.cell_of(latitude, longitude)
+    one = batch(
+        "car-001", seq + 1, now, [0.5] * count, leave_time=leave, enter_time=leave, latitude=latitude,
+        longitude=longitude, cell=cell,
+    )  # fmt: skip
+    return replace(one, region=int(grid.region_of(cell[0])))
+
+
+def test_a_car_fills_no_memory_with_places_and_all_it_says_is_archived(engine: Engine) -> None:
+    now, sent = time.time_ns(), 0
+    for seq in range(200):
+        at = now - (200 - seq) * 200 * SECOND
+        one = everywhere(seq, 50, at)
+        if len(np.unique(grid.region_of(one.columns["cell"]))) == 1:
+            engine.ingest([message(one)], at)
+            sent += 50
+    assert sent > 2 * NEW_CELLS_AT_ONCE
+    assert engine.counts[Kind.OBSERVATION] == sent, "nothing is refused"
+    assert engine.counts["implausible_moves"] == 0
+    assert engine.counts["too_many_places"] > sent - 2 * NEW_CELLS_AT_ONCE
+    assert engine.fusion.size < 3 * NEW_CELLS_AT_ONCE
+
+
+def test_a_car_opens_so_many_streams_and_keeps_the_rest(engine: Engine) -> None:
+    now = time.time_ns()
+    for boot in range(1, 1000):
+        one = replace(batch("car-001", 1, now, [0.8]), boot=boot)
+        engine.ingest([message(one)], now)
+    assert engine.counts[Kind.OBSERVATION] == STREAMS_AT_ONCE
+    assert engine.counts["too_many_streams"] == 999 - STREAMS_AT_ONCE
+
+
+def place(east_m: float) -> tuple[FloatArray, FloatArray]:
+    return np.array([0.0]), np.array([east_m / 111_320.0])
+
+
+def test_a_car_is_not_in_two_towns_at_once() -> None:
+    tracks, who, start = Tracks(), np.array([7]), time.time_ns()
+
+    def wrong(seconds: float, east_m: float) -> bool:
+        return bool(tracks.impossible(who, np.array([start + int(seconds * SECOND)]), *place(east_m))[0])
+
+    assert [wrong(0, 0.0), wrong(10, 400.0), wrong(20, 8e6), wrong(30, 1_200.0)] == [False, False, True, False]
+    assert not wrong(-3600, -200_000.0), "of a backlog: there was time to come from there"
+    assert wrong(31, 5_000.0 + FASTEST * 31)
+
+
+def test_within_a_batch_a_leap_is_seen_too() -> None:
+    tracks, time_ns = Tracks(), np.arange(4) * SECOND
+    longitude = np.array([0.0, 1e-4, 50.0, 2e-4])
+    assert tracks.impossible(np.full(4, 7), time_ns, np.zeros(4), longitude).tolist() == [False, False, True, False]
+
+
+def test_a_budget_fills_again() -> None:
+    bucket = Bucket(10, 3600)
+    assert [bucket.take(1, 6, 0.0), bucket.take(1, 6, 0.0), bucket.take(1, 6, 3.0), bucket.take(2, 6, 3.0)] == [
+        6,
+        4,
+        3,
+        6,
+    ]
+
+
+def test_of_a_month_nothing_is_left_that_names_a_vehicle_when_it_is_forgotten(tmp_path: Path) -> None:
+    now = time.time_ns()
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        engine.ingest([message(batch("car-001", 1, now, [0.8]))], now)
+        engine.flush()
+    month = f"{datetime.fromtimestamp(now / SECOND, UTC) - timedelta(seconds=1):%Y-%m}"
+    forget_period(tmp_path, month)
+    assert not read(tmp_path / "keys")
