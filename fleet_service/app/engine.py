@@ -11,7 +11,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 
@@ -19,6 +19,7 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_service.app.clock import TimeNow
+from fleet_service.app.past import PastQuery, ask
 from fleet_service.app.precompile import warm_up
 from fleet_service.archive.files import lock
 from fleet_service.archive.load import count_set_aside, set_aside
@@ -36,12 +37,12 @@ from fleet_service.ingest.weather import WeatherInbox, archived
 from fleet_service.ingest.weather import files as weather_files
 from fleet_service.replay import checkpoints
 from fleet_service.replay.checkpoints import Taken
-from fleet_service.replay.rebuild import Begin, Since, first_day, past, replay, restore_streams
+from fleet_service.replay.rebuild import Begin, Since, first_day, replay, restore_streams
 from fleet_service.replay.restart import image_of, restart
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.encode import cell_table
 from fleet_service.serve.map_state import MapState
-from fleet_service.serve.query import answer
+from fleet_service.serve.query import answer, cells_asked
 from fleet_service.serve.tile_cache import TileCache
 from schemas import grid, wire
 from schemas.config import ServiceConfig, nanoseconds
@@ -316,16 +317,12 @@ class Engine:
         at = nanoseconds(query.at)
         if at > now:
             raise InputError("at", "lies in the future", "give a time that has been")
-        try:
-            then = past(self._root, self._config.lateness_s, at, _box(query))
-        except OSError as error:
-            raise InputError("at", f"the archive cannot be read ({error.strerror})", "ask again later") from error
-        return answer(TileCache(MapState(then), nullcontext(), least), query, wanted, at, only)
+        return ask(self._root, PastQuery(query, at, self._config.lateness_s, only), wanted)
 
+    def cells(self, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None) -> int:
+        """Cells that an answer may have at the most.
 
-def _box(query: MapQuery) -> tuple[float, float, float, float] | None:
-    """What a query looks at, if that is less than everything."""
-    if query.route is None:
-        return query.bbox
-    longitudes, latitudes = zip(*query.route, strict=True)
-    return min(longitudes), min(latitudes), max(longitudes), max(latitudes)
+        Raises:
+            InputError: as `answer`.
+        """
+        return cells_asked(self._tiles, query, wanted, only)

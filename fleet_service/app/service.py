@@ -25,7 +25,7 @@ from fleet_service.enrolment.fleet import Enrolment
 from fleet_service.ingest.inbox import Inbox, Message
 from fleet_service.ingest.rate_limit import RateLimiter
 from fleet_service.ingest.weather import WeatherMessage
-from fleet_service.serve.queryable import MapQueryable
+from fleet_service.serve.queryable import Answering, MapQueryable
 from schemas import grid, keys, wire
 from schemas.config import ServiceConfig, load
 from schemas.query import MapQuery
@@ -62,7 +62,7 @@ class Service:
         self.engine = Engine(config, root)
         self._clock = SteadyClock(self.engine.seen)
         limits = RateLimiter(config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, known, self.engine.counts)
-        self._replies = MapQueryable(self._answer, self.engine.counts)
+        self._replies = MapQueryable(Answering(self.engine.cells, self._answer), self.engine.counts)
         self.inbox = Inbox(config.queue_batches, self.engine.counts, limits)
         jobs = archive_jobs(self.engine, config, root, self._clock.moment)
         self._upkeep = Upkeep(jobs, self.engine.counts, log_line)

@@ -27,13 +27,14 @@ column are in its field metadata too. This page is generated.
 
 ```python
 import duckdb
-duckdb.sql('''select cell, sector, count(distinct vehicle), median(mu) filter (value) as mu, max(mu_utilised) as at_least
+duckdb.sql('''select cell, sector, count(distinct vehicle), median(mu) filter (value) as mu,
+                     max(mu_utilised) as at_least
               from 'observations/*/*/*.parquet' group by cell, sector''')
 ```
 
 - mu is the peak tyre–road adhesion coefficient, mean of the four wheels. NaN is "not said", which is not "dry".
-- `value` says whether mu is a value. Where it is false, mu is mostly the prior of a vehicle that merely rolled: leave it
-  out of every mean, median and colour; all that is known is that mu is at least `mu_utilised`.
+- `value` says whether mu is a value. Where it is false, mu is mostly the prior of a vehicle that merely rolled: leave
+  it out of every mean, median and colour; all that is known is that mu is at least `mu_utilised`.
 - `log_likelihood`: {mugrid.BINS} bytes for {mugrid.BINS} equal bins of mu on [{mugrid.LOWER}, {mugrid.UPPER}]; byte k
   is {mugrid.STEPS_PER_NAT} times how many nats bin k lies below the best. Sums over vehicles are evidence, means of mu
   are opinions.

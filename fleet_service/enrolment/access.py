@@ -21,6 +21,7 @@ from typing import Any, Final
 from fleet_service.enrolment.fleet import Enrolment
 from schemas import keys, wire
 
+QUESTION_BYTES: Final = 1024  # of payload and attachment; there is none
 PUBLIC: Final = (f"{keys.ROOT}/map/**", f"{keys.ROOT}/alert/**")
 WEATHER: Final = f"{keys.ROOT}/weather/**"
 EVERYTHING: Final = "gripmap/**"
@@ -66,7 +67,7 @@ def router_configuration(fleet: Enrolment, name: str, certificates: Path) -> Sec
             },
         },
         "access_control": access_control(fleet),
-        "low_pass_filter": [_no_larger()],
+        "low_pass_filter": [_no_larger(), _no_payload()],
         "qos": {"network": [_priority(keys.TOPICS[kind]) for kind in wire.Kind]},
     }
 
@@ -136,6 +137,17 @@ def _no_larger() -> Section:
         "messages": ["put"],
         "key_exprs": [f"{keys.ROOT}/{kind}/**" for kind in wire.Kind],
         "size_limit": wire.MAX_BYTES,
+    }
+
+
+def _no_payload() -> Section:
+    """A question is its key and its parameters: what comes with it travels no further than the first router."""
+    return {
+        "id": "questions",
+        "flows": ["ingress"],
+        "messages": ["query"],
+        "key_exprs": [f"{keys.ROOT}/**"],
+        "size_limit": QUESTION_BYTES,
     }
 
 

@@ -21,6 +21,7 @@ from fleet_service.fusion import Fusion, Updated, observations_of
 from fleet_service.fusion.constants import EPOCH_NS
 from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.weather import archived
+from schemas import grid
 from schemas.numeric import IntArray
 from schemas.tables import US, US_STEP
 from schemas.wire import Kind
@@ -35,6 +36,7 @@ Box = tuple[float, float, float, float]  # west, south, east, north [deg]
 # Days of observations that show in the map, and of batches that may come again (ServiceConfig.oldest_s is 30 days).
 MAP_DAYS: Final = 31
 PART_ROWS: Final = 1_000_000  # of a replay at once: 300 MB while they are sorted
+SEGMENT_ROW_BYTES: Final = 60  # in the inbox, at the least
 MARGIN_DEG: Final = 0.002  # around a box: over 100 m, more than a visit's position error moves what it tells
 
 
@@ -185,9 +187,45 @@ def in_order(listing: reading.Listing) -> Iterator[pa.Table]:
                 yield pa.concat_tables(tables).sort_by(time)
 
 
-def _rows_of(path: Path) -> int:
-    """Rows of a file by its footer; 0 if it has none that can be read, or is gone."""
+def rows_near(root: Path, until: int, box: Box | None, most: int) -> int:
+    """Rows that `past` would have to read at the most, by footers alone; counts no further than beyond `most`.
+
+    Raises:
+        OSError: the archive cannot be read.
+    """
+    last = until // layout.DAY_NS + 1
+    found = sum(path.stat().st_size for path in segments.paths(root, Kind.OBSERVATION)) // SEGMENT_ROW_BYTES
+    for path in layout.compacted(root, Kind.OBSERVATION, last - MAP_DAYS - 1, last):
+        if found > most:
+            break
+        zone = grid.bounds(np.array([layout.partition_of(path).zone]), grid.ZONE_ZOOM)
+        if box is None or grid.touches(box, zone)[0]:
+            found += _rows_of(path, box)
+    return found
+
+
+def _touches(group: Any, columns: dict[str, int], box: Box) -> bool:  # noqa: ANN401 metadata of a row group
+    """Whether a row group may have rows in a box, by its statistics."""
+    west, south, east, north = box
+    for name, least, most in (("longitude", west, east), ("latitude", south, north)):
+        found = group.column(columns[name]).statistics
+        if (
+            found is not None
+            and found.has_min_max
+            and (found.max < least - MARGIN_DEG or found.min > most + MARGIN_DEG)
+        ):
+            return False
+    return True
+
+
+def _rows_of(path: Path, box: Box | None = None) -> int:
+    """Rows of a file by its footer, of row groups near a box; 0 if it has none that can be read, or is gone."""
     try:
-        return int(pq.read_metadata(path).num_rows)
+        footer = pq.read_metadata(path)
     except (OSError, pa.ArrowInvalid):
         return 0
+    if box is None:
+        return int(footer.num_rows)
+    columns = {footer.schema.column(at).path: at for at in range(footer.num_columns)}
+    groups = (footer.row_group(at) for at in range(footer.num_row_groups))
+    return int(sum(group.num_rows for group in groups if _touches(group, columns, box)))

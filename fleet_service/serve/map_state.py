@@ -63,6 +63,10 @@ class MapState:
         parts[:] = [np.concatenate(parts)]
         return parts[0].astype(np.int64)
 
+    def count(self, tile: int) -> int:
+        """How many slots a tile has."""
+        return sum(map(len, self._slots.get(tile, ())))
+
     def _index(self) -> None:
         if self._indexed == self.fusion.size:
             return

@@ -49,6 +49,14 @@ def answer(
                 yield tile, payload
 
 
+def cells_asked(cache: TileCache, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None) -> int:
+    """Cells of all tiles that an answer looks at; arguments and errors as of `answer`."""
+    route = keys_along(query.route) if query.route else None
+    tiles = [tile for tile in _tiles(cache, query, route, only) if only is not None or wanted(tile)]
+    with cache.guard:
+        return sum(cache.state.count(tile) for tile in tiles)
+
+
 def _tiles(cache: TileCache, query: MapQuery, route: IntArray | None, only: int | None) -> list[int]:
     """Select: the tiles that may have something."""
     if route is not None:

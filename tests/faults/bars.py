@@ -53,6 +53,9 @@ BARS: Final = {
     "faults.insider.honest_delay_s": Bar("s", 2),
     "faults.insider.messages": Bar("messages/s of the insider", 5, "more"),
     "faults.insider.honest_lost": Bar("-", 0),
+    "faults.query.light_p99_ms": Bar("ms", 100),
+    "faults.query.heavy_answers": Bar("whole maps of the slower of two", 2, "more"),
+    "faults.query.light_answers": Bar("answers", 20, "more"),
     "soak.memory_slope_mb_per_10min": Bar("MB per 10 min", 1),
     "soak.handles_growth": Bar("handles", 0),
 }

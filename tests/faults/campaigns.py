@@ -15,6 +15,7 @@ from tests.faults import (
     insider,
     kill,
     outages,
+    queries,
     security,
     truncation,
 )
@@ -60,6 +61,11 @@ CAMPAIGNS: Final = (
             *("faults.insider.alerts_alone", "faults.insider.mb_per_hour", "faults.insider.honest_delay_s"),
             *("faults.insider.messages", "faults.insider.honest_lost"),
         ),
+    ),
+    Campaign(
+        "queries",
+        queries.run,
+        ("faults.query.light_p99_ms", "faults.query.heavy_answers", "faults.query.light_answers"),
     ),
     Campaign("flood", flood.run, ("faults.flood.honest_delay_s", "faults.flood.map_difference")),
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
 
@@ -9,9 +10,9 @@ import pyarrow as pa
 import pytest
 import zenoh
 
-from fleet_service.serve.queryable import MapQueryable
+from fleet_service.serve.queryable import COST, LIGHT, MOST, Answering, MapQueryable
 from schemas import keys
-from schemas.query import MapQuery
+from schemas.query import Format, MapQuery
 from tests.fleet_service.examples import TILE
 from tests.waiting import matched, until
 
@@ -38,12 +39,58 @@ def test_an_answer_that_fails_on_the_way_is_an_error_and_the_next_one_is_answere
 
     counts: Counter[str] = Counter()
     key = keys.map_key(TILE)
-    queryable = session.declare_queryable(key, MapQueryable(answer, counts), complete=True)
+    queryable = session.declare_queryable(key, MapQueryable(Answering(lambda *_: 1, answer), counts), complete=True)
     querier = session.declare_querier(key)
     matched(querier)
     first = texts(session, key + parameters)
     assert first == ["a tile", f"query: could not be answered ({type(failure).__name__}); ask again later"]
     until(lambda: texts(session, key + parameters) == ["a tile"])  # the past before is let go a moment after its answer
     assert counts["answer_failures"] == 1
+    querier.undeclare()
+    queryable.undeclare()
+
+
+def test_a_question_whose_answer_would_be_too_large_is_refused_with_the_way_to_ask(session: zenoh.Session) -> None:
+    key, counts, asked = (
+        keys.map_key(TILE),
+        Counter[str](),
+        Answering(lambda *_: MOST // COST[Format.JSON] + 1, nothing),
+    )
+    queryable = session.declare_queryable(key, MapQueryable(asked, counts), complete=True)
+    querier = session.declare_querier(key)
+    matched(querier)
+    assert texts(session, f"{key}?format=json") == [
+        "bbox: the answer would be too large; narrow bbox, or take format=arrow"
+    ]
+    assert texts(session, key) == []
+    assert counts["heavy_queries"] == 1
+    querier.undeclare()
+    queryable.undeclare()
+
+
+def nothing(query: MapQuery, wanted: Callable[[int], bool], only: int | None) -> Iterator[tuple[int, bytes]]:
+    """An answer without tiles."""
+    return iter(())
+
+
+def test_who_asks_for_little_does_not_wait_for_who_asks_for_much(session: zenoh.Session) -> None:
+    """The heavy answer does not end before the light one has come."""
+    key, counts, light_came = keys.map_key(TILE), Counter[str](), threading.Event()
+
+    def cells(query: MapQuery, wanted: Callable[[int], bool], only: int | None) -> int:
+        return LIGHT + 1 if query.min_vehicles == 2 else 1
+
+    def answer(query: MapQuery, wanted: Callable[[int], bool], only: int | None) -> Iterator[tuple[int, bytes]]:
+        if query.min_vehicles == 2:
+            assert light_came.wait(30.0)
+        yield TILE, b"a tile"
+
+    queryable = session.declare_queryable(key, MapQueryable(Answering(cells, answer), counts), complete=True)
+    querier = session.declare_querier(key)
+    matched(querier)
+    heavy = session.get(f"{key}?min_vehicles=2", timeout=60.0)
+    assert texts(session, key) == ["a tile"]
+    light_came.set()
+    assert [reply.ok.payload.to_string() for reply in heavy if reply.ok] == ["a tile"]
     querier.undeclare()
     queryable.undeclare()

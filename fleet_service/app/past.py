@@ -1,0 +1,113 @@
+"""The map of a past moment, rebuilt in a process of its own: its memory is bounded before it reads, and goes with it.
+
+`python -m fleet_service.app.past ARCHIVE` reads the question as JSON and writes the replies, each after its tile and
+length; an error is a tile of -1.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from fleet_service.replay.rebuild import Box, past, rows_near
+from fleet_service.serve.map_state import MapState
+from fleet_service.serve.query import answer
+from fleet_service.serve.tile_cache import TileCache
+from schemas import grid
+from schemas.errors import InputError
+from schemas.query import MapQuery
+
+MOST_ROWS: Final = 1_000_000  # of the box, by the files' footers: 100 MB and some seconds
+_HEAD: Final = struct.Struct("<qQ")
+_ERROR: Final = -1
+
+
+class PastQuery(NamedTuple):
+    """A query about a moment [ns], with the lateness that the service had [s]; `only`: the one tile that is wanted."""
+
+    query: MapQuery
+    at: int
+    lateness_s: float
+    only: int | None
+
+
+def ask(root: Path, question: PastQuery, wanted: Callable[[int], bool]) -> Iterator[tuple[int, bytes]]:
+    """Tile and payload of every reply, from a process of its own.
+
+    Raises:
+        InputError: it would have to read too much, or the archive cannot be read.
+        ChildProcessError: the process died.
+    """
+    box = box_of(question)
+    if rows_near(root, question.at, box, MOST_ROWS) > MOST_ROWS:
+        raise InputError("at", "would have to read too much of the archive", "narrow bbox")
+    told = {**question._asdict(), "query": question.query.model_dump_json()}
+    command = [sys.executable, "-m", "fleet_service.app.past", str(root)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
+        assert child.stdin
+        assert child.stdout
+        with child.stdin as pipe:
+            pipe.write(json.dumps(told).encode())
+        try:
+            while head := child.stdout.read(_HEAD.size):
+                tile, size = _HEAD.unpack(head)
+                payload = child.stdout.read(size)
+                if tile == _ERROR:
+                    raise InputError(*json.loads(payload))
+                if wanted(tile):
+                    yield tile, payload
+        finally:
+            child.kill()
+    if child.returncode not in (0, -9):
+        raise ChildProcessError(f"the past could not be rebuilt ({child.returncode})")
+
+
+def box_of(question: PastQuery) -> Box | None:
+    """What a query looks at, if that is less than everything."""
+    query = question.query
+    if query.route is not None:
+        longitudes, latitudes = zip(*query.route, strict=True)
+        return min(longitudes), min(latitudes), max(longitudes), max(latitudes)
+    if question.only is not None and query.bbox is None:
+        west, south, east, north = (float(edge) for edge in grid.bounds(question.only, grid.TILE_ZOOM))
+        return west, south, east, north
+    return query.bbox
+
+
+def replies(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
+    """Tile and payload of every reply.
+
+    Raises:
+        InputError: the archive cannot be read.
+    """
+    try:
+        then = past(root, question.lateness_s, question.at, box_of(question))
+    except OSError as error:
+        raise InputError("at", f"the archive cannot be read ({error.strerror})", "ask again later") from error
+    cache = TileCache(MapState(then), nullcontext(), question.query.min_vehicles)
+    yield from answer(cache, question.query, lambda _: True, question.at, question.only)
+
+
+def main() -> int:
+    """Answer one question."""
+    told = json.loads(sys.stdin.buffer.read())
+    question = PastQuery(**{**told, "query": MapQuery.model_validate_json(told["query"])})
+    out = sys.stdout.buffer
+    try:
+        for tile, payload in replies(Path(sys.argv[1]), question):
+            out.write(_HEAD.pack(tile, len(payload)) + payload)
+    except InputError as error:
+        payload = json.dumps([error.field, error.problem, error.fix]).encode()
+        out.write(_HEAD.pack(_ERROR, len(payload)) + payload)
+    out.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
