@@ -15,6 +15,7 @@ from edge_agent.inputs.block import Block
 from edge_agent.observe.observation_builder import RecordBlock
 from edge_agent.observe.pipeline import Pipeline
 from edge_agent.publish.publisher import Publisher
+from schemas.runtime import watchdog
 from schemas.wire import Kind
 
 STATUS_EVERY_S = 5.0
@@ -71,6 +72,8 @@ def drive(
             break
         if clock() - started >= status_at:
             status_at += STATUS_EVERY_S
+            if not publisher.broken:
+                watchdog.alive()
             on_status(progress)
     if (last := pipeline.finish()) is not None:
         _offer(publisher, progress, admitted(), last)

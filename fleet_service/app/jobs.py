@@ -10,6 +10,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -156,7 +157,8 @@ class Upkeep:
         self._thread.join()
 
     def _keep(self) -> None:
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)  # of this thread alone, on Linux
+        with suppress(OSError):  # where it may not: the jobs matter more than their place
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)  # of this thread alone, on Linux
         began = time.monotonic()
         due = {job: began + min(job.every_s, SOON_S) for job in self._jobs}
         while due and not self._stop.wait(max(min(due.values()) - time.monotonic(), 0.0)):

@@ -90,6 +90,7 @@ class Service:
         with session, self._upkeep, self._declared(session):
             self._session = session
             self._log_line(f"ready: {self._config.name}, {self.engine.fusion.size} cells from the archive{address}")
+            watchdog.alive()
             try:
                 while not stop.is_set():
                     self._step(session, stop)

@@ -34,6 +34,7 @@ UNITS = sorted((DEPLOY / "systemd").glob("*.service"))
 BIN = Path(sys.executable).parent
 PORTS = ("7447", "7448", "9464")
 INSTANCES = {"gripmap-router@": ["router-a", "router-b"], "gripmap-service": [""], "gripmap-agent@": ["car-001"]}
+MOST_EXPOSED = 3.0  # of systemd's ten
 START_S = 300.0  # the first start compiles the kernels, on a busy machine
 
 
@@ -63,6 +64,7 @@ class Site:
         text = text.replace("%S/gripmap", str(self.root / "lib")).replace("%C/gripmap", str(self.root / "cache"))
         for port, other in zip(PORTS, self._ports, strict=True):
             text = text.replace(port, other)
+        text = text.replace("${SOURCE}", "simulated").replace("$MORE", "")  # as EnvironmentFile would have it
         return text.replace("/opt/gripmap/bin", str(BIN))
 
     def unit(self, unit: Path, instance: str) -> configparser.SectionProxy:
@@ -104,6 +106,45 @@ def test_systemd_accepts_the_units(site: Site, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd on this machine")
+@pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
+def test_each_unit_is_shut_in(unit: Path, tmp_path: Path) -> None:
+    """The exposure that systemd itself finds: 0 is a sealed box, 10 an open one."""
+    instance = INSTANCES[unit.stem][0]
+    file = tmp_path / unit.name.replace("@.", f"@{instance}.")
+    file.write_text(unit.read_text())
+    done = subprocess.run(
+        ["systemd-analyze", "security", "--offline=true", "--no-pager", f"--threshold={MOST_EXPOSED * 10:.0f}", file],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
+
+
+def test_no_unit_gives_up_or_invents_or_has_another_roles_user() -> None:
+    users = set()
+    for unit in UNITS:
+        plain = configparser.ConfigParser(strict=False, interpolation=None)
+        plain.optionxform = str  # type: ignore[assignment,method-assign]
+        plain.read_string(unit.read_text())
+        service = plain["Service"]
+        users.add(service["User"])
+        assert plain["Unit"]["StartLimitIntervalSec"] == "0"
+        assert service["Restart"] == "always"
+        assert {"MemoryMax", "UMask", "TasksMax"} <= set(service)
+        assert "simulated" not in unit.read_text()
+        assert "edge-agent" not in service["ExecStart"] or "--source ${SOURCE}" in service["ExecStart"]
+    assert len(users) == len(UNITS)
+
+
+def test_what_is_shipped_as_secure_keeps_persons_private() -> None:
+    secure = DEPLOY / "secure"
+    agent, service = load(secure / "agent.json", AgentConfig), load(secure / "service.json", ServiceConfig)
+    assert agent.trip_end_m > 0.0
+    assert agent.trip_end_s > 0.0
+    assert service.public_vehicles > 1
+    assert service.fleet is not None
+
+
 def test_the_compose_file_is_one_and_starts_what_the_units_start() -> None:
     file = DEPLOY / "compose.yaml"
     subprocess.run([BIN / "check-jsonschema", "--builtin-schema", "vendor.compose-spec", file], check=True)
@@ -113,7 +154,8 @@ def test_the_compose_file_is_one_and_starts_what_the_units_start() -> None:
     commands = []
     for unit, instance in instances():
         plain.read_string(unit.read_text().replace("%i", instance))
-        program, *rest = shlex.split(plain["Service"]["ExecStart"])
+        started_by = plain["Service"]["ExecStart"].replace("${SOURCE}", "simulated").replace("$MORE", "")
+        program, *rest = shlex.split(started_by)
         commands.append([Path(program).name, *rest])
     assert started == sorted(commands)
     for part in services.values():

@@ -105,7 +105,7 @@ def test_a_car_fills_no_memory_with_places_and_all_it_says_is_archived(engine: E
         at = now - (200 - seq) * 200 * SECOND
         one = everywhere(seq, 50, at)
         if len(np.unique(grid.region_of(one.columns["cell"]))) == 1:
-            engine.ingest([message(one)], at)
+            engine.ingest([message(one)], now)
             sent += 50
     assert sent > 2 * NEW_CELLS_AT_ONCE
     assert engine.counts[Kind.OBSERVATION] == sent, "nothing is refused"
