@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_service.archive import reading
+from fleet_service.client.stretches import Stretches, linked
 from fleet_service.lab.end_to_end import false_ice
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.figures import Figure
@@ -116,6 +117,7 @@ def figures(
         Figure("demo.map.rmse", float(np.sqrt(_mean(error[value] ** 2))), "", 0.12),
         Figure("demo.alert.delay_passes", delay_passes(visits, patch, alerts, changed_ns), "passes", 8),
         Figure("demo.alerts.on_dry_roads", false, "alerts", 0),
+        Figure("demo.alerts.per_stretch", per_stretch(alerts, visits), "per icy stretch and direction", 2),
         Figure("demo.observations.unacknowledged", counts["observations_unsettled"], "", 0),
         Figure("demo.observations.duplicates", rows - distinct, "", 0),
         Figure("demo.wall_s", wall_s, "s", 240),
@@ -131,6 +133,18 @@ def newly_slippery(visits: pa.Table, changed_ns: int) -> BoolArray:
     cell, mu = visits["cell"].to_numpy(), visits["mu"].to_numpy()
     before = np.unique(cell[(enter < changed_ns) & (mu < SLIPPERY_MU)])
     return np.asarray((enter >= changed_ns) & ~np.isin(cell, before))
+
+
+def per_stretch(alerts: list[tuple[int, Alert]], visits: pa.Table) -> float:
+    """Alerts that an operator got, per icy stretch and direction of travel; NaN without ice."""
+    road, ids = Stretches(), set[str]()
+    for _, alert in alerts:
+        road.take(alert)
+        ids |= {one.id for one in road.changes()}
+    icy = visits.filter(pc.less(visits["mu"], pa.scalar(SLIPPERY_MU)))
+    cell, sector = icy["cell"].to_numpy(), icy["sector"].to_numpy()
+    stretches = sum(int(linked(np.unique(cell[sector == k])).max(initial=-1)) + 1 for k in np.unique(sector))
+    return len(ids) / stretches if stretches else float("nan")
 
 
 def archived(archive: Path) -> tuple[int, int, int]:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import json
-import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -13,7 +12,7 @@ from typing import Any, Final
 import pyarrow as pa
 import zenoh
 
-from schemas import grid, keys, query, tables, wire
+from schemas import grid, keys, query, tables
 from schemas.config import ServiceConfig, ZenohSettings, load
 from schemas.errors import InputError
 from schemas.query import Format
@@ -140,67 +139,3 @@ def _shown(name: str, value: object) -> str:
     if not isinstance(value, float):
         return str(value)
     return f"{value:.6f}" if name in ("latitude", "longitude") else f"{value:.2f}"
-
-
-def watch(connection: ZenohSettings, bbox: str | None, stop: threading.Event, say: Callable[[str], None]) -> None:
-    """Say a line per changed tile and per alert until `stop` is set; waits for a router.
-
-    Raises:
-        InputError: the box cannot be read.
-    """
-    box = query.parse({} if bbox is None else {"bbox": bbox}).bbox
-
-    def near(key: str) -> int | None:
-        tile = keys.parse(key).quadint
-        if tile is None or box is None:
-            return tile
-        return tile if grid.touches(box, grid.bounds(tile, grid.TILE_ZOOM)) else None
-
-    def changed(sample: zenoh.Sample) -> None:
-        tile = near(str(sample.key_expr))
-        if tile is not None:
-            say(_tile_line(tile, decode_tile(sample.payload.to_bytes())))
-
-    known: set[wire.Alert] = set()
-
-    def alerted(sample: zenoh.Sample) -> None:
-        if near(str(sample.key_expr)) is not None:
-            tell(wire.decode_alert(sample.payload.to_bytes()))
-
-    def tell(alert: wire.Alert) -> None:
-        """Say what is news: an alert is put again and again while it stands."""
-        place = {one for one in list(known) if (one.cell, one.sector) == (alert.cell, alert.sector)}
-        if alert.raised and alert in place:
-            return
-        known.difference_update(place)
-        if alert.raised:
-            known.add(alert)
-        say(_alert_line(alert))
-
-    session = zenoh_session.open_session(connection, stop)
-    if session is None:
-        return
-    with session:
-        session.declare_subscriber(f"{keys.ROOT}/map/**", changed)
-        session.declare_subscriber(f"{keys.ROOT}/alert/**", alerted)
-        for reply in session.get(f"{keys.ROOT}/alert/**"):  # after the subscription: none is missed in between
-            if reply.ok is not None and near(str(reply.ok.key_expr)) is not None:
-                for alert in wire.decode_standing(reply.ok.payload.to_bytes()):
-                    tell(alert)
-        say("watching")
-        stop.wait()
-
-
-def _tile_line(tile: int, table: pa.Table) -> str:
-    measured = sum(basis == "measured" for basis in table["basis"].to_pylist())
-    slippery = int((table["p_slippery"].to_numpy() > 0.5).sum())
-    name = grid.quadkey(tile, grid.TILE_ZOOM)
-    return f"tile {name}: {table.num_rows} cells, {measured} measured, {slippery} likely slippery"
-
-
-def _alert_line(alert: wire.Alert) -> str:
-    word = "RAISED" if alert.raised else "cleared"
-    return (
-        f"alert {word} at {alert.latitude:.6f}, {alert.longitude:.6f} heading {grid.HEADINGS[alert.sector]}: "
-        f"mu {alert.mu:.2f} [{alert.mu_lower:.2f}, {alert.mu_upper:.2f}], {alert.vehicles} vehicles; {alert.reason}"
-    )

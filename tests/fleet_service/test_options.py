@@ -91,7 +91,7 @@ SHOWN_BELOW: Final = {
     "certs": {"--renew-days"},
     "run": {"--config", "--archive", "--weather"},
     "query": {"--bbox", "--route", "--min-vehicles", "--at", "--basis", "--format", "--out", "--connect", "--config"},
-    "watch": {"--bbox", "--connect", "--config"},
+    "watch": {"--bbox", "--connect", "--config", "--alerts", "--json", "--webhook"},
 }
 # A campaign takes minutes: tests/fleet_service/lab/test_evaluate.py runs it small.
 CAMPAIGN: Final = {"--out", "--quick", "--skip-end-to-end", "--end-to-end"}

@@ -1,0 +1,182 @@
+"""Alerts of cells and headings as alerts of stretches of road: what an operator can send somebody to. Pure.
+
+Cells under an alert that lie within LINK_CELLS of each other are one stretch, both directions of travel together. A
+stretch keeps its id from the first cell to the last: when two grow together the older id stays, when one falls apart
+the larger part keeps it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from typing import Any, Final, Literal
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from schemas import grid
+from schemas.numeric import IntArray
+from schemas.thresholds import METRES_PER_DEGREE, NS
+from schemas.wire import Alert
+
+State = Literal["raised", "changed", "cleared"]
+# Cells in between that nobody drove hard enough over, or that a bend cuts: 30 to 60 m.
+LINK_CELLS: Final = 3
+ROUND: Final = 1.3  # a stretch less elongated than that has no direction
+
+
+@dataclass(frozen=True)
+class StretchAlert:
+    """A stretch of road that is slippery, or ceased to be.
+
+    Attributes:
+        id: the same from the first cell to the last.
+        state: raised; changed: it grew or shrank; cleared.
+        since, time: when it began, and of what is said now [ns since 1970, UTC].
+        length_m: along its road direction, a cell at the least.
+        direction: of the road, e.g. north-south; headings: of the vehicles that found it.
+        latitude, longitude: its middle [deg]; bbox: west, south, east, north [deg].
+        mu, mu_lower, mu_upper: least of the cells', with that cell's interval.
+        vehicles: most of any cell.
+        reason: of the last cell that changed it.
+    """
+
+    id: str
+    state: State
+    since: int
+    time: int
+    length_m: float
+    direction: str
+    headings: tuple[str, ...]
+    latitude: float
+    longitude: float
+    bbox: tuple[float, float, float, float]
+    cells: int
+    mu: float
+    mu_lower: float
+    mu_upper: float
+    vehicles: int
+    reason: str
+
+    def values(self) -> dict[str, Any]:
+        """All of it as JSON has it; times as ISO 8601, UTC."""
+        return asdict(self) | {"since": iso(self.since), "time": iso(self.time)}
+
+    def line(self) -> str:
+        """All of it in a line."""
+        word = {"raised": "RAISED", "changed": "now", "cleared": "cleared"}[self.state]
+        return (
+            f"alert {word} at {self.latitude:.6f}, {self.longitude:.6f}: {self.length_m:.0f} m {self.direction}, "
+            f"heading {' and '.join(self.headings)}; mu {self.mu:.2f} [{self.mu_lower:.2f}, {self.mu_upper:.2f}], "
+            f"{self.vehicles} vehicles; since {iso(self.since)}, {iso(self.time)}; {self.reason}; id {self.id}"
+        )
+
+
+def iso(ns: int) -> str:
+    """A time as text."""
+    return f"{datetime.fromtimestamp(ns // NS, UTC):%Y-%m-%dT%H:%M:%SZ}"
+
+
+class Stretches:
+    """The stretches that stand, from alerts of cells as they come."""
+
+    def __init__(self) -> None:
+        self._standing: dict[tuple[int, int], Alert] = {}
+        self._known: dict[str, StretchAlert] = {}
+        self._members: dict[str, set[int]] = {}
+        self._last: Alert | None = None
+
+    def take(self, alert: Alert) -> None:
+        """A cell's alert was raised or cleared; the same twice is as once."""
+        place = (alert.cell, alert.sector)
+        if alert.raised:
+            self._standing[place] = alert
+        else:
+            self._standing.pop(place, None)
+        self._last = alert
+
+    def changes(self) -> list[StretchAlert]:
+        """What has changed since this was asked last."""
+        found, out = self._groups(), []
+        for name, group in found.items():
+            if name not in self._known:
+                out.append(self._stretch(name, group))
+            elif self._members[name] != _cells(group):
+                out.append(replace(self._stretch(name, group), state="changed"))
+        for name in [name for name in self._known if name not in found]:
+            ended, last = self._known.pop(name), self._last
+            del self._members[name]
+            if last is not None:
+                out.append(replace(ended, state="cleared", time=last.time, reason=last.reason))
+        for name, group in found.items():
+            self._known[name] = self._stretch(name, group)
+            self._members[name] = _cells(group)
+        return out
+
+    def _groups(self) -> dict[str, list[Alert]]:
+        """The standing alerts by stretch."""
+        alerts = sorted(self._standing.values(), key=lambda one: (one.time, one.cell, one.sector))
+        label = linked(np.array([one.cell for one in alerts], np.int64))
+        parts: list[list[Alert]] = [[] for _ in range(int(label.max(initial=-1)) + 1)]
+        for one, k in zip(alerts, label.tolist(), strict=True):
+            parts[k].append(one)
+        out: dict[str, list[Alert]] = {}
+        for part in sorted(parts, key=len, reverse=True):
+            cells = _cells(part)
+            names = [name for name, members in self._members.items() if members & cells and name not in out]
+            name = min(names, key=lambda one: (self._known[one].since, one)) if names else _new(part[0])
+            while not names and (name in out or name in self._known):  # a part that fell off begins with the same cell
+                name += "b"
+            out[name] = part
+        return out
+
+    def _stretch(self, name: str, group: list[Alert]) -> StretchAlert:
+        worst, last = min(group, key=lambda one: one.mu), max(group, key=lambda one: one.time)
+        known = self._known.get(name)
+        headings = tuple(grid.HEADINGS[k] for k in sorted({one.sector for one in group}))
+        length, direction, middle, bbox = _shape(np.array([one.cell for one in group], np.int64))
+        return StretchAlert(
+            id=name, state="raised", since=known.since if known else min(one.time for one in group), time=last.time,
+            length_m=length, direction=direction, headings=headings,
+            latitude=middle[0], longitude=middle[1], bbox=bbox, cells=len(_cells(group)), mu=worst.mu,
+            mu_lower=worst.mu_lower, mu_upper=worst.mu_upper, vehicles=max(one.vehicles for one in group),
+            reason=last.reason,
+        )  # fmt: skip
+
+
+def linked(cell: IntArray) -> IntArray:
+    """Number of the stretch of each cell, (n,): cells at most LINK_CELLS apart are of one."""
+    if not len(cell):
+        return np.zeros(0, np.int64)
+    places = np.stack(grid.deinterleave(cell), axis=1).astype(np.float64)
+    pairs = cKDTree(places).query_pairs(LINK_CELLS, p=np.inf, output_type="ndarray")
+    near = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(cell), len(cell)))
+    return np.asarray(connected_components(near, directed=False)[1], np.int64)
+
+
+def _cells(group: list[Alert]) -> set[int]:
+    return {one.cell for one in group}
+
+
+def _new(first: Alert) -> str:
+    return f"{grid.quadkey(first.cell, grid.CELL_ZOOM)}-{first.time // NS:x}"
+
+
+def _shape(cell: IntArray) -> tuple[float, str, tuple[float, float], tuple[float, float, float, float]]:
+    """Length [m], direction, middle [deg] and box [deg] of cells; the direction is that of the largest spread."""
+    west, south, east, north = grid.bounds(cell)
+    scale = METRES_PER_DEGREE * math.cos(math.radians(float(south.mean())))
+    x, y = (west + east) / 2 * scale, (south + north) / 2 * METRES_PER_DEGREE
+    side = float((east[0] - west[0]) * scale)
+    spread, axes = np.linalg.eigh(np.cov(np.stack([x - x.mean(), y - y.mean()]), ddof=0).reshape(2, 2))
+    along = (x - x.mean()) * axes[0, 1] + (y - y.mean()) * axes[1, 1]
+    bearing = math.degrees(math.atan2(axes[1, 1], axes[0, 1])) % 180.0
+    names = ("east-west", "northeast-southwest", "north-south", "northwest-southeast")
+    elongated = np.sqrt(spread[1]) > ROUND * np.sqrt(max(spread[0], 0.0)) and len(cell) > 1
+    direction = names[round(bearing / 45.0) % 4] if elongated else "around one place"
+    box = (float(west.min()), float(south.min()), float(east.max()), float(north.max()))
+    middle = (float((south + north).mean() / 2), float((west + east).mean() / 2))
+    return float(np.ptp(along)) + side, direction, middle, box

@@ -1,0 +1,101 @@
+"""The map watched: a line per changed tile and per stretch that became slippery or ceased to be."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+import pyarrow as pa
+import zenoh
+
+from fleet_service.client.stretches import StretchAlert, Stretches
+from schemas import grid, keys, query, wire
+from schemas.config import ZenohSettings
+from schemas.runtime import zenoh_session
+from schemas.wire.tile import decode_tile
+
+GATHER_S: Final = 0.3  # for which alerts of neighbouring cells are gathered into one
+
+
+class Wishes(NamedTuple):
+    """What is to be heard of.
+
+    Attributes:
+        bbox: west,south,east,north as text; None: everything.
+        only_alerts: no lines of tiles.
+        as_json: lines for programs.
+    """
+
+    bbox: str | None = None
+    only_alerts: bool = False
+    as_json: bool = False
+
+
+def watch(
+    connection: ZenohSettings,
+    wishes: Wishes,
+    stop: threading.Event,
+    say: Callable[[str], None],
+    hear: Callable[[StretchAlert], None] = lambda _: None,
+) -> None:
+    """Say a line per changed tile and stretch until `stop` is set; waits for a router. `hear` gets the stretches too.
+
+    Raises:
+        InputError: the box cannot be read.
+    """
+    box = query.parse({} if wishes.bbox is None else {"bbox": wishes.bbox}).bbox
+    stretches, lock = Stretches(), threading.Lock()
+
+    def near(key: str) -> int | None:
+        tile = keys.parse(key).quadint
+        if tile is None or box is None:
+            return tile
+        return tile if grid.touches(box, grid.bounds(tile, grid.TILE_ZOOM)) else None
+
+    def changed(sample: zenoh.Sample) -> None:
+        tile = near(str(sample.key_expr))
+        if tile is not None:
+            say(_tile_line(tile, decode_tile(sample.payload.to_bytes()), wishes.as_json))
+
+    def take(alert: wire.Alert) -> None:
+        with lock:
+            stretches.take(alert)
+
+    def alerted(sample: zenoh.Sample) -> None:
+        if near(str(sample.key_expr)) is not None:
+            take(wire.decode_alert(sample.payload.to_bytes()))
+
+    def tell() -> None:
+        with lock:
+            found = stretches.changes()
+        for alert in found:
+            say(json.dumps({"event": "alert", **alert.values()}) if wishes.as_json else alert.line())
+            hear(alert)
+
+    session = zenoh_session.open_session(connection, stop)
+    if session is None:
+        return
+    with session:
+        if not wishes.only_alerts:
+            session.declare_subscriber(f"{keys.ROOT}/map/**", changed)
+        session.declare_subscriber(f"{keys.ROOT}/alert/**", alerted)
+        for reply in session.get(f"{keys.ROOT}/alert/**"):  # after the subscription: none is missed in between
+            if reply.ok is not None and near(str(reply.ok.key_expr)) is not None:
+                for alert in wire.decode_standing(reply.ok.payload.to_bytes()):
+                    take(alert)
+        say(json.dumps({"event": "watching"}) if wishes.as_json else "watching")
+        while not stop.wait(GATHER_S):
+            tell()
+        tell()
+
+
+def _tile_line(tile: int, table: pa.Table, as_json: bool) -> str:
+    measured = sum(basis == "measured" for basis in table["basis"].to_pylist())
+    slippery = int((table["p_slippery"].to_numpy() > 0.5).sum())
+    name = grid.quadkey(tile, grid.TILE_ZOOM)
+    if as_json:
+        counts = {"cells": table.num_rows, "measured": measured, "slippery": slippery}
+        return json.dumps({"event": "tile", "tile": name, **counts})
+    return f"tile {name}: {table.num_rows} cells, {measured} measured, {slippery} likely slippery"

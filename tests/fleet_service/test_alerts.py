@@ -1,0 +1,175 @@
+"""Alerts that somebody can be sent to: stretches with length, direction, id and life cycle; a webhook that arrives."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from fleet_service.cli import main
+from fleet_service.client.stretches import LINK_CELLS, Stretches
+from fleet_service.client.webhook import Webhook, body
+from schemas import grid
+from schemas.config import ZenohSettings
+from schemas.errors import InputError
+from schemas.wire import Alert
+from tests.fleet_service.app.test_service import Fleet
+from tests.fleet_service.conftest import Running
+from tests.fleet_service.examples import SECOND, batch
+from tests.waiting import until
+
+X, Y = 1_118_000, 630_000  # of cells near Gothenburg
+
+
+def alert(x: int, y: int = 0, *, sector: int = 0, raised: bool = True, at: int = 0, mu: float = 0.2) -> Alert:
+    cell = int(grid.interleave(np.array([X + x]), np.array([Y + y]))[0])
+    latitude, longitude = grid.centre(cell)
+    return Alert(
+        cell, sector, raised, (1_800_000_000 + at) * SECOND, mu, mu - 0.1, mu + 0.1, 0.95, 2, float(latitude),
+        float(longitude), "P(mu < 0.4) = 0.95 > 0.9" if raised else "later visits found grip",
+    )  # fmt: skip
+
+
+def told(stretches: Stretches, *alerts: Alert) -> list[Any]:
+    for one in alerts:
+        stretches.take(one)
+    return stretches.changes()
+
+
+def test_a_road_of_ice_in_both_directions_is_one_alert_with_its_length_and_direction() -> None:
+    (found,) = told(Stretches(), *(alert(x, sector=s, at=x) for x in range(20) for s in (0, 2)))
+    side = 360 / 2**21 * 111_195 * np.cos(np.radians(found.latitude))
+    assert found.length_m == pytest.approx(20 * side, rel=0.01)
+    assert (found.direction, found.headings, found.cells) == ("east-west", ("east", "west"), 20)
+    assert found.state == "raised"
+    assert (
+        "m east-west, heading east and west; mu 0.20 [0.10, 0.30], 2 vehicles; since 2027-01-15T08:00:00Z"
+        in found.line()
+    )
+    (north,) = told(Stretches(), *(alert(0, y) for y in range(10)))
+    assert north.direction == "north-south"
+    (one,) = told(Stretches(), alert(0))
+    assert one.direction == "around one place"
+
+
+def test_ice_far_away_is_another_alert_and_a_small_gap_is_none() -> None:
+    gap = LINK_CELLS
+    assert len(told(Stretches(), alert(0), alert(gap))) == 1
+    assert len(told(Stretches(), alert(0), alert(gap + 1))) == 2
+
+
+def test_a_stretch_keeps_its_id_while_it_grows_joins_falls_apart_and_ends() -> None:
+    road = Stretches()
+    (old,) = told(road, alert(0, at=0))
+    (young,) = told(road, alert(8, at=10))
+    assert old.id != young.id
+    assert told(road, alert(0, at=0), alert(8, at=10)) == [], "an alert is put again while it stands: that is no news"
+    joined = {one.id: one for one in told(road, *(alert(x, at=20) for x in (2, 4, 6)))}
+    assert joined[old.id].state == "changed"
+    assert joined[old.id].cells == 5
+    assert joined[young.id].state == "cleared"
+    assert joined[old.id].since == old.since
+    apart = told(road, *(alert(x, raised=False, at=30) for x in (2, 4)))
+    assert {one.state for one in apart} == {"changed", "raised"}
+    assert [one.cells for one in apart if one.id == old.id] == [2], "the larger part keeps the name"
+    ended = told(road, *(alert(x, raised=False, at=40) for x in (0, 6, 8)))
+    assert {one.state for one in ended} == {"cleared"}
+    assert {one.reason for one in ended} == {"later visits found grip"}
+    assert told(road) == []
+
+
+@contextmanager
+def receiver(refuse: int = 0) -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    """A real HTTP server that takes webhooks, after refusing so many."""
+    heard: list[dict[str, Any]] = []
+    left = [refuse]
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            text = self.rfile.read(int(self.headers["Content-Length"]))
+            refused = left[0] > 0
+            left[0] -= refused
+            if not refused:
+                assert self.headers["Content-Type"] == "application/json"
+                heard.append(json.loads(text))
+            self.send_response(503 if refused else 200)
+            self.end_headers()
+
+        def log_message(self, format: str, *args: object) -> None:  # noqa: A002
+            """Silent."""
+
+    server = HTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}/hook", heard
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+def test_a_webhook_is_what_alertmanager_sends_and_comes_in_order_after_a_refusal() -> None:
+    road, said = Stretches(), list[str]()
+    with receiver(refuse=1) as (url, heard):
+        hook = Webhook(url, said.append)
+        for one in (*told(road, alert(0)), *told(road, alert(0, raised=False, at=5))):
+            hook.send(one)
+        until(lambda: len(heard) == 2)
+        hook.close()
+    assert [one["status"] for one in heard] == ["firing", "resolved"]
+    assert [one["version"] for one in heard] == ["4", "4"]
+    (first,), (second,) = (one["alerts"] for one in heard)
+    assert first["fingerprint"] == second["fingerprint"] == first["labels"]["id"]
+    assert first["labels"]["alertname"] == "SlipperyRoad"
+    assert (first["startsAt"], first["endsAt"]) == ("2027-01-15T08:00:00Z", "0001-01-01T00:00:00Z")
+    assert second["endsAt"] == "2027-01-15T08:00:05Z"
+    assert "does not take alerts" in said[0]
+    assert "answers again" in said[1]
+
+
+def test_a_receiver_that_never_comes_is_said_at_the_end() -> None:
+    said: list[str] = []
+    hook = Webhook("http://127.0.0.1:9/none", said.append)
+    hook.send(told(Stretches(), alert(0))[0])
+    until(lambda: said)
+    hook.close()
+    assert said[-1] == "webhook: 1 alerts were not delivered"
+    with pytest.raises(InputError, match="webhook: 'ftp://x' is no URL"):
+        Webhook("ftp://x", said.append)
+    assert set(body(told(Stretches(), alert(0))[0])) >= {"receiver", "status", "alerts", "groupLabels", "externalURL"}
+
+
+@pytest.mark.usefixtures("service")
+def test_watch_says_stretches_as_json_and_sends_them(
+    router: ZenohSettings, session: zenoh.Session, service: Running
+) -> None:
+    with receiver() as (url, heard):
+        words = ["watch", "--alerts", "--json", "--webhook", url, "--connect", router.connect[0]]
+        command = [sys.executable, "-m", "fleet_service.cli", *words]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as watching:
+            assert watching.stdout is not None
+            assert json.loads(watching.stdout.readline()) == {"event": "watching"}
+            fleet = Fleet(session).meet()
+            fleet.settle(*(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(4)))
+            line = json.loads(watching.stdout.readline())
+            until(lambda: heard)
+            watching.terminate()
+            assert watching.wait(20) == 0
+    assert (line["event"], line["state"], line["cells"]) == ("alert", "raised", 1)
+    assert heard[0]["alerts"][0]["labels"]["id"] == line["id"]
+
+
+def test_a_webhook_that_is_no_url_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["watch", "--webhook", "x"]) == 2
+    assert capsys.readouterr().err.startswith("error: webhook: 'x' is no URL")
