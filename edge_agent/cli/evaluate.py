@@ -6,6 +6,7 @@ import argparse
 import importlib.util
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -15,6 +16,8 @@ LEAST_SEEDS: Final = 20  # of a campaign whose bars count
 QUICK_SEEDS: Final = 2
 ONLY: Final = ("inputs",)
 LEARNED_CARS: Final = 20
+LIVE_S: Final = 60.0
+QUICK_S: Final = 10
 CARS: Final = 5  # smooth ones, and as many rough ones, of the inputs' campaign
 
 
@@ -24,11 +27,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quick", action="store_true", help="three scenarios, two estimators, two seeds: does it run?")
     parser.add_argument("--seeds", type=int, help=f"how many drives per scenario (default {LEAST_SEEDS})")
     parser.add_argument(
-        "--only", choices=ONLY, help="a campaign of its own: inputs, of the signal doctor and of calibration"
+        "--only", choices=ONLY, help="a campaign of its own: inputs: readers, signal doctor, calibration, live sources"
     )
     parser.add_argument(
         "--plots", choices=("png", "svg", "pdf"), default="png", help="their format (default %(default)s)"
     )
+    parser.add_argument("--recorded", type=Path, help="CAN log whose frames are decoded too (--only inputs)")
     parser.add_argument("--no-plots", action="store_true", help="figures and table only; needs no matplotlib")
 
 
@@ -74,12 +78,26 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _inputs(args: argparse.Namespace) -> int:
-    from edge_agent.lab.evaluation.calibrated import figures as calibrated
-    from edge_agent.lab.evaluation.planted import figures as planted
+    from edge_agent.lab.evaluation import calibrated, imports, planted
+    from edge_agent.lab.live import judge
     from edge_agent.lab.seeds import FIGURES
-    from schemas.runtime.figures import markdown, write
+    from schemas.runtime.figures import Figure, markdown, write
 
-    figures = planted(1 if args.quick else CARS, FIGURES) + calibrated(1 if args.quick else LEARNED_CARS, FIGURES)
+    folder = args.out / "inputs"
+    folder.mkdir(exist_ok=True)
+    quick = args.quick
+    rows: list[Callable[[], list[Figure]]] = [
+        lambda: imports.figures(folder, FIGURES, args.recorded, QUICK_S if quick else imports.DRIVE_S),
+        lambda: planted.figures(1 if quick else CARS, FIGURES),
+        lambda: calibrated.figures(1 if quick else LEARNED_CARS, FIGURES),
+        lambda: calibrated.widths(1 if quick else LEARNED_CARS, FIGURES, 2 * QUICK_S if quick else calibrated.JUDGED_S),
+        lambda: judge.figures(folder, 1.0 if quick else LIVE_S, 1 if quick else judge.KILLS),
+    ]
+    figures: list[Figure] = []
+    for row in rows:
+        found = row()
+        figures += found
+        print(markdown(found).partition("|---|---|---|---|\n")[2], file=sys.stderr, flush=True)
     write(args.out / "figures.json", "edge-agent evaluate --only inputs", [FIGURES, FIGURES + 1], figures)
     text = f"# Inputs\n\n{markdown(figures)}\n"
     (args.out / "report.md").write_text(text, encoding="utf-8")

@@ -95,7 +95,7 @@ def write_log(path: Path, merged: Merged, profile: Profile, sources: Sequence[st
         whole = merged.start_ns + np.rint(merged.t * NS).astype(np.int64)
         columns["timestamp"] = pa.array(whole, pa.int64()).cast(pa.timestamp("ns", tz="UTC"))
     else:
-        columns["t"] = pa.array(merged.t)
+        columns["t"] = pa.array(np.rint(merged.t * NS) / NS)  # as dated ones read: one drive is one log in all formats
     columns |= {name: pa.array(values, from_pandas=True) for name, values in merged.columns.items()}
     provenance: Mapping[str, object] = {
         "profile": json.loads(profile.text()), "sources": list(sources),

@@ -11,12 +11,13 @@ def corrected(signals: FloatArray, vehicle: Vehicle) -> FloatArray:
     """Signals (…, 18) less what the vehicle's calibration knows of their errors; the same array where there is none.
 
     What was not learned is taken as sound; what was is a posterior mean, drawn to it. Rear steering and torque stay.
+    So does a_y: what it reads straight on is crossfall too, which tyres truly hold, and no drive tells them apart.
     """
     known = vehicle.calibration
     if known is None:
         return signals
     signals = signals.copy()
-    for channel, estimate in ((S.AX, known.ax), (S.AY, known.ay), (S.YAW_RATE, known.yaw_rate)):
+    for channel, estimate in ((S.AX, known.ax), (S.YAW_RATE, known.yaw_rate)):
         signals[..., channel] -= _value(estimate, 0.0)
     for i, wheel in enumerate(WHEELS):
         signals[..., S.OMEGA + i] /= 1.0 + _value(getattr(known, f"radius_{wheel}"), 0.0)

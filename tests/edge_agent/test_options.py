@@ -88,6 +88,7 @@ ELSEWHERE = {
     "tune": {"--quick": "test_quick_tuning_writes_a_valid_file_and_says_what_it_does",
              "--study": "test_the_quick_study_writes_figures_table_plot_and_a_tuned_file"},
     "evaluate": {"--out": CAMPAIGN, "--quick": CAMPAIGN, "--seeds": SEEDS, "--no-plots": SEEDS, "--plots": CAMPAIGN,
+                 "--recorded": "test_only_the_inputs_are_evaluated_where_so_asked",
                  "--only": "test_only_the_inputs_are_evaluated_where_so_asked"},
 }  # fmt: skip
 # agent configuration: setting -> another value; those of sending are shown where things are sent

@@ -29,7 +29,8 @@ def judge(memory: MixtureMemory, design: MixtureDesign, duration: float) -> None
     trust, constants, rules = memory.trust, design.constants, design.rules
     wheels = memory.actual[0] / max(memory.theoretical[0], LEAST_VARIANCE) - 1.0
     axles = memory.actual[1] / max(memory.theoretical[1], LEAST_VARIANCE) - 1.0
-    odd = contradiction(rules, axles, belief_cost(memory.overall_mean, memory.nominal))
+    # by what any car may be: a calibration makes the belief of this one narrower, and contradicts nothing
+    odd = contradiction(rules, axles, belief_cost(memory.overall_mean, design.nominal))
     keep = math.exp(-duration / (constants.odd_rise if odd > trust.odd else constants.odd_fall))
     trust.odd = keep * trust.odd + (1.0 - keep) * odd
     trust.distrust, trust.hurry = distrust(rules, trust.odd), hurry(rules, wheels)

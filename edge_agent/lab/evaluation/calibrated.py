@@ -1,21 +1,31 @@
-"""Calibration against the truth of simulated rough cars: its errors in units of the standard deviations it claims."""
+"""Calibration against the truth of simulated rough cars: its errors, and what it brings.
+
+Errors are in units of the standard deviations that it claims; what it brings is the width of the friction's interval.
+"""
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
+from edge_agent.app.estimator_factory import bank_of
 from edge_agent.calibration.learn import learn
-from edge_agent.lab.evaluation.planted import drives
+from edge_agent.inputs.correct import corrected
+from edge_agent.lab.evaluation.planted import RATE_HZ, drives
+from edge_agent.lab.simulation import SimulatedFleet
 from edge_agent.lab.simulation.misaligned import Misaligned
 from edge_agent.lab.simulation.place import GOTHENBURG
 from edge_agent.lab.simulation.sensors import ROUGH_FLEET, ErrorColumn, error_row
+from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
 from schemas.signals import WHEELS, S
 
 DRIVES, DRIVE_S = 10, 60  # of each car; its road goes on from drive to drive
 CARS_AT_ONCE: Final = 5
+JUDGED_S: Final = 120  # of the drive after them that is judged
+SETTLED_S: Final = 10.0  # of it that are left out
+ESTIMATOR: Final = "aco-fckf"
 
 
 def truth(seed: int, car: int) -> dict[str, float]:
@@ -32,6 +42,57 @@ def truth(seed: int, car: int) -> dict[str, float]:
         "steer_offset": float(mounted[Misaligned.ZERO] + offset[S.DELTA]),
         "steer_gain": float(1.0 + mounted[Misaligned.GAIN]),
     }
+
+
+class Narrowed(NamedTuple):
+    """Of some cars: mean width of the 90 % interval, and share of truths inside, without and with calibration."""
+
+    plain_width: float
+    plain_coverage: float
+    width: float
+    coverage: float
+
+
+def narrowed(cars: int, seed: int, judged_s: int = JUDGED_S) -> Narrowed:
+    """Rough cars that learn from DRIVES drives, and are judged on the drive after them."""
+    fleet = SimulatedFleet("hills", cars, seed, RATE_HZ, rough=1.0)
+    t, signals = _driven(fleet, DRIVES * DRIVE_S)[:2]
+    size = len(t) // DRIVES
+    parts = [slice(k * size, (k + 1) * size) for k in range(DRIVES)]
+    learned = [
+        vehicle.model_copy(update={"calibration": learn([(t[p, n], signals[p, n]) for p in parts], vehicle)})
+        for n, vehicle in enumerate(fleet.vehicles)
+    ]
+    t, signals, mu = _driven(fleet, judged_s)
+    judged = slice(round(SETTLED_S * RATE_HZ), None)
+    found = []
+    for vehicles in (fleet.vehicles, learned):
+        mended = np.stack([corrected(signals[:, n], vehicle) for n, vehicle in enumerate(vehicles)], axis=1)
+        told = bank_of(ESTIMATOR, vehicles).advance(t, mended)
+        inside = (told.mu_lower <= mu) & (mu <= told.mu_upper)
+        found += [float((told.mu_upper - told.mu_lower)[judged].mean()), float(inside[judged].mean())]
+    return Narrowed(*found)
+
+
+def _driven(fleet: SimulatedFleet, seconds: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Times (T, N), signals (T, N, 18), and true friction, the mean of the wheels (T, N)."""
+    parts = []
+    for _ in range(seconds):
+        t, signals = fleet.step(round(RATE_HZ))
+        parts.append((t, signals, fleet.truth.mu_wheel.mean(axis=-1)))
+    t, signals, mu = (np.concatenate([part[k] for part in parts]) for k in range(3))
+    return t, signals, mu
+
+
+def widths(cars: int, seed: int, judged_s: int = JUDGED_S) -> list[Figure]:
+    """Width with calibration over without, and both coverages."""
+    groups = [narrowed(min(CARS_AT_ONCE, cars - k), seed + k, judged_s) for k in range(0, cars, CARS_AT_ONCE)]
+    plain, plain_coverage, width, coverage = (float(np.mean(column)) for column in zip(*groups, strict=True))
+    return [
+        Figure("calibration.width_ratio", width / plain, "1", 0.8), Figure("calibration.width", width, "1"),
+        Figure("calibration.coverage", coverage, "1", 0.88, "more"),
+        Figure("calibration.plain_coverage", plain_coverage, "1"),
+    ]  # fmt: skip
 
 
 def figures(cars: int, seed: int) -> list[Figure]:

@@ -7,7 +7,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +29,7 @@ MULTICAST: Final = "239.74.163.2"
 COUNTED: Final = ("can", "ros2", "vss")
 PATIENCE_S: Final = 60.0
 SETTLED_S: Final = 2.0  # after the last sample: rows come late by design
-KILLED: Final = 3  # times that each source is killed while an agent drives
+KILLS: Final = 3  # of each source while an agent drives
 
 
 @dataclass
@@ -146,7 +146,7 @@ def lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
     return max(missing, 0) + feeds[0].lost + max(int((~inside[2:-2]).sum()), short), samples
 
 
-def crashes(folder: Path, estimator: str = "aco-fckf") -> tuple[int, int]:
+def crashes(folder: Path, kills: int = KILLS) -> tuple[int, int]:
     """Agents that did not end as they should although their sources were killed and came back, and how often."""
     vehicle = folder / "car.json"
     vehicle.write_text(Vehicle.model_validate(PRESETS["sedan"].vehicle).model_dump_json(exclude_none=True))
@@ -155,7 +155,7 @@ def crashes(folder: Path, estimator: str = "aco-fckf") -> tuple[int, int]:
         place, source = addresses(kind)
         name, dbc = written("can" if kind == "gpsd" else kind, folder)
         config = folder / f"{kind}.agent.json"
-        spool = {"spool": str(folder / f"{kind}.sqlite"), "estimator": estimator}
+        spool = {"spool": str(folder / f"{kind}.sqlite"), "estimator": "ckf"}
         config.write_text(json.dumps({"zenoh": {"connect": ["tcp/127.0.0.1:9"]}, **spool}), encoding="utf-8")
         words = ["run", "--source", source, "--profile", name, "--vehicle", str(vehicle), "--name", "car-one"]
         words += ["--config", str(config), "--trust", *(["--dbc", str(dbc)] if dbc else [])]
@@ -163,7 +163,7 @@ def crashes(folder: Path, estimator: str = "aco-fckf") -> tuple[int, int]:
             words += ["--source", addresses("can")[1]]
         command = [sys.executable, "-c", "import sys; from edge_agent.cli import main; sys.exit(main(sys.argv[1:]))"]
         agent = subprocess.Popen([*command, *words], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
-        for _ in range(KILLED):
+        for _ in range(kills):
             with peer(kind, place, 100_000) as running:
                 running.go()
                 running.until("ready")
@@ -178,16 +178,16 @@ def crashes(folder: Path, estimator: str = "aco-fckf") -> tuple[int, int]:
     return bad, tries
 
 
-def figures(folder: Path, seconds: float, kinds: Sequence[str] = COUNTED) -> list[Figure]:
+def figures(folder: Path, seconds: float, kills: int = KILLS) -> list[Figure]:
     """Samples lost by kind, and crashes."""
     found = []
-    for kind in kinds:
+    for kind in COUNTED:
         missing, sent = lost(kind, folder, seconds)
         found += [
             Figure(f"live.{kind}.samples_lost", float(missing), "samples", 0.0),
             Figure(f"live.{kind}.samples", float(sent), "samples"),
         ]
-    bad, tries = crashes(folder)
+    bad, tries = crashes(folder, kills)
     return [
         *found, Figure("live.source_loss.crashes", float(bad), "crashes", 0.0),
         Figure("live.source_loss.losses", float(tries), "losses"),

@@ -124,10 +124,19 @@ def test_estimates_that_are_not_plausible_have_an_exit_code_of_their_own(tmp_pat
     assert "NOT PLAUSIBLE" in capsys.readouterr().err
 
 
-@pytest.mark.timeout(120)
+@pytest.mark.timeout(600)  # processes are started, and kernels may have to be compiled
 def test_only_the_inputs_are_evaluated_where_so_asked(tmp_path: Path) -> None:
-    assert main(["evaluate", "--only", "inputs", "--quick", "--out", str(tmp_path)]) in (0, 1)
+    words = ["evaluate", "--only", "inputs", "--quick", "--recorded", str(BLF), "--out", str(tmp_path)]
+    assert main(words) in (0, 1)
     figures = {row["name"]: row["value"] for row in json.loads((tmp_path / "figures.json").read_text())[1:]}
     assert figures["doctor.tries"] == 2 * len(PLANTED)
     assert figures["doctor.faults_named"] > 0.9
+    assert figures["inputs.decode_errors"] == 0
+    assert figures["inputs.decoded"] > 60_000, "the recorded frames are among them"
+    assert figures["inputs.formats"] == 6
+    assert figures["inputs.same_estimates"] <= 1e-6
+    assert [figures[f"live.{kind}.samples"] for kind in ("can", "ros2", "vss")] == [100] * 3
+    assert figures["live.source_loss.losses"] == 4
+    assert figures["live.source_loss.crashes"] == 0
+    assert "calibration.width_ratio" in figures
     assert "doctor.published_wrong" in (tmp_path / "report.md").read_text()

@@ -1,0 +1,161 @@
+"""What comes in by files: frames decoded as by cantools, a minute of a bus at once, one drive alike in all formats."""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.inputs.bring_in import read_source, write_log
+from edge_agent.inputs.merge import merge
+from edge_agent.inputs.profile import Channel, Profile, load_profile, shipped
+from edge_agent.inputs.readers.can_log import log_frames
+from edge_agent.inputs.readers.dbc import LONGEST, Database, parse_dbc, read_dbc
+from edge_agent.inputs.recording import library
+from edge_agent.inputs.signal_log import read_log
+from edge_agent.lab.evaluation.formats import as_bag, as_csv, as_log, as_mf4
+from edge_agent.lab.evaluation.planted import Recorded, drives
+from edge_agent.lab.live.peers import CHANNELS, DBC, STEP, profile_of
+from schemas.numeric import FloatArray
+from schemas.runtime.figures import Figure
+from schemas.signals import CHANNELS as ALL
+
+MADE: Final = 200  # frames of each message
+MINUTE_FRAMES: Final = 99_000
+OTHERS: Final = 40  # identifiers of a bus that nobody asks for
+TRIES: Final = 3
+DRIVE_S: Final = 30
+START_S: Final = 1_700_000_000
+
+
+def decode_errors(recorded: Path | None, seed: int) -> tuple[int, int]:
+    """Values that differ from those of cantools, and how many were compared.
+
+    Made frames of random bytes for every shipped profile with a database; and those of a recorded log, by the database
+    of the profile that it has frames of.
+    """
+    wrong = compared = 0
+    rng = np.random.default_rng(seed)
+    for name in shipped():
+        profile, folder = load_profile(name)
+        if profile.dbc is None:
+            continue
+        ours, oracle = (
+            read_dbc(folder / profile.dbc),
+            library("cantools", "dev").database.load_file(folder / profile.dbc),
+        )
+        frames = {message.name: [rng.bytes(message.length) for _ in range(MADE)] for message in oracle.messages}
+        if recorded is not None:
+            log, _ = log_frames(recorded, {message.identifier for message in ours.values()})
+            for message in oracle.messages:
+                for (_, identifier, extended), heard in log.items():
+                    if (identifier, extended) == (message.frame_id, message.is_extended_frame):
+                        data = heard.columns()[1]
+                        frames[message.name] += [bytes(row[: message.length]) for row in data]
+        for message in oracle.messages:
+            errors, values = _against(ours, message, frames[message.name])
+            wrong, compared = wrong + errors, compared + values
+    return wrong, compared
+
+
+def _against(ours: Database, message: Any, frames: Sequence[bytes]) -> tuple[int, int]:  # noqa: ANN401 cantools has no types
+    table = np.frombuffer(b"".join(frame.ljust(LONGEST, b"\0") for frame in frames), np.uint8).reshape(-1, LONGEST)
+    oracle = [message.decode(frame, decode_choices=False) for frame in frames]
+    decoded = ours[message.name].decode(table, list(ours[message.name].signals))
+    pairs = [
+        (float(row.get(signal, np.nan)), value) for signal, values in decoded.items()
+        for row, value in zip(oracle, values.tolist(), strict=True)
+    ]  # fmt: skip
+    return sum(a != b and not (np.isnan(a) and np.isnan(b)) for a, b in pairs), len(pairs)
+
+
+def on_a_bus(drive: Recorded) -> list[Any]:
+    """A drive as frames: four messages a sample, among others that nobody asks for if there is room in a minute."""
+    frames = []
+    columns = drive.signals[:, [ALL.index(name) for name in CHANNELS]]
+    for t, row in zip(drive.t, columns, strict=True):
+        for k in range(0, len(row), 2):
+            if np.isfinite(row[k : k + 2]).all():
+                data = struct.pack("<ii", *(round(value / STEP) for value in row[k : k + 2]))
+                frames.append(_frame(t + 1e-4 * k, 256 + k // 2, data))
+    return frames
+
+
+def _frame(t: float, identifier: int, data: bytes) -> Any:  # noqa: ANN401 python-can has no types
+    stamp = round(START_S + t, 6)
+    return library("can").Message(
+        timestamp=stamp, arbitration_id=identifier, is_extended_id=False, data=data, channel=1
+    )
+
+
+def a_minute(path: Path) -> Path:
+    """MINUTE_FRAMES of a bus in a minute: four messages at 100 Hz that are asked for, and OTHERS."""
+    rng = np.random.default_rng(1)
+    others = rng.choice(np.arange(512, 512 + OTHERS), MINUTE_FRAMES - 24_000)
+    chosen = np.concatenate([np.tile(np.arange(256, 260), 6000), others])
+    rng.shuffle(chosen)
+    data = rng.bytes(8)
+    return as_log(path, [_frame(60.0 * k / len(chosen), int(one), data) for k, one in enumerate(chosen)])
+
+
+def imported(path: Path, profile: Profile, out: Path) -> Path:
+    """A source as a signal log, the way of `edge-agent import`."""
+    database = parse_dbc(DBC) if path.suffix != ".csv" else None
+    merged = merge([read_source(path, profile, database)], profile)
+    write_log(out, merged, profile, [path.name])
+    return out
+
+
+def import_s(folder: Path) -> float:
+    """Seconds for a minute of a bus, the best of TRIES."""
+    path, profile, spent = a_minute(folder / "minute.blf"), profile_of("can"), []
+    for _ in range(TRIES):
+        began = time.perf_counter()
+        imported(path, profile, folder / "minute.parquet")
+        spent.append(time.perf_counter() - began)
+    return min(spent)
+
+
+def estimates_of(log: Path, drive: Recorded) -> FloatArray:
+    """Everything that the default estimator says of a log."""
+    read = read_log(log)
+    return np.asarray(bank_of("aco-fckf", [drive.vehicle]).advance(read.t[:, None], read.signals[:, None]).values)
+
+
+def same_estimates(folder: Path, seed: int, seconds: int = DRIVE_S) -> tuple[float, int]:
+    """Largest difference of estimates of one drive over its formats, and how many formats there were."""
+    (drive,) = drives(1, seed, rough=True, seconds=seconds)
+    frames, profile = on_a_bus(drive), profile_of("can")
+    paths = [as_log(folder / f"drive.{kind}", frames) for kind in ("blf", "asc", "log")]
+    paths += [as_mf4(folder / "drive.mf4", frames), as_bag(folder / "bag", frames)]
+    logs = [imported(path, profile, folder / f"{path.name}.parquet") for path in paths]
+    csv = as_csv(folder / "drive.csv", logs[0])
+    plain = Profile(name="csv", channels={name: Channel(signal=name) for name in CHANNELS})
+    logs.append(imported(csv, plain, folder / "csv.parquet"))
+    first, *others = (estimates_of(log, drive) for log in logs)
+    differences = [_largest(first, other) for other in others]
+    return max(differences), len(logs)
+
+
+def _largest(one: FloatArray, other: FloatArray) -> float:
+    if one.shape != other.shape or not np.array_equal(np.isnan(one), np.isnan(other)):
+        return float("inf")
+    return float(np.nanmax(np.abs(one - other)))
+
+
+def figures(folder: Path, seed: int, recorded: Path | None, seconds: int = DRIVE_S) -> list[Figure]:
+    """The three rows, and what they were taken over."""
+    wrong, compared = decode_errors(recorded, seed)
+    largest, formats = same_estimates(folder, seed, seconds)
+    return [
+        Figure("inputs.decode_errors", float(wrong), "values", 0.0),
+        Figure("inputs.decoded", float(compared), "values"),
+        Figure("inputs.import_s", import_s(folder), "s", 1.5),
+        Figure("inputs.same_estimates", largest, "1", 1e-6),
+        Figure("inputs.formats", float(formats), "formats"),
+    ]
