@@ -10,6 +10,7 @@ setup: $(STAMP)  ## make .venv and install everything, pinned
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[analytics,certs,demo,dev,inputs,metrics]'
+	$(BIN)/python -m deploy.precompile
 	touch $@
 
 demo: setup  ## router, fleet service and simulated vehicles; ends with the map beside the truth
