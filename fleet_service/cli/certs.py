@@ -9,6 +9,7 @@ from pathlib import Path
 from schemas.errors import InputError
 
 LONGEST_DAYS = 36525.0  # a century; beyond, dates end
+ASKED = 3  # names that may be revoked without a word: a list that is short by mistake must not end a fleet
 SHOWN = 8  # names of a kind
 
 
@@ -19,6 +20,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--days", type=float, default=365.0, help="how long a certificate is good (default 365)")
     parser.add_argument("--ca-days", type=float, default=3650.0, help="how long a new authority is good (default 3650)")
     parser.add_argument("--renew-days", type=float, default=30.0, help="renew what ends sooner (default 30)")
+    parser.add_argument("--revoke", metavar="N", type=int, help=f"revoke so many names; more than {ASKED} want it said")
+    parser.add_argument("--dry-run", action="store_true", help="only say who would be revoked")
     parser.add_argument("--ca", choices=("next", "switch", "drop"), help="a step on the way to another authority")
 
 
@@ -39,7 +42,16 @@ def run(arguments: argparse.Namespace) -> int:
     except ImportError as error:
         raise InputError("certs", "the package cryptography is missing", "pip install 'gripmap[certs]'") from error
     try:
-        done = Registry(out, Terms(*days), datetime.now(UTC)).enrol(fleet, arguments.ca)
+        registry = Registry(out, Terms(*days), datetime.now(UTC))
+        leaving = registry.leaving(fleet)
+        if arguments.dry_run:
+            print(f"would revoke {len(leaving)}: {', '.join(leaving) or 'nobody'}")
+            return 0
+        if len(leaving) > (ASKED if arguments.revoke is None else arguments.revoke):
+            shown = ", ".join(leaving[:SHOWN]) + (" …" if len(leaving) > SHOWN else "")
+            fix = f"put them back on the list, or add --revoke {len(leaving)}"
+            raise InputError("fleet", f"{len(leaving)} names with a certificate are not on it: {shown}", fix)
+        done = registry.enrol(fleet, arguments.ca)
     except OSError as error:
         problem = f"cannot write {error.filename or out} ({error.strerror})"
         raise InputError("out", problem, "give a folder you may write") from error

@@ -82,7 +82,7 @@ class Registry:
                 self._refuse_revoked(name, signer.certificate)
                 ca.issue(signer, name, hosts, self._terms.days, self._now).write(self._folder / name)
                 done.made.append(name)
-        done.revoked += self._revoke(set(fleet.names))
+        done.revoked += self._revoke(self.leaving(fleet))
         self._trust()
         for name in fleet.routers:
             text = json.dumps(router_configuration(fleet, name, self._folder), indent=1)
@@ -141,14 +141,30 @@ class Registry:
             "fleet", f"{name!r} was revoked and its certificate is good until {until}", "give another name"
         )
 
-    def _revoke(self, names: set[str]) -> list[str]:
-        """Certificates of names that are no longer on the list go aside, their keys away."""
-        gone = [path for path in sorted(self._folder.glob("*.pem")) if path.stem not in names | {"trust"}]
-        for path in gone:
-            path.with_suffix(".key").unlink(missing_ok=True)
-            path.with_suffix(".json5").unlink(missing_ok=True)
-            path.rename(self._revoked / path.name)
-        return [path.stem for path in gone]
+    def leaving(self, fleet: Enrolment) -> list[str]:
+        """Names that have a certificate of this authority and are no longer on the list: `enrol` would revoke them."""
+        found = (ca.read_certificate(self._authority / f"{name}.pem") for name in ("ca", "next", "old"))
+        signers = [signer for signer in found if signer is not None]
+        return [path.stem for path in sorted(self._folder.glob("*.pem")) if self._leaves(path, fleet, signers)]
+
+    def _leaves(self, path: Path, fleet: Enrolment, signers: list[x509.Certificate]) -> bool:
+        """Whether a file is a certificate made here, for a name that is off the list; others are left alone."""
+        if path.stem in {*fleet.names, "trust"}:
+            return False
+        try:
+            found = ca.read_certificate(path)
+        except InputError:
+            return False
+        return found is not None and any(ca.signed(found, signer) for signer in signers)
+
+    def _revoke(self, gone: list[str]) -> list[str]:
+        """Certificates and keys of names that are no longer on the list go aside."""
+        for name in gone:
+            for ending in (".key", ".json5", ".pem"):  # the certificate last: cut off half way, it is done again
+                path = self._folder / f"{name}{ending}"
+                if path.exists():
+                    path.rename(self._revoked / path.name)
+        return gone
 
     def _trust(self) -> None:
         found = (ca.read_certificate(self._authority / f"{name}.pem") for name in ("ca", "next", "old"))

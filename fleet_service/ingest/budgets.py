@@ -20,7 +20,7 @@ NEW_CELLS_AT_ONCE: Final = 3_000.0
 STREAMS_PER_HOUR: Final = 60.0
 STREAMS_AT_ONCE: Final = 120.0
 FASTEST: Final = 70.0  # m/s; no road vehicle, and no error of a clock
-LEAP_M: Final = 1_000.0  # of a position that comes back after a tunnel or a ferry's hold
+LEAP_M: Final = 2_000.0  # of a position that comes back after a tunnel or a ferry's hold
 VEHICLES: Final = 200_000  # that are remembered
 HOUR: Final = 3600.0
 

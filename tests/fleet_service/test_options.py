@@ -88,7 +88,7 @@ SHOWN_BELOW: Final = {
     "retention": {"--yes"},
     "forget": {"--yes"},  # of terminals: test_commands.py
     "completion": {"shell"},
-    "certs": {"--renew-days"},
+    "certs": {"--renew-days", "--revoke", "--dry-run"},  # enrolment/test_certificates.py
     "run": {"--config", "--archive", "--weather"},
     "query": {"--bbox", "--route", "--min-vehicles", "--at", "--basis", "--format", "--out", "--connect", "--config"},
     "watch": {"--bbox", "--connect", "--config", "--alerts", "--json", "--webhook"},
@@ -222,10 +222,10 @@ def there(name: str, mu: float) -> wire.Batch:
 
 @pytest.fixture
 def fed(service: Running, session: zenoh.Session) -> Fleet:
-    """A service with three cars on ice, one of which is on a dry road elsewhere later."""
+    """A service with three cars on ice, and one on a dry road elsewhere later."""
     fleet = Fleet(session).meet()
     fleet.settle(*(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(3)))
-    fleet.settle(there("sim-000", 0.8))
+    fleet.settle(there("sim-009", 0.8))
     return fleet
 
 
@@ -272,7 +272,7 @@ def test_a_box_chooses_the_tiles_that_are_watched_and_either_way_names_the_route
         for part in watching.values():
             part.line_with("watching")
         fleet = Fleet(session).meet()
-        fleet.settle(batch("sim-001", 1, time.time_ns() - SECOND, [0.8]), there("sim-001", 0.8))
+        fleet.settle(batch("sim-001", 1, time.time_ns() - SECOND, [0.8]), there("sim-009", 0.8))
         tiles = {name: part.line_with("tile ").split()[1] for name, part in watching.items()}
         assert tiles["here"] != tiles["far"]
         for name, part in watching.items():

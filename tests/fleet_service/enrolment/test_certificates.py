@@ -182,3 +182,39 @@ def test_the_command_says_what_it_did_and_what_is_to_be_done(
         "issued 4: router-a, shard-0, car-1, car-2",
         f"routers: restart router-a one at a time, each with its file in {tmp_path / 'out'}",
     ]
+
+
+def test_what_was_not_made_here_is_left_alone_and_no_key_is_deleted(
+    folder: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    other = tmp_path_factory.mktemp("other")
+    at(other).enrol(enrolment())
+    for ending in (".pem", ".key"):
+        (folder / f"nginx{ending}").write_bytes((other / f"{SERVICE}{ending}").read_bytes())
+    (folder / "notes.pem").write_text("no certificate at all")
+    gone = VEHICLES[0]
+    key = (folder / f"{gone}.key").read_bytes()
+    assert at(folder).enrol(enrolment(vehicles=list(VEHICLES[1:]))).revoked == [gone]
+    assert (folder / "nginx.pem").exists()
+    assert (folder / "nginx.key").exists()
+    assert (folder / "notes.pem").exists()
+    assert (folder / "revoked" / f"{gone}.key").read_bytes() == key
+    assert (folder / "revoked" / f"{gone}.key").stat().st_mode & 0o077 == 0
+
+
+def test_a_list_that_is_short_by_mistake_revokes_nobody_without_a_word(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = [f"car-{k:03}" for k in range(6)]
+    words = ["certs", "--fleet", str(tmp_path / "fleet.json"), "--out", str(tmp_path / "certs")]
+    (tmp_path / "fleet.json").write_text(enrolment(vehicles=names).model_dump_json())
+    assert main(words) == 0
+    (tmp_path / "fleet.json").write_text(enrolment(vehicles=names[:2]).model_dump_json())
+    capsys.readouterr()
+    assert main([*words, "--dry-run"]) == 0
+    assert capsys.readouterr().out == f"would revoke 4: {', '.join(names[2:])}\n"
+    assert main(words) == 2
+    assert "4 names with a certificate are not on it" in capsys.readouterr().err
+    assert len(list((tmp_path / "certs").glob("car-*.pem"))) == 6
+    assert main([*words, "--revoke", "4"]) == 0
+    assert len(list((tmp_path / "certs").glob("car-*.pem"))) == 2
