@@ -15,6 +15,8 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Final, NamedTuple
 
+import pyarrow as pa
+
 from fleet_service.replay.rebuild import Box, past, rows_near
 from fleet_service.serve.map_state import MapState
 from fleet_service.serve.query import answer
@@ -23,7 +25,7 @@ from schemas import grid
 from schemas.errors import InputError
 from schemas.query import MapQuery
 
-MOST_ROWS: Final = 1_000_000  # of the box, by the files' footers: 100 MB and some seconds
+MOST_ROWS: Final = 500_000  # of row groups near the box, by the files' footers: some seconds
 _HEAD: Final = struct.Struct("<qQ")
 _ERROR: Final = -1
 
@@ -96,6 +98,8 @@ def replies(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
 
 def main() -> int:
     """Answer one question."""
+    pa.set_memory_pool(pa.system_memory_pool())  # gives back what a file took before the next is read
+    pa.set_cpu_count(1)
     told = json.loads(sys.stdin.buffer.read())
     question = PastQuery(**{**told, "query": MapQuery.model_validate_json(told["query"])})
     out = sys.stdout.buffer

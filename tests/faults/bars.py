@@ -56,6 +56,12 @@ BARS: Final = {
     "faults.query.light_p99_ms": Bar("ms", 100),
     "faults.query.heavy_answers": Bar("whole maps of the slower of two", 2, "more"),
     "faults.query.light_answers": Bar("answers", 20, "more"),
+    "faults.age.ready_s": Bar("s", 10),
+    "faults.age.ready_mb": Bar("MB", 600),
+    "faults.age.at_mb": Bar("MB", 300),
+    "faults.age.cold_s": Bar("s", 180),
+    "faults.age.cold_mb": Bar("MB", 1500),
+    "faults.age.cells": Bar("cells", 50_000, "more"),
     "soak.memory_slope_mb_per_10min": Bar("MB per 10 min", 1),
     "soak.handles_growth": Bar("handles", 0),
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from tests.faults import (
+    age,
     away,
     bitrot,
     clocks,
@@ -24,6 +25,14 @@ from tests.faults.frame import Campaign
 CAMPAIGNS: Final = (
     Campaign("crash-model", crash_model.run, ("faults.crash_model.violations",)),
     Campaign("compaction", compaction.run, ("faults.compaction.incomplete_reads",)),
+    Campaign(
+        "age",
+        age.run,
+        (
+            *("faults.age.ready_s", "faults.age.ready_mb", "faults.age.at_mb"),
+            *("faults.age.cold_s", "faults.age.cold_mb", "faults.age.cells"),
+        ),
+    ),
     Campaign("truncation", truncation.run, ("faults.truncation.lost_rows",)),
     Campaign(
         "bitrot",

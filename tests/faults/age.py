@@ -1,0 +1,147 @@
+"""An archive that has grown old: how long a service takes to be ready on it, and what a question about the past costs.
+
+20 million observations and 40 million states of six days, made once and kept in `age-archive` beside the campaigns'
+folders. A service begins from Parquet alone, takes a checkpoint, and begins from that and the little that came since.
+Each is measured in a process of its own, by the most memory that it ever had.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from fleet_service.analytics import synthetic
+from fleet_service.analytics.synthetic import LATITUDE, LONGITUDE, START_NS, SyntheticFleet
+from fleet_service.app.engine import Engine
+from fleet_service.app.past import MOST_ROWS, PastQuery, box_of, replies
+from fleet_service.archive.layout import CHECKPOINTS, DAY_NS
+from fleet_service.archive.segments import SCHEMAS, Writer
+from fleet_service.replay import checkpoints
+from fleet_service.replay.rebuild import rows_near
+from schemas import query
+from schemas.config import ServiceConfig
+from schemas.runtime.figures import Figure
+from schemas.wire import Kind
+from tests.faults.bars import figure
+from tests.faults.frame import Site
+
+DAYS: Final = 6
+SINCE: Final = 20_000  # observations after the checkpoint
+SEGMENT: Final = 20_000
+NEAR: Final = f"{LONGITUDE},{LATITUDE + 0.011},{LONGITUDE + 0.01},{LATITUDE + 0.013}"  # a quarter of a road
+
+
+def run(site: Site) -> list[Figure]:
+    """Twenty million observations and twice as many states, or a hundredth."""
+    millions = site.of(2000, 20) / 100
+    root = _made(site, round(millions * 1e6))
+    shutil.rmtree(root / CHECKPOINTS, ignore_errors=True)
+    cold = _measured("ready", root)
+    site.say(f"from Parquet alone: {cold}")
+    _measured("checkpoint", root)
+    synthetic.write(root, SyntheticFleet(SINCE, 1, vehicles=50, seed=int(time.time())), SEGMENT)
+    warm = _measured("ready", root)
+    site.say(f"from a checkpoint: {warm}")
+    then = _measured("past", root)
+    site.say(f"a question about the past: {then}")
+    return [
+        figure("faults.age.ready_s", warm["seconds"]),
+        figure("faults.age.ready_mb", warm["mb"]),
+        figure("faults.age.at_mb", then["mb"]),
+        figure("faults.age.cold_s", cold["seconds"]),
+        figure("faults.age.cold_mb", cold["mb"]),
+        figure("faults.age.cells", min(cold["cells"], warm["cells"], 1e5 * then["tiles"])),
+        Figure("faults.age.observations", millions, "10^6 observations"),
+        Figure("faults.age.at_s", then["seconds"], "s"),
+    ]
+
+
+def _made(site: Site, observations: int) -> Path:
+    """The archive, made anew if it is not of this size."""
+    root = site.folder.parent / "age-archive"
+    said = root / "size"
+    if said.exists() and said.read_text() == str(observations):
+        return root
+    shutil.rmtree(root, ignore_errors=True)
+    synthetic.write(root, SyntheticFleet(observations, DAYS, vehicles=1000), SEGMENT)
+    _states(root, 2 * observations)
+    site.say("written; being compacted")
+    words = ["compact", "--archive", str(root), "--round-rows", "1000000"]
+    subprocess.run([sys.executable, "-m", "fleet_service.cli", *words], check=True, stdout=subprocess.DEVNULL)
+    said.write_text(str(observations))
+    return root
+
+
+def _states(root: Path, rows: int) -> None:
+    """States of a thousand vehicles at 2 Hz, in batches of two, on the roads of the observations."""
+    writer, rng, at = Writer(root, "shard-1"), np.random.default_rng(1), 0
+    model = next(synthetic.chunks(SyntheticFleet(SEGMENT, 1, vehicles=1000), 24))
+    while at < rows:
+        n = min(SEGMENT, rows - at)
+        part = {name: column[:n].copy() for name, column in model.items()}
+        order = at + np.arange(n)
+        part["time"] = START_NS + order * (DAYS * DAY_NS // rows) // 1000 * 1000
+        part["boot"], part["row"] = part["boot"] * 0 + 7, (order % 2).astype(np.int32)
+        part["vehicle"] = np.array([f"{one:016x}" for one in (order // 2 % 1000 + 1).tolist()])
+        part["seq"] = order // 2 // 1000 + 1
+        part["first_held"] = np.maximum(part["seq"] - 5, 1)
+        for name in ("vx", "vy", "yaw_rate", "sideslip"):
+            part[name] = rng.normal(10.0, 1.0, n).astype(np.float32)
+        part["received_at"] = part["time"] + 10**9
+        columns = {f.name: part[f.name] if f.name in part else np.zeros(n, np.float32) for f in SCHEMAS[Kind.STATE]}
+        writer.write(Kind.STATE, columns | {"with_likelihood": np.zeros(n, bool)})
+        writer.sync()
+        at += n
+
+
+def _measured(what: str, root: Path) -> dict[str, float]:
+    """What a process says of itself; see `main`."""
+    command = [sys.executable, "-m", "tests.faults.age", what, str(root)]
+    done = subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True)
+    found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+def main() -> None:
+    """`ready`: begin from the archive; `checkpoint`: and take one; `past`: ask about it. Says seconds and megabytes."""
+    what, root, began = sys.argv[1], Path(sys.argv[2]), time.perf_counter()
+    if what == "past":
+        asked = PastQuery(query.parse({"bbox": NEAR}), START_NS + (DAYS - 1) * DAY_NS, 120.0, None)
+        assert rows_near(root, asked.at, box_of(asked), MOST_ROWS) <= MOST_ROWS
+        found = {"tiles": len(list(replies(root, asked)))}  # as the process of its own does
+    else:
+        with closing(Engine(ServiceConfig(), root)) as engine:
+            if what == "checkpoint":
+                _checkpoint(engine, root)
+        found = {"cells": engine.fusion.size}
+    print(json.dumps({"seconds": time.perf_counter() - began, "mb": _most_mb(), **found}))
+
+
+def _most_mb() -> float:
+    """The most memory that this process had; what `getrusage` says holds its parent's too."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1024
+
+
+def _checkpoint(engine: Engine, root: Path) -> None:
+    taken: list[checkpoints.Taken | None] = []
+    thread = threading.Thread(target=lambda: taken.append(engine.checkpoint(threading.Event())))
+    thread.start()
+    while thread.is_alive():
+        engine.flush()
+        thread.join(0.1)
+    assert taken[0] is not None
+    checkpoints.save(root, taken[0])
+
+
+if __name__ == "__main__":
+    main()
