@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: setup demo test test-shuffled check package docs lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test
+.PHONY: setup demo test test-shuffled check package docs lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test usability
 
 setup: $(STAMP)  ## make .venv and install everything, pinned
 
@@ -44,6 +44,9 @@ faults: setup  ## the fault campaigns, half an hour; writes .faults/figures.json
 
 faults-quick: setup  ## the same mechanisms in two minutes
 	$(BIN)/python -m tests.faults --quick
+
+usability: setup  ## the first hour of a new user as figures; wants chromium and unshare; writes .usability/figures.json
+	$(BIN)/python -m tests.usability
 
 soak: setup  ## half an hour of steady load: does anything grow?
 	$(BIN)/python -m tests.faults.soak

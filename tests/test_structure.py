@@ -303,4 +303,4 @@ def test_a_missing_docstring_is_seen_and_a_private_one_is_not_missed() -> None:
 
 def test_the_tests_mirror_the_packages() -> None:
     folders = {path.name for path in (ROOT / "tests").iterdir() if path.is_dir() and path.name != "__pycache__"}
-    assert folders - {"end_to_end", "benchmarks", "faults", "data"} <= set(PACKAGES)
+    assert folders - {"end_to_end", "benchmarks", "faults", "data", "usability"} <= set(PACKAGES)

@@ -75,6 +75,17 @@ def insist_on_sound(log: SignalLog, vehicle: Vehicle) -> None:
         raise InputError("log", "is not fit to be published", f"{advice(said)}; --trust publishes it as it is")
 
 
+def warn_of_faults(log: SignalLog, vehicle: Vehicle) -> None:
+    """Say on stderr what the signal doctor finds wrong with a log that is only estimated."""
+    from edge_agent.inputs.doctor.findings import diagnose
+
+    found = diagnose(log.t, log.signals, vehicle, log.ground).findings
+    for fault in found:
+        print(f"warning: {fault.channel} {fault.kind}: {fault.words}", file=sys.stderr)
+    if found:
+        print("warning: the estimates below mean nothing until that is mended; run edge-agent check", file=sys.stderr)
+
+
 @contextmanager
 def stop_on_signal() -> Iterator[threading.Event]:
     """An event that SIGTERM and Ctrl-C set; a second signal ends the process at once."""

@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.app.estimator_factory import bank_of
     from edge_agent.app.plausible import IMPLAUSIBLE, Plausibility
     from edge_agent.app.tuned_memberships import load as load_memberships
-    from edge_agent.cli.common import insist_on_sound
+    from edge_agent.cli.common import insist_on_sound, warn_of_faults
     from edge_agent.inputs.correct import corrected
     from edge_agent.inputs.signal_log import read_log
     from schemas.config import AgentConfig, load
@@ -77,6 +77,8 @@ def run(args: argparse.Namespace) -> int:
     plausibility = Plausibility(vehicle.wheel_radius)
     if args.publish and not args.trust:
         insist_on_sound(log, vehicle)
+    else:
+        warn_of_faults(log, vehicle)
     with EstimatesFile(args.out) as file:
         code = 0
 

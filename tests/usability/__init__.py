@@ -1,0 +1,1 @@
+"""How it is to use: what a person meets in the first hour, as figures. `make usability`."""

@@ -1,0 +1,220 @@
+"""`make usability`: every figure of the first hour, measured; writes `.usability/figures.json`.
+
+--skip NAME leaves a slow part out; what is left out is not in the file, and a missing figure is a failure.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import venv
+from collections.abc import Callable
+from itertools import combinations
+from pathlib import Path
+from typing import Final
+
+import fleet_service.cli
+from edge_agent.inputs.doctor.findings import diagnose
+from edge_agent.inputs.doctor.report import page as doctors_page
+from edge_agent.lab.evaluation.planted import PLANTED, drives
+from fleet_service.analytics import synthetic
+from fleet_service.archive.compaction import compact
+from schemas.runtime import figures
+from schemas.runtime.figures import Figure
+from schemas.runtime.palette import ESTIMATORS, GRIP_RANGE, SURFACES, TRUTH, shade
+from tests.browser import opened
+from tests.house import ROOT
+from tests.sight import SIGHTS, difference, lab
+from tests.usability import mistakes, stale, waiting
+from tests.usability.wrong_logs import unnoticed
+
+FOLDER: Final = ROOT / ".usability"
+PAGES: Final = ("grip", "worst", "spells", "replay", "replay --step 10800")
+SEED: Final = 9000
+WORLD: Final = synthetic.SyntheticFleet(rows=6000, days=1, vehicles=20, roads=4, length=30, icy=2)
+DAY: Final = ("--from", "2026-01-27", "--to", "2026-01-28")
+
+
+class House:
+    """A folder with an archive, and what is said on the way."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.archive = folder, folder / "archive"
+        synthetic.write(self.archive, WORLD, 2000)
+        compact(self.archive)
+        mistakes.prepare(folder)
+
+    def note(self, what: str, found: object) -> None:
+        """Say what a figure is made of."""
+        print(f"{what}: {found}", flush=True)
+
+
+def readme_commands_failed(house: House) -> float:
+    """Commands of the root README that fail, in a network of their own."""
+    folder = house.folder / "readme"
+    folder.mkdir()
+    line = f"ip link set lo up && exec {sys.executable} -m tests.usability.readme {folder}"
+    command = ["unshare", "-n", "bash", "-c", line]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    if done.returncode:
+        house.note("readme", done.stderr[-400:])
+        return float("nan")
+    failed = [line for line in done.stdout.splitlines() if line]
+    house.note("readme", failed)
+    return float(len(failed))
+
+
+def pages_with_errors(house: House) -> float:
+    """Pages that complain, ask for something, or draw nothing, in Chromium."""
+    pages = []
+    for words in PAGES:
+        out = house.folder / f"{words.replace(' ', '')}.html"
+        command = ["analyze", *words.split(), "--archive", str(house.archive), *DAY, "--out", str(out)]
+        assert fleet_service.cli.main(command) == 0, command
+        pages.append(out)
+    drive = drives(1, SEED, rough=False)[0]
+    said = diagnose(drive.t, drive.signals, drive.vehicle)
+    pages.append(house.folder / "check.html")
+    pages[-1].write_text(doctors_page(said, "a drive"))
+    if (ROOT / ".demo" / "map.html").exists():
+        pages.append(ROOT / ".demo" / "map.html")
+    bad = []
+    for path in pages:
+        with opened(path) as found:
+            drawn = found.drawn or found.page.locator("svg").count()
+            if found.errors or len(found.requests) > 1 or not drawn:
+                bad.append((path.name, found.errors, found.requests))
+    house.note("pages", f"{len(pages)} opened, bad: {bad}")
+    return float(len(bad))
+
+
+def bound_painted(house: House) -> float:
+    """Outputs in which a bound has a number to colour by."""
+    command = [sys.executable, "-m", "pytest", "-q", "--tb=no", "tests/test_bounds_unpainted.py"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    counts = {word: int(count) for count, word in re.findall(r"(\d+) (passed|failed)", done.stdout)}
+    house.note("bounds", counts)
+    return float(counts.get("failed", 0)) if counts.get("passed") else float("nan")
+
+
+def colour_distance(house: House) -> float:
+    """Least CIEDE2000 between surfaces, and between lines, for four kinds of sight."""
+    surfaces = [shade(mu, *GRIP_RANGE) for mu in SURFACES.values()]
+    lines = [style.colour for style in (*ESTIMATORS.values(), TRUTH)]
+    least = {
+        sight: min(
+            difference(lab(a, sight), lab(b, sight)) for alike in (surfaces, lines) for a, b in combinations(alike, 2)
+        )
+        for sight in SIGHTS
+    }
+    house.note("colours", least)
+    return min(least.values())
+
+
+def wrong_logs_unnoticed(house: House) -> float:
+    """Planted mistakes of a recording that `replay` does not mention."""
+    names = list(PLANTED)[:12]
+    found = unnoticed(house.folder, names, SEED)
+    house.note("wrong logs", f"{len(names)} planted, unnoticed: {found}")
+    return float(len(found))
+
+
+def tracebacks(house: House) -> float:
+    """Mistakes at the command line that are answered with a traceback or with success."""
+    count, bad = mistakes.tracebacks(house.folder, house.archive)
+    house.note("mistakes", f"{count} made, bad: {bad}")
+    return float(len(bad)) if count >= 60 else float("nan")
+
+
+def silent_seconds(house: House) -> float:
+    """Longest silence on a terminal."""
+    found = waiting.silent_seconds(house.folder, house.archive)
+    house.note("silence", found)
+    return max(found.values())
+
+
+def install_to_first_map_s(house: House) -> float:
+    """From an empty environment and a wheel to a map in a browser."""
+    built = house.folder / "dist"
+    build = [sys.executable, "-m", "build", "--wheel", "--outdir", str(built), str(ROOT)]
+    subprocess.run(build, check=True, capture_output=True)
+    (wheel,) = built.glob("*.whl")
+    began, place = time.monotonic(), house.folder / "venv"
+    venv.create(place, with_pip=True)
+    pip = [str(place / "bin" / "python"), "-m", "pip", "install", "--quiet", "--constraint"]
+    subprocess.run([*pip, str(ROOT / "constraints.txt"), f"{wheel}[analytics]"], check=True, capture_output=True)
+    out = house.folder / "first.html"
+    command = [str(place / "bin" / "fleet-service"), "analyze", "grip", "--archive", str(house.archive), *DAY]
+    subprocess.run([*command, "--out", str(out)], check=True, capture_output=True, cwd=house.folder)
+    with opened(out) as found:
+        assert found.drawn > 0
+    return time.monotonic() - began
+
+
+def options_undocumented(house: House) -> float:
+    """Options that no README mentions."""
+    found = stale.undocumented()
+    house.note("undocumented", found)
+    return float(len(found))
+
+
+def figures_stale(house: House) -> float:
+    """Figures of the root README that are not those of its figures.json."""
+    found = stale.stale_figures()
+    house.note("stale", found)
+    return float(len(found))
+
+
+def alerts_per_stretch(house: House) -> float:
+    """Of the last demo."""
+    path = ROOT / ".demo" / "figures.json"
+    rows = json.loads(path.read_text()) if path.exists() else []
+    values = {row["name"]: row["value"] for row in rows if "name" in row}
+    house.note("demo", path if path.exists() else "make demo first")
+    value = values.get("demo.alerts.per_stretch")
+    return float("nan") if value is None else float(value)
+
+
+PARTS: Final[dict[str, tuple[Callable[[House], float], str, float, str]]] = {
+    "readme_commands_failed": (readme_commands_failed, "", 0, "less"),
+    "pages_with_errors": (pages_with_errors, "", 0, "less"),
+    "bound_painted": (bound_painted, "outputs", 0, "less"),
+    "colour_distance": (colour_distance, "CIEDE2000", 10, "more"),
+    "wrong_logs_unnoticed": (wrong_logs_unnoticed, "of 12", 0, "less"),
+    "tracebacks": (tracebacks, "", 0, "less"),
+    "silent_seconds": (silent_seconds, "s", 2, "less"),
+    "install_to_first_map_s": (install_to_first_map_s, "s", 90, "less"),
+    "options_undocumented": (options_undocumented, "", 0, "less"),
+    "figures_stale": (figures_stale, "", 0, "less"),
+    "alerts_per_stretch": (alerts_per_stretch, "per icy stretch and direction, of the last demo", 2, "less"),
+}
+
+
+def main() -> int:
+    """Measure; 1 where a bar does not hold or a figure is missing."""
+    parser = argparse.ArgumentParser(prog="python -m tests.usability", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--only", nargs="*", choices=PARTS, default=list(PARTS), help="parts (default: all)")
+    args = parser.parse_args()
+    FOLDER.mkdir(exist_ok=True)
+    place = Path(tempfile.mkdtemp())
+    try:
+        house, found = House(place), []
+        for name in args.only:
+            measure, unit, bar, better = PARTS[name]
+            print(f"-- {name}", flush=True)
+            found.append(Figure(f"usability.{name}", measure(house), unit, bar, better))  # type: ignore[arg-type]
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
+    figures.write(FOLDER / "figures.json", "usability", [SEED], found)
+    print(figures.markdown(found))
+    return 0 if len(found) == len(PARTS) and all(figure.holds for figure in found) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,88 @@
+"""Mistakes at the command line: each is one line with exit code 2 or argparse's own, and never a traceback."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import edge_agent.cli
+import fleet_service.cli
+
+EDGE: Final = (
+    "", "no-such-command", "simulate", "simulate no-such-manoeuvre --out {d}/x.parquet", "simulate slalom",
+    "simulate slalom --mu 5 --out {d}/x.parquet", "simulate slalom --mu nan --out {d}/x.parquet",
+    "simulate slalom --rate 0 --out {d}/x.parquet", "simulate slalom --duration -1 --out {d}/x.parquet",
+    "simulate slalom --out /proc/none/x.parquet", "simulate slalom --out {d}/x.xlsx", "simulate slalom --sensors bad",
+    "import", "import {d}/none.blf --out {d}/y.parquet", "import {d}/text.csv --out {d}/text.csv",
+    "import {d}/text.csv --profile no-such --out {d}/y.parquet", "check {d}/none.parquet", "check {d}/text.csv",
+    "check {d}/log.parquet --vehicle {d}/none.json",
+    "calibrate {d}/none.parquet --vehicle {d}/car.json --out {d}/c.json",
+    "calibrate {d}/log.parquet --vehicle {d}/bad.json --out {d}/c.json", "replay {d}/none.parquet --out {d}/e.parquet",
+    "replay {d}/log.parquet --vehicle {d}/car.json --out {d}/log.parquet",
+    "replay {d}/log.parquet --vehicle {d}/car.json --out {d}/e.xlsx",
+    "replay {d}/log.parquet --vehicle {d}/car.json --out /proc/none/e.parquet",
+    "replay {d}/log.parquet --vehicle {d}/car.json --estimator none --out {d}/e.parquet",
+    "replay {d}/log.parquet --vehicle {d}/bad.json --out {d}/e.parquet",
+    "replay {d}/log.parquet --vehicle {d}/car.json --memberships {d}/bad.json --out {d}/e.parquet",
+    "replay {d}/log.parquet --vehicle {d}/car.json --start yesterday --out {d}/e.parquet",
+    "replay {d}/log.parquet --vehicle {d}/car.json --config {d}/bad.json --out {d}/e.parquet",
+    "replay {d}/log.parquet {d}/log.parquet --out {d}/folder", "replay {d}/log.parquet --jobs 0 --out {d}",
+    "run --source {d}/log.parquet", "run --source nothing:here --vehicle {d}/car.json", "run --name X",
+    "run --config {d}/none.json", "fleet --vehicles -1", "fleet --scenario none", "tune --ants 0", "tune --seed -1",
+    "evaluate --out /proc/none", "evaluate --seeds 1 --out {d}/ev", "completion abacus",
+)  # fmt: skip
+FLEET: Final = (
+    "", "no-such-command", "run --archive /proc/none", "run --archive {d}/a --config {d}/bad.json",
+    "query --bbox 1,2", "query --bbox -181,0,1,1", "query --bbox a,b,c,d", "query --route 1,2", "query --at yesterday",
+    "query --format xml", "query --out {d}/x.xlsx", "query --out /proc/none/x.json", "query --min-vehicles none",
+    "query --connect tcp/127.0.0.1:1", "query --connect nonsense", "query --config {d}/none.json",
+    "watch --bbox 1", "watch --webhook nonsense", "watch --config {d}/bad.json", "compact --archive {d}",
+    "compact --archive {d}/none", "compact --archive {a} --round-rows 0", "compact --archive {a} --put-to nonsense://x",
+    "retention --archive {a} --raw-days 1", "retention --archive {d} --raw-days 31", "forget --archive {a} --period x",
+    "forget --archive {a} --period 1999-01", "export map --archive {d} --out {d}/x.csv",
+    "export map --archive {a} --out {d}/x.xlsx", "export map --archive {a} --out /proc/none/x.csv",
+    "export nothing --archive {a} --out {d}/x.csv", "export map --archive {a} --out {d}/x.csv --from z",
+    "export map --archive {a} --out {d}/x.csv --from 2030-01-01", "analyze nothing --archive {a}",
+    "analyze grip --archive {d}", "analyze grip --archive {a} --at 2024-10-04", "analyze grip --archive {a} --engine x",
+    "analyze grip --archive {a} --out {d}/x.xlsx", "analyze grip --archive {a} --from 1980-01-01 --to 1980-01-02",
+    "analyze before-after --archive {a}", "analyze weather --archive {a}",
+    "analyze weather --archive {a} --stations {d}/text.csv", "analyze weather --archive {a} --stations {d}/none.csv",
+    "analyze replay --archive {a} --step -5", "analyze replay --archive {a} --step nan",
+    "analyze worst --archive {a} --min-vehicles 0", "analyze vehicles --archive {a} --out {d}/x.html",
+    "certs --fleet {d}/none.json --out {d}/c", "certs --fleet {d}/bad.json --out {d}/c",
+    "certs --fleet {d}/bad.json --out {d}/c --days 0", "evaluate --out /proc/none --quick --skip-end-to-end",
+    "completion abacus",
+)  # fmt: skip
+
+
+def prepare(folder: Path) -> None:
+    """Files that the mistakes are made with."""
+    (folder / "text.csv").write_text("a;b\n1,5;x\n")
+    (folder / "bad.json").write_text(json.dumps({"mass": "heavy", "surprise": 1}))
+    words = ["simulate", "slalom", "--duration", "1", "--out", str(folder / "log.parquet")]
+    assert edge_agent.cli.main([*words, "--vehicle-out", str(folder / "car.json")]) == 0
+
+
+def tracebacks(folder: Path, archive: Path) -> tuple[int, list[str]]:
+    """How many mistakes were made, and those that were answered with a traceback or with exit code 0."""
+    bad = []
+    lines: list[tuple[Callable[[list[str]], int], str]] = [(edge_agent.cli.main, line) for line in EDGE]
+    lines += [(fleet_service.cli.main, line) for line in FLEET]
+    for main, line in lines:
+        words = line.format(d=folder, a=archive).split()
+        said = io.StringIO()
+        try:
+            with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+                code = main(words)
+        except SystemExit as left:
+            code = left.code if isinstance(left.code, int) else 1
+        except BaseException as error:  # noqa: BLE001 whatever it is, a user would see it
+            bad.append(f"{line}: {type(error).__name__}: {error}")
+            continue
+        if code == 0 or "Traceback" in said.getvalue():
+            bad.append(f"{line}: exit code {code}")
+    return len(lines), bad

@@ -1,0 +1,108 @@
+"""The commands of the root README, as written and in their order, in a network of their own and an empty folder.
+
+Lines that stay (router, service, agent, watch) are started and must still run at the end; `pip install` is not run.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Final
+
+from tests.house import ROOT
+
+LASTING: Final = ("python -m deploy.router", "fleet-service run", "edge-agent run", "fleet-service watch")
+LEFT_OUT: Final = ("pip install",)
+SECTION: Final = "## Using them"
+SETTLE_S: Final = 20.0  # until what stays is up; kernels may have to be compiled
+LONGEST_S: Final = 300.0
+
+
+def blocks(text: str) -> list[tuple[str, str]]:
+    """Language and text of each fenced block of the section."""
+    section = text[text.index(SECTION) :].split("\n## ")[0]
+    return [(m[1], m[2]) for m in re.finditer(r"^```(\w*)\n(.*?)^```", section, re.DOTALL | re.MULTILINE)]
+
+
+def commands(text: str) -> list[str]:
+    """Lines that are typed, without their comments; a block of Python as one."""
+    found = []
+    for language, block in blocks(text):
+        if language == "python":
+            found.append(block)
+        else:
+            lines = (re.sub(r"\s{2,}#.*", "", line).strip() for line in block.splitlines())
+            found += [line for line in lines if line.startswith(("python ", "fleet-service ", "edge-agent "))]
+    return [one for one in found if not one.startswith(LEFT_OUT)]
+
+
+def run(folder: Path) -> list[str]:
+    """Run all; returns those that failed, with the last line they said."""
+    for name in ("deploy", "tests/data"):
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "*.py"))
+    bin_folder = Path(sys.executable).parent
+    staying: list[tuple[str, subprocess.Popen[bytes]]] = []
+    failed: list[str] = []
+    try:
+        for number, command in enumerate(commands((ROOT / "README.md").read_text())):
+            log = folder / f"{number}.log"
+            if command.startswith(LASTING):
+                if "certs/" in command:  # the second router wants the port of the first
+                    for words, process in staying:
+                        _end(words, process, failed)
+                    staying.clear()
+                with log.open("wb") as out:
+                    typed = command.split()
+                    process = subprocess.Popen(
+                        [str(bin_folder / typed[0]), *typed[1:]], cwd=folder, stdout=out, stderr=out
+                    )
+                staying.append((command, process))
+                time.sleep(SETTLE_S if "service run" in command else 2.0)
+                if process.poll() is not None:
+                    failed.append(f"{command}: ended with {process.returncode}: {_last(log)}")
+                    staying.pop()
+                continue
+            line = [sys.executable, "-c", command] if "\n" in command else ["bash", "-c", command]
+            with log.open("wb") as out:
+                done = subprocess.run(
+                    line, cwd=folder, stdout=out, stderr=out, check=False, timeout=LONGEST_S,
+                    env={"PATH": f"{bin_folder}:/usr/bin:/bin", "HOME": str(Path.home())},
+                )  # fmt: skip
+            if done.returncode:
+                failed.append(f"{command}: {done.returncode}: {_last(log)}")
+    finally:
+        for words, process in staying:
+            _end(words, process, failed)
+    return failed
+
+
+def _end(command: str, process: subprocess.Popen[bytes], failed: list[str]) -> None:
+    if process.poll() is not None:
+        failed.append(f"{command}: ended by itself with {process.returncode}")
+        return
+    process.terminate()
+    try:
+        process.wait(20)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+        failed.append(f"{command}: had to be killed")
+
+
+def _last(log: Path) -> str:
+    lines = log.read_text(errors="replace").strip().splitlines()
+    return lines[-1][:200] if lines else "no word"
+
+
+def main() -> int:
+    """Print what failed, a line each: for a process in a network of its own."""
+    print("\n".join(run(Path(sys.argv[1]))))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,34 @@
+"""Recordings with a planted mistake, estimated as a new user does: is the mistake mentioned?"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+import edge_agent.cli
+from edge_agent.lab.evaluation.planted import PLANTED, Recorded, drives
+from schemas.signals import CHANNELS
+
+
+def unnoticed(folder: Path, names: Sequence[str], seed: int) -> list[str]:
+    """Names of mistakes of which `edge-agent replay` says nothing; the sound drive must be passed in silence."""
+    drive = drives(1, seed, rough=False)[0]
+    out = [] if not _said(folder, drive) else ["the sound drive is suspected"]
+    return out + [name for name in names if not _said(folder, PLANTED[name].spoil(drive))]
+
+
+def _said(folder: Path, drive: Recorded) -> bool:
+    t, signals, vehicle = drive
+    columns = {name: pa.array(signals[:, k], from_pandas=True) for k, name in enumerate(CHANNELS)}
+    pq.write_table(pa.table({"t": pa.array(t), **columns}), folder / "wrong.parquet")
+    (folder / "wrong.json").write_text(vehicle.model_dump_json(exclude_none=True))
+    heard = io.StringIO()
+    words = ["replay", str(folder / "wrong.parquet"), "--estimator", "sr-ukf", "--out", str(folder / "e.parquet")]
+    with contextlib.redirect_stderr(heard), contextlib.redirect_stdout(io.StringIO()):
+        code = edge_agent.cli.main(words)
+    return code == 2 or "warning: " in heard.getvalue()
