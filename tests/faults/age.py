@@ -42,7 +42,7 @@ NEAR: Final = f"{LONGITUDE},{LATITUDE + 0.011},{LONGITUDE + 0.01},{LATITUDE + 0.
 
 def run(site: Site) -> list[Figure]:
     """Twenty million observations and twice as many states, or a hundredth."""
-    millions = site.of(2000, 20) / 100
+    millions = site.of(2000, 8) / 100
     root = _made(site, round(millions * 1e6))
     shutil.rmtree(root / CHECKPOINTS, ignore_errors=True)
     cold = _measured("ready", root)

@@ -11,6 +11,7 @@ from tests.faults import (
     clocks,
     compaction,
     crash_model,
+    disk,
     flood,
     fuzz,
     insider,
@@ -19,12 +20,22 @@ from tests.faults import (
     queries,
     security,
     truncation,
+    versions,
 )
 from tests.faults.frame import Campaign
 
 CAMPAIGNS: Final = (
     Campaign("crash-model", crash_model.run, ("faults.crash_model.violations",)),
-    Campaign("compaction", compaction.run, ("faults.compaction.incomplete_reads",)),
+    Campaign(
+        "compaction",
+        compaction.run,
+        (
+            "faults.compaction.incomplete_reads",
+            "faults.compaction.kills",
+            "faults.compaction.reads",
+            "faults.compaction.batches",
+        ),
+    ),
     Campaign(
         "age",
         age.run,
@@ -34,6 +45,14 @@ CAMPAIGNS: Final = (
         ),
     ),
     Campaign("truncation", truncation.run, ("faults.truncation.lost_rows",)),
+    Campaign(
+        "versions",
+        versions.run,
+        (
+            *("faults.versions.set_aside", "faults.versions.lost_rows"),
+            *("faults.versions.map_difference", "faults.versions.files"),
+        ),
+    ),
     Campaign(
         "bitrot",
         bitrot.run,
@@ -50,7 +69,10 @@ CAMPAIGNS: Final = (
     Campaign(
         "kill",
         kill.run,
-        ("faults.kill.acknowledged_lost", "faults.kill.doubled", "faults.kill.unacknowledged_lost_at_end"),
+        (
+            *("faults.kill.acknowledged_lost", "faults.kill.doubled", "faults.kill.unacknowledged_lost_at_end"),
+            *("faults.kill.map_difference", "faults.kill.upkeep", "faults.kill.kills", "faults.kill.offered_per_s"),
+        ),
     ),
     Campaign("router-down", outages.router_down, ("faults.router_down.lost", "faults.router_down.recovery_s")),
     Campaign("frozen", outages.frozen, ("faults.frozen.lost", "faults.frozen.agent_deadline_misses")),
@@ -61,6 +83,14 @@ CAMPAIGNS: Final = (
     ),
     Campaign("leaving", outages.leaving, ("faults.leaving.longest_s", "faults.leaving.acknowledged_lost")),
     Campaign("disk-full", outages.disk_full, ("faults.disk_full.false_acks", "faults.disk_full.recovered")),
+    Campaign(
+        "disk",
+        disk.run,
+        (
+            *("faults.disk.false_acks", "faults.disk.stuck"),
+            *("faults.disk.times_full", "faults.disk.jobs_run"),
+        ),
+    ),
     Campaign("security", security.run, ("faults.security.breaches",)),
     Campaign("fuzz", fuzz.run, ("faults.fuzz.crashes", "faults.fuzz.admitted_out_of_range", "faults.fuzz.honest_lost")),
     Campaign(

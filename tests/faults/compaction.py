@@ -109,8 +109,9 @@ def run(site: Site) -> list[Figure]:
     site.say(f"{part.starts} kills, {reader.reads} reads, {writing.acknowledged} batches")
     return [
         figure("faults.compaction.incomplete_reads", incomplete),
-        Figure("faults.compaction.kills", part.starts, "kills"),
-        Figure("faults.compaction.reads", reader.reads, "reads"),
+        figure("faults.compaction.kills", part.starts),
+        figure("faults.compaction.reads", reader.reads),
+        figure("faults.compaction.batches", writing.acknowledged),
     ]
 
 

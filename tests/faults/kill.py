@@ -8,8 +8,16 @@ from __future__ import annotations
 
 import random
 import time
+from contextlib import closing
+from pathlib import Path
 from typing import Final
 
+import numpy as np
+
+from fleet_service.app.engine import Engine
+from fleet_service.archive.retention import drop_checkpoints
+from fleet_service.serve.encode import cell_table
+from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
 from tests.faults.bars import figure
 from tests.faults.census import Census, take
@@ -22,16 +30,21 @@ KILLS_PER_ROUND: Final = 20
 PAUSE_S: Final = (0.5, 3.0)  # between kills: before, during and after the restart of the ones killed before
 DOWN_S: Final = (0.0, 1.0)  # how long the killed ones stay away
 DRAIN_S: Final = 90.0
+# So short that compaction, checkpoints and snapshots happen many times within the seconds that a service lives.
+PERIODS: Final[dict[str, object]] = {"compact_s": 2.0, "checkpoint_s": 1.5, "snapshot_s": 3.0, "vehicle_kb_s": 250.0}
 
 
 def run(site: Site) -> list[Figure]:
     """200 kills in ten rounds; in a quick run, five in one with six agents."""
     random_ = random.Random(site.seed)
-    kills, seconds, found = 0, 0.0, []
+    kills, seconds, difference, found = 0, 0.0, 0.0, []
+    upkeep: frozenset[str] = frozenset()
     for number in range(site.of(10, 1)):
         began = time.monotonic()
-        with stage(site.folder / f"round-{number}", segment_s=0.5) as there:
+        with stage(site.folder / f"round-{number}", segment_s=0.5, **PERIODS) as there:
             census = _round(there, site.of(AGENTS, 6), site.of(KILLS_PER_ROUND, 5), random_)
+        upkeep = upkeep.union(_done(there.archive))
+        difference = max(difference, map_difference(there.archive))
         kills += sum(part.starts - 1 for part in there.parts)
         seconds += time.monotonic() - began
         found.append(census)
@@ -41,10 +54,40 @@ def run(site: Site) -> list[Figure]:
         figure("faults.kill.acknowledged_lost", total["acknowledged_lost"]),
         figure("faults.kill.doubled", total["doubled"]),
         figure("faults.kill.unacknowledged_lost_at_end", total["lost"]),
-        Figure("faults.kill.kills", kills, "processes killed"),
-        Figure("faults.kill.offered_per_s", total["observations"] / seconds, "observations/s, drains included"),
+        figure("faults.kill.map_difference", difference),
+        figure("faults.kill.upkeep", len(upkeep)),
+        _shown(site, "faults.kill.kills", kills, "processes killed"),
+        _shown(site, "faults.kill.offered_per_s", total["observations"] / seconds, "observations/s, drains included"),
         Figure("faults.kill.observations", total["observations"], "observations"),
     ]
+
+
+def _shown(site: Site, name: str, value: float, unit: str) -> Figure:
+    """A figure with its bar; without it in a quick run, which is smaller."""
+    return Figure(name, value, unit) if site.quick else figure(name, value)
+
+
+def _done(archive: Path) -> frozenset[str]:
+    """What upkeep left: the kills met it only if it was there."""
+    found = {"checkpoints": "checkpoints/*-*", "compaction": "observations/*/*/*.parquet"}
+    return frozenset(name for name, pattern in found.items() if any(archive.glob(pattern)))
+
+
+def map_difference(archive: Path) -> float:
+    """The map that a service begins with, from its checkpoint, against that of the log alone: the largest difference of
+    mu, of its bounds and of P(slippery); infinite if a cell or a visit is missing."""
+    maps = []
+    for _ in range(2):
+        with closing(Engine(ServiceConfig(), archive)) as engine:
+            fusion = engine.fusion
+            slots = np.lexsort((fusion.sector[: fusion.size], fusion.cell[: fusion.size]))
+            maps.append(cell_table(fusion, slots, engine.seen))
+        drop_checkpoints(archive)
+    ours, theirs = maps
+    if not all(ours[name].equals(theirs[name]) for name in ("cell", "sector", "observations", "vehicles")):
+        return float("inf")
+    told = ("mu", "mu_lower", "mu_upper", "p_slippery")
+    return max(float(np.nanmax(np.abs(ours[name].to_numpy() - theirs[name].to_numpy()))) for name in told)
 
 
 def _round(there: Stage, agents: int, kills: int, random_: random.Random) -> Census:

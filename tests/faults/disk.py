@@ -1,0 +1,177 @@
+"""A real small file system that is full: a service and an agent's outbox on it, load going on, then room again.
+
+Where this process may mount, it is a tmpfs of some megabytes; elsewhere every call by which log, upkeep and outbox make
+or move a file fails with ENOSPC. While it is full nothing may be acknowledged that is not there, jobs go on in turn,
+and with room again everything is acknowledged and nothing hangs.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+from typing import Final
+
+from edge_agent.publish.batching import Draft
+from edge_agent.publish.outbox import Outbox
+from fleet_service.app.clock import SteadyClock
+from fleet_service.app.engine import Engine
+from fleet_service.app.jobs import Upkeep, archive_jobs
+from fleet_service.archive import reading
+from fleet_service.ingest.inbox import Message
+from schemas import wire
+from schemas.config import ServiceConfig
+from schemas.runtime.figures import Figure
+from schemas.thresholds import NS
+from schemas.wire import Kind
+from tests.faults.bars import figure
+from tests.faults.frame import Site
+from tests.fleet_service.examples import batch, key
+
+SIZE_MB: Final = 24
+VEHICLES: Final = 5
+CONFIG: Final = ServiceConfig(compact_s=0.3, checkpoint_s=0.3, snapshot_s=0.3)
+STUCK_S: Final = 60.0
+
+
+@contextmanager
+def small_disk(folder: Path) -> Iterator[bool]:
+    """Mount a small file system at a folder; whether that is allowed."""
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", f"size={SIZE_MB}m", "tmpfs", str(folder)]
+    try:
+        mounted = subprocess.run(command, capture_output=True, check=False).returncode == 0
+    except OSError:
+        mounted = False
+    try:
+        yield mounted
+    finally:
+        if mounted:
+            subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+@contextmanager
+def full(folder: Path, mounted: bool) -> Iterator[None]:
+    """No room while the block runs."""
+    if mounted:
+        ballast = folder / "ballast"
+        with ballast.open("wb") as file, suppress(OSError):
+            while True:
+                file.write(bytes(1 << 16))
+                file.flush()
+        assert not os.statvfs(folder).f_bavail
+        try:
+            yield
+        finally:
+            ballast.unlink()
+        return
+    with _refused("open", "fsync", "rename", "mkdir"):
+        yield
+
+
+@contextmanager
+def _refused(*names: str) -> Iterator[None]:
+    """These calls of the system fail as on a full disk."""
+
+    def refuse(*_: object, **__: object) -> object:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    was: dict[str, Callable[..., object]] = {name: getattr(os, name) for name in names}
+    for name in names:
+        setattr(os, name, refuse)
+    try:
+        yield
+    finally:
+        for name, function in was.items():
+            setattr(os, name, function)
+
+
+def run(site: Site) -> list[Figure]:
+    """Full several times, at other moments of the jobs."""
+    false, stuck, refused, runs = 0, 0, 0, Counter[str]()
+    with small_disk(site.folder / "disk") as mounted:
+        root = site.folder / "disk" / "archive"
+        with closing(Engine(CONFIG, root)) as engine:
+            jobs = archive_jobs(engine, CONFIG, root, SteadyClock().moment)
+            with Upkeep(jobs, engine.counts, lambda _: None):
+                acknowledged, seq = 0, 0
+                for _ in range(site.of(10, 3)):
+                    acknowledged += _drive(engine, seq, 3)
+                    seq += 3
+                    with full(site.folder / "disk", mounted):
+                        got = _drive(engine, seq, 6)
+                        seq += 6
+                        refused += got == 0
+                        acknowledged += got
+                        false += acknowledged > _rows(root)
+                    acknowledged += _until_settled(engine)
+                    stuck += engine.unsettled > 0
+            runs.update({name: n for name, n in engine.counts.items() if name.endswith(("_runs", "_failures"))})
+        false += acknowledged > _rows(root)
+        stuck += not _outbox_recovers(site.folder / "disk", mounted)
+    site.say(f"{'mounted' if mounted else 'injected'}; {acknowledged} acknowledged, {dict(runs)}")
+    return [
+        figure("faults.disk.false_acks", false),
+        figure("faults.disk.stuck", stuck + (acknowledged != VEHICLES * seq)),
+        figure("faults.disk.times_full", refused),
+        figure("faults.disk.jobs_run", min(runs["compaction_runs"], runs["checkpoint_runs"])),
+        Figure("faults.disk.mounted", int(mounted), "a real file system"),
+    ]
+
+
+def _drive(engine: Engine, since: int, steps: int) -> int:
+    """Some seconds of load; returns the batches that were acknowledged."""
+    got = 0
+    for seq in range(since + 1, since + steps + 1):
+        now = time.time_ns()
+        for vehicle in range(VEHICLES):
+            one = batch(f"sim-{vehicle:03}", seq, now - NS, [0.8])
+            engine.ingest([Message(Kind.OBSERVATION, key(one.vehicle), wire.encode(one), "")], now)
+        got += _acked(engine.flush())
+        threading.Event().wait(0.2)  # for the jobs
+    return got
+
+
+def _acked(acks: list[tuple[str, bytes]]) -> int:
+    return sum(
+        last - first + 1
+        for _, payload in acks
+        for stream in wire.decode_ack(payload)[1]
+        for first, last in stream.durable
+    )
+
+
+def _until_settled(engine: Engine) -> int:
+    got, deadline = 0, time.monotonic() + STUCK_S
+    while engine.unsettled and time.monotonic() < deadline:
+        got += _acked(engine.flush())
+        threading.Event().wait(0.05)
+    return got
+
+
+def _rows(root: Path) -> int:
+    return sum(table.num_rows for table in reading.read(root, Kind.OBSERVATION, ["seq"]))
+
+
+def _outbox_recovers(folder: Path, mounted: bool) -> bool:
+    """An outbox refuses what it has no room for, keeps what it took, and goes on."""
+    outbox = Outbox(folder / "spool.sqlite", boot=5)
+    draft = Draft("car-a", Kind.OBSERVATION, 77, 1, lambda seq, first: bytes(60_000))
+    took = len(outbox.store([draft], 0.0))
+    refused = False
+    if mounted:
+        with full(folder, mounted):
+            try:
+                took += len(outbox.store([draft] * 50, 0.0))
+            except Exception:  # noqa: BLE001 sqlite's own
+                refused = True
+    took += len(outbox.store([draft], 0.0))
+    whole = len(outbox.held()) == took and (refused or not mounted)
+    outbox.close()
+    return whole

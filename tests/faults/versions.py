@@ -1,0 +1,71 @@
+"""Archives of other versions: one that was kept from before files had any, under a service of today; and one of today
+with columns that nobody knows yet, as a newer version would write them, under a service that is rolled back to today's.
+
+Nothing is set aside, every row is read, and the map is the one that its writer had.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fleet_service.app.engine import Engine
+from fleet_service.archive import reading
+from fleet_service.archive.compaction import compact
+from fleet_service.archive.load import count_set_aside
+from fleet_service.archive.retention import drop_checkpoints
+from schemas.config import ServiceConfig
+from schemas.runtime.figures import Figure
+from schemas.wire import Kind
+from tests.faults.bars import figure
+from tests.faults.frame import Site
+from tests.fleet_service.archive.kept import DATA, make, map_of
+from tests.fleet_service.archive.test_version import rewritten, with_columns
+
+
+def run(site: Site) -> list[Figure]:
+    """Both, before and after a compaction, with and without a checkpoint."""
+    old, new = site.folder / "old", site.folder / "new"
+    shutil.copytree(DATA / "v1.0" / "archive", old)
+    made_old = json.loads((DATA / "v1.0" / "map.json").read_text())
+    made_new = make(new)
+    changed = 0
+    for pattern in ("inbox/*.parquet", "inbox/states/*.parquet", "observations/*/*/*.parquet", "states/*/*/*.parquet"):
+        for path in new.glob(pattern):
+            rewritten(path, with_columns, "1.7")
+            changed += 1
+    aside = lost = looks = 0
+    difference = 0.0
+    for root, made in ((old, made_old), (new, made_new)):
+        for turn in range(3):
+            if turn == 1:
+                compact(root)
+            if turn == 2:
+                drop_checkpoints(root)
+            difference = max(difference, _difference(root, made))
+            lost += sum(made["rows"][str(kind)] - _rows(root, kind) for kind in Kind)
+            looks += 1
+        aside += count_set_aside(root)
+    site.say(f"{changed} files rewritten, {looks} starts")
+    return [
+        figure("faults.versions.set_aside", aside),
+        figure("faults.versions.lost_rows", abs(lost)),
+        figure("faults.versions.map_difference", difference),
+        figure("faults.versions.files", changed),
+    ]
+
+
+def _difference(root: Path, made: dict[str, Any]) -> float:
+    with closing(Engine(ServiceConfig(), root)) as engine:
+        found = np.asarray(map_of(engine, made["at"])["beliefs"])
+    beliefs = np.asarray(made["beliefs"])
+    return float(np.abs(found - beliefs).max()) if found.shape == beliefs.shape else float("inf")
+
+
+def _rows(root: Path, kind: Kind) -> int:
+    return sum(table.num_rows for table in reading.read(root, kind, ["seq"]))
