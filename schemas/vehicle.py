@@ -34,6 +34,10 @@ class Calibration(BaseModel):
     yaw_rate: Annotated[Learned | None, Field(description="[rad/s] read straight on")] = None
     steer_offset: Annotated[Learned | None, Field(description="[rad] read straight on")] = None
     steer_gain: Annotated[Learned | None, Field(description="reading over the road wheels' true angle [1]")] = None
+    force_gain: Annotated[
+        Learned | None,
+        Field(description="torque over radius, over what moves the file's mass [1]"),
+    ] = None
     understeer: Annotated[Learned | None, Field(description="[rad per m/s^2], told and not yet used")] = None
 
 

@@ -6,6 +6,7 @@
     yaw_rate          intercept of the wheels' yaw rate over the gyro's
     steer_offset      intercept of δ over L·r/v with understeer beside it
     steer_gain        gain of the same
+    force_gain        torque over radius, over mass times acceleration: torque gain and mass, where torque is recorded
     understeer        δ beyond L·r/v per v·r [rad per m/s²]
 
 Wheels under force slip: what the driven axle turns faster for it, and the dragged one slower, is taken off a radius by
@@ -27,7 +28,7 @@ from typing import Final, TypeAlias
 import numpy as np
 
 from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, prepare
-from edge_agent.inputs.doctor.identities import fits
+from edge_agent.inputs.doctor.identities import fits, robust
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, FloatArray
 from schemas.signals import WHEELS
@@ -35,15 +36,16 @@ from schemas.thresholds import GRAVITY
 from schemas.vehicle import Calibration, Vehicle
 
 CALM: Final = 0.7  # [m/s^2] of acceleration, up to which wheels hardly slip
+PULLED: Final = 0.5  # [m/s^2] from which on torque tells its gain
 STRAIGHT: Final = 1.0  # [m/s^2] of v·r
 LEAST_S: Final = 10.0  # of moments that count
 # spread among drives that is always allowed for; what drives have in common; and spread among cars
 FLOOR: Final = {"radius": 0.0004, "ax": 0.10, "ay": 0.05, "yaw_rate": 0.0015, "steer_offset": 0.0006,
-                "steer_gain": 0.03, "understeer": 0.0015}  # fmt: skip
+                "steer_gain": 0.03, "force_gain": 0.02, "understeer": 0.0015}  # fmt: skip
 BIAS: Final = {"radius": 0.0001, "ax": 0.02, "ay": 0.25, "yaw_rate": 0.0005, "steer_offset": 0.0004,
-               "steer_gain": 0.03, "understeer": 0.0010}  # fmt: skip
+               "steer_gain": 0.03, "force_gain": 0.002, "understeer": 0.0005}  # fmt: skip
 USUAL: Final = {"radius": 0.006, "ax": 0.4, "ay": 0.2, "yaw_rate": 0.004, "steer_offset": 0.005, "steer_gain": 0.04,
-                "understeer": 0.01}  # fmt: skip
+                "force_gain": 0.08, "understeer": 0.01}  # fmt: skip
 ROBUST: Final = 1.4826  # standard deviations in the median of absolute deviations
 UNKNOWN_SPLIT: Final = 0.0008  # BIAS of radii where the file does not say which axle drives
 DRAG: Final = 0.4  # [kg/m] half of 1.2 kg/m^3 x .3 x 2.2 m^2
@@ -99,7 +101,7 @@ def surer(one: Calibration | None, other: Calibration | None) -> Calibration | N
 
 def _posterior(kind: str, values: FloatArray, bias: float) -> tuple[float, float]:
     """Value and standard deviation by the estimates of drives (n,)."""
-    sound = 1.0 if kind == "steer_gain" else 0.0
+    sound = 1.0 if kind.endswith("gain") else 0.0
     centre = float(np.median(values))
     around = ROBUST * float(np.median(np.abs(values - centre))) if len(values) > 2 else 2.0 * FLOOR[kind]
     spread = max(around, FLOOR[kind])
@@ -115,7 +117,7 @@ def one_drive(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
     if axle.known and axle.error < 0.1:
         quantities["yaw_rate"] = -axle.offset / axle.gain
         drive = replace(drive, r=drive.r - quantities["yaw_rate"])  # else taken for offsets of steering and a_y
-    quantities |= _radii(drive, vehicle)
+    quantities |= _radii(drive, vehicle) | _force_gain(drive, vehicle)
     calm = moving & np.isfinite(drive.ax) & np.isfinite(drive.v_dot)
     if calm.sum() > LEAST_S * RATE_HZ:
         quantities["ax"] = float(np.median((drive.ax - drive.v_dot)[calm]))
@@ -139,6 +141,19 @@ def _radii(drive: EvenDrive, vehicle: Vehicle) -> dict[str, float]:
     faster = rims / rims.mean(axis=1, keepdims=True) - _slips(drive, vehicle, calm)
     ratio = np.median(faster, axis=0) - 1.0
     return {f"radius_{wheel}": float(value) for wheel, value in zip(WHEELS, ratio, strict=True)}
+
+
+def _force_gain(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
+    """Torque against what moves the file's mass, by the wheels: an accelerometer pitches with the body.
+
+    Slope, air and rolling are beside it: they do not go with acceleration.
+    """
+    rows = (drive.moving > 0) & np.isfinite(drive.torque) & np.isfinite(drive.v_dot)
+    if np.sum(rows & (np.abs(drive.v_dot) > PULLED)) < LEAST_S * RATE_HZ:
+        return {}
+    moved = vehicle.mass + 4.0 * vehicle.wheel_inertia / vehicle.wheel_radius**2
+    table = np.stack([moved * drive.v_dot[rows], np.ones(int(rows.sum()))], axis=1)
+    return {"force_gain": float(robust(table, drive.torque[rows] / vehicle.wheel_radius)[0])}
 
 
 def _slips(drive: EvenDrive, vehicle: Vehicle, rows: BoolArray) -> FloatArray:

@@ -5,12 +5,16 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from schemas.errors import InputError
+
+if TYPE_CHECKING:
+    from schemas.runtime.figures import Figure
 
 LEAST_SEEDS: Final = 20  # of a campaign whose bars count
 QUICK_SEEDS: Final = 2
@@ -78,13 +82,24 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _inputs(args: argparse.Namespace) -> int:
+    from edge_agent.lab.seeds import FIGURES
+    from schemas.runtime.figures import markdown, write
+
+    with tempfile.TemporaryDirectory(dir=args.out) as scratch:
+        figures = _measured(Path(scratch), args)
+    write(args.out / "figures.json", "edge-agent evaluate --only inputs", [FIGURES, FIGURES + 1], figures)
+    text = f"# Inputs\n\n{markdown(figures)}\n"
+    (args.out / "report.md").write_text(text, encoding="utf-8")
+    print(text)
+    return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
+
+
+def _measured(folder: Path, args: argparse.Namespace) -> list[Figure]:
     from edge_agent.lab.evaluation import calibrated, imports, planted
     from edge_agent.lab.live import judge
     from edge_agent.lab.seeds import FIGURES
-    from schemas.runtime.figures import Figure, markdown, write
+    from schemas.runtime.figures import markdown
 
-    folder = args.out / "inputs"
-    folder.mkdir(exist_ok=True)
     quick = args.quick
     rows: list[Callable[[], list[Figure]]] = [
         lambda: imports.figures(folder, FIGURES, args.recorded, QUICK_S if quick else imports.DRIVE_S),
@@ -98,8 +113,4 @@ def _inputs(args: argparse.Namespace) -> int:
         found = row()
         figures += found
         print(markdown(found).partition("|---|---|---|---|\n")[2], file=sys.stderr, flush=True)
-    write(args.out / "figures.json", "edge-agent evaluate --only inputs", [FIGURES, FIGURES + 1], figures)
-    text = f"# Inputs\n\n{markdown(figures)}\n"
-    (args.out / "report.md").write_text(text, encoding="utf-8")
-    print(text)
-    return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
+    return figures

@@ -43,6 +43,7 @@ class EvenDrive:
     course_yaw: FloatArray  # the log's own yaw at the same times, not smoothed
     moving: FloatArray  # 1 where the car moves, else 0
     wheelbase: float
+    torque: FloatArray  # of all wheels [N m]
 
     @property
     def v_dot(self) -> FloatArray:
@@ -127,6 +128,7 @@ def prepare(t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: FloatA
         delta=smooth(even(t, np.where(np.isfinite(delta), delta, signals[:, S.DELTA + 1]), at)), wheels=rims, v=v,
         r_wheels=r_wheels, v_ground=v_ground, course=course, course_yaw=yaw_at,
         moving=(np.abs(v) > CREEP * fast).astype(float), wheelbase=vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle,
+        torque=smooth(even(t, signals[:, S.TORQUE : S.TORQUE + 4].sum(axis=1), at)),
     )  # fmt: skip
 
 

@@ -14,8 +14,10 @@ from edge_agent.calibration.learn import learn
 from edge_agent.inputs.correct import corrected
 from edge_agent.lab.evaluation.planted import RATE_HZ, drives
 from edge_agent.lab.simulation import SimulatedFleet
+from edge_agent.lab.simulation.fleet import VEHICLE_STREAM
 from edge_agent.lab.simulation.misaligned import Misaligned
 from edge_agent.lab.simulation.place import GOTHENBURG
+from edge_agent.lab.simulation.presets import nominal, one_of_a_fleet
 from edge_agent.lab.simulation.sensors import ROUGH_FLEET, ErrorColumn, error_row
 from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
@@ -41,7 +43,17 @@ def truth(seed: int, car: int) -> dict[str, float]:
         "yaw_rate": float(offset[S.YAW_RATE]),
         "steer_offset": float(mounted[Misaligned.ZERO] + offset[S.DELTA]),
         "steer_gain": float(1.0 + mounted[Misaligned.GAIN]),
+        "understeer": 0.0,  # front and rear tyres of the simulated cars have one stiffness over load
+        "force_gain": float(error[ErrorColumn.GAIN + S.TORQUE]) * _heavier(seed, car),
     }
+
+
+def _heavier(seed: int, car: int) -> float:
+    """True mass times radius over those of the vehicle file."""
+    rng = np.random.default_rng([seed, car, VEHICLE_STREAM])
+    true = one_of_a_fleet(car, "car", rng)
+    file = nominal(true, rng)
+    return true.vehicle.mass * true.vehicle.wheel_radius / (file.mass * file.wheel_radius)
 
 
 class Narrowed(NamedTuple):

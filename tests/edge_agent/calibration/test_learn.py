@@ -94,6 +94,29 @@ def test_the_driven_axle_is_not_taken_for_a_smaller_one() -> None:
         assert theirs[1] > ours[1]
 
 
+def test_torque_tells_its_gain_times_the_mass() -> None:
+    drive = drives(1, 33, rough=False, seconds=180)[0]
+    assert np.isfinite(drive.signals[:, S.TORQUE]).any()
+    torques = [S.TORQUE + wheel for wheel in range(4)]
+    laden = drive.vehicle.model_copy(update={"mass": drive.vehicle.mass / 1.1})
+    plain, more, heavy = (
+        learn(parts(one, 3), vehicle).force_gain
+        for one, vehicle in ((drive, drive.vehicle), (scaled(torques, 1.1)(drive), drive.vehicle), (drive, laden))
+    )
+    assert plain is not None
+    assert more is not None
+    assert heavy is not None
+    assert abs(plain[0] - 1.0) < 0.08
+    for gained in (more, heavy):
+        assert gained[0] - plain[0] == pytest.approx(0.1, abs=0.02)
+    vehicle = drive.vehicle.model_copy(update={"calibration": Calibration(drives=1, force_gain=(1.1, 0.01))})
+    mended = corrected(scaled(torques, 1.1)(drive).signals, vehicle)
+    assert np.allclose(mended[:, torques], drive.signals[:, torques], equal_nan=True)
+    unsaid = drive.signals.copy()
+    unsaid[:, torques] = np.nan
+    assert learn([(drive.t, unsaid)], drive.vehicle).force_gain is None
+
+
 def test_of_two_calibrations_the_surer_value_holds() -> None:
     one = Calibration(drives=3, ax=(0.3, 0.05), ay=(0.1, 0.2))
     other = Calibration(drives=9, ax=(0.2, 0.1), yaw_rate=(0.01, 0.001))

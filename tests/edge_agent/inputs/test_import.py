@@ -305,3 +305,40 @@ def test_blocks_of_a_measurement_in_a_circle_are_refused(tmp_path: Path) -> None
     path.write_bytes(bytes(data))
     with pytest.raises(InputError, match="circle"):
         read_source(path, load_profile("toyota")[0], read_dbc(FOLDER / "toyota.dbc"))
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("part", ["*.db3", "metadata.yaml"])
+def test_a_hostile_bag_folder_is_one_clear_error_or_the_readings_that_are_left(tmp_path: Path, part: str) -> None:
+    folder, rng, refused = formats.as_bag(tmp_path / "bag", formats.frames(60), "sqlite3"), np.random.default_rng(6), 0
+    file = next(folder.glob(part))
+    data = file.read_bytes()
+    profile, database = load_profile("toyota")[0], read_dbc(FOLDER / "toyota.dbc")
+    assert read_source(folder, profile, database).signals
+    for k in range(18):
+        file.write_bytes(broken(data, ("cut", "full", "changed")[k % 3], rng))
+        try:
+            read_source(folder, profile, database)
+        except InputError:
+            refused += 1
+    assert refused > 0
+
+
+def test_a_hostile_database_or_profile_is_one_clear_error_or_what_is_left_of_it(tmp_path: Path) -> None:
+    rng, refused = np.random.default_rng(7), 0
+    dbc, profile = (FOLDER / "toyota.dbc").read_bytes(), (FOLDER / "toyota.json").read_bytes()
+    for k in range(60):
+        kind = ("cut", "full", "changed")[k % 3]
+        (tmp_path / "p.dbc").write_bytes(broken(dbc, kind, rng))
+        (tmp_path / "p.json").write_bytes(broken(profile, kind, rng))
+        for read in (lambda: read_dbc(tmp_path / "p.dbc"), lambda: load_profile(str(tmp_path / "p.json"))):
+            try:
+                read()
+            except InputError:
+                refused += 1
+    assert 20 < refused < 120
+    (tmp_path / "p.dbc").write_bytes(b"BO_ 1 A: 8 X\n" + b' SG_ S : 0|8@1+ (1,0) [0|0] "" X\n' * 200_000)
+    assert len(read_dbc(tmp_path / "p.dbc")["A"].signals) == 1
+    (tmp_path / "p.json").write_bytes(b'{"channels":' * 50_000)
+    with pytest.raises(InputError):
+        load_profile(str(tmp_path / "p.json"))
