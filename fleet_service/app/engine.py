@@ -40,7 +40,7 @@ from fleet_service.replay.checkpoints import Taken
 from fleet_service.replay.rebuild import Begin, Since, first_day, replay, restore_streams
 from fleet_service.replay.restart import image_of, restart
 from fleet_service.serve.alerts import Alerts
-from fleet_service.serve.encode import cell_table
+from fleet_service.serve.encode import batch_of
 from fleet_service.serve.map_state import MapState
 from fleet_service.serve.query import answer, cells_asked
 from fleet_service.serve.tile_cache import TileCache
@@ -294,7 +294,7 @@ class Engine:
             with self._guard:
                 slots = np.arange(start, min(start + SNAPSHOT_SLOTS, self.fusion.size))
                 public = slots[self.fusion.live.vehicles[slots] >= self._config.public_vehicles]
-                tables.append(cell_table(self.fusion, public, now))
+                tables.append(pa.Table.from_batches([batch_of(self._tiles.seen(public, now), now)]))
         return pa.concat_tables([*tables, MAP_SCHEMA.empty_table()])
 
     def fade_alerts(self, now: int) -> list[Alert]:

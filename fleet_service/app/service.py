@@ -150,7 +150,7 @@ class Service:
                 asked.reply(keys.alert_key(tile), alerts, encoding=wire.STANDING_ENCODING)
 
     def _weather(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.PUT:
+        if sample.kind == zenoh.SampleKind.PUT and len(sample.payload) <= wire.MAX_BYTES:
             message = WeatherMessage(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding))
             self.engine.weather.enqueue(message)
 

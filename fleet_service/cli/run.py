@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import gc
+import os
 import sys
 import threading
 import traceback
@@ -18,6 +19,7 @@ from schemas.runtime.process import end_now, line_logger, log_as
 if TYPE_CHECKING:
     from fleet_service.app.service import Service
 
+PRIVATE = 0o027  # where persons drove is for the service and its group alone, whatever the mask was
 SWITCH_S = 0.0005  # after which a busy worker lets an answer go first; ten times that is Python's own
 LEAVE_AT_LAST_S = 2.7  # after a signal; the process is to have ended within 3 s
 
@@ -35,6 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
     from schemas.config import ServiceConfig, load
 
     stop = stop_on_signals()
+    os.umask(os.umask(0o077) | PRIVATE)
     config = load(arguments.config, ServiceConfig)
     log_as(config.log, sys.stderr, service=config.name)
     if arguments.weather is not None:

@@ -11,7 +11,7 @@ import pyarrow as pa
 from fleet_service.serve.encode import encode
 from fleet_service.serve.neighbour_fill import impute
 from fleet_service.serve.tile_cache import ShownTile, TileCache, used_once
-from fleet_service.serve.view import joined, view
+from fleet_service.serve.view import joined
 from schemas import grid
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, IntArray
@@ -80,7 +80,7 @@ def _viewed(cache: TileCache, tile: int, query: MapQuery, route: IntArray | None
             ahead = route[grid.tile_of(route // grid.SECTORS) == tile]
             found = fusion.slots_of(ahead // grid.SECTORS, ahead % grid.SECTORS)
             passed = found[found >= 0]
-        cells = view(fusion, passed, now)
+        cells = cache.seen(passed, now)
         if query.basis == "borrowed":
             cells = joined(cells, impute(fusion, tile, slots, route, now))
     return used_once(cells, now)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from fleet_service.serve.encode import arrow_stream, batch_of
 from fleet_service.serve.map_state import MapState
-from fleet_service.serve.view import CellView, view
+from fleet_service.serve.view import CellView, coarse, view
 from schemas import grid
 from schemas.numeric import IntArray
 from schemas.thresholds import NS
@@ -83,13 +83,18 @@ class TileCache:
         """A tile as it is believed at `now` [ns]."""
         with self.guard:
             change = self.state.change
-            cells = view(self.state.fusion, self._public(self.state.slots(tile)), now)
+            cells = self.seen(self._public(self.state.slots(tile)), now)
         payload = arrow_stream(batch_of(cells, now))
         batch = pa.ipc.open_stream(payload).read_next_batch()
         columns = selected_by(batch)
         made = ShownTile(batch, columns, payload, *_common(columns), now, change)
         self._keep(tile, made)
         return made
+
+    def seen(self, slots: IntArray, now: int) -> CellView:
+        """The cells of slots as readers see them: coarse where more than one vehicle makes a cell public."""
+        cells = view(self.state.fusion, slots, now)
+        return coarse(cells) if self._least > 1 else cells
 
     def _public(self, slots: IntArray) -> IntArray:
         """The public ones, from south to north."""

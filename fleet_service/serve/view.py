@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from fleet_service.fusion import Fusion
 from schemas import grid, mugrid
 from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray
+from schemas.thresholds import NS
 
 CountArray = NDArray[np.integer[Any]]
 LOWER, UPPER = 0.05, 0.95  # of the interval
@@ -19,6 +20,8 @@ PRIOR_WIDTH: Final = PRIOR_UPPER - float(mugrid.quantiles(mugrid.PRIOR, LOWER))
 # the interval; else all that is known is a lower bound.
 MEASURED_DROP: Final = 0.02
 MEASURED_WIDTH: Final = 0.5
+TIME_STEP_NS: Final = 900 * NS  # a quarter of an hour, in which a street has had several cars
+COUNT_STEPS: Final = np.array([0, 1, 2, 3, 5, *(m * 10**e for e in range(1, 9) for m in (1, 2, 5))])
 
 
 class CellView(NamedTuple):
@@ -53,6 +56,17 @@ def view(fusion: Fusion, slots: IntArray, now: int) -> CellView:
         values=live.values[slots], vehicles=live.vehicles[slots], observations=live.visits[slots],
         first=live.first[slots], last=live.time[slots], imputed=np.zeros(len(slots), bool),
     )  # fmt: skip
+
+
+def coarse(cells: CellView) -> CellView:
+    """The cells as readers see them where persons are kept private: no single passage shows in a time or a count."""
+    steps = COUNT_STEPS
+    counts = [
+        steps[np.maximum(np.searchsorted(steps, column, "right") - 1, 0)]
+        for column in (np.asarray(cells.vehicles, np.int64), np.asarray(cells.observations, np.int64))
+    ]
+    first, last = (time // TIME_STEP_NS * TIME_STEP_NS for time in (cells.first, cells.last))
+    return cells._replace(vehicles=counts[0], observations=counts[1], first=first, last=last)
 
 
 def joined(*views: CellView) -> CellView:

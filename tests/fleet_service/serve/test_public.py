@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from datetime import datetime
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pytest
 
 from fleet_service.app.engine import Engine
 from fleet_service.ingest.inbox import Message
+from fleet_service.serve.view import CellView, coarse
 from schemas import query, wire
 from schemas.config import ServiceConfig
 from schemas.wire import Kind
@@ -72,3 +75,30 @@ def test_a_route_tells_the_deceleration_that_is_safe_at_95_percent(start: Start)
     (row,) = rows(engine, route=f"{LONGITUDE - 0.001},{LATITUDE}|{LONGITUDE + 0.001},{LATITUDE}")
     assert row["safe_deceleration"] == pytest.approx(9.81 * float(str(row["mu_lower"])), rel=1e-5)
     assert 5.0 < float(str(row["safe_deceleration"])) < 0.8 * 9.81
+
+
+def test_no_single_passage_shows_where_persons_are_kept_private(start: Start) -> None:
+    """Times and counts are coarse: a pass at night changes neither."""
+    engine = start(3)
+    hear(engine, *(f"sim-{k:03}" for k in range(6)))
+    (before,) = rows(engine)
+    assert (before["vehicles"], before["observations"]) == (5, 5)
+    hear(engine, "sim-006")
+    (after,) = rows(engine)
+    assert (after["vehicles"], after["observations"]) == (5, 5)
+    for name in ("first_time", "last_time"):
+        moment = after[name]
+        assert isinstance(moment, datetime)
+        assert (moment.minute % 15, moment.second, moment.microsecond) == (0, 0, 0)
+
+
+def test_coarse_counts_are_never_more_than_there_were() -> None:
+    counts = np.arange(1, 4000)
+    zeros = np.zeros(len(counts), np.int64)
+    cells = CellView(
+        zeros, zeros, np.zeros((len(counts), 32)), zeros.astype(np.float32), counts, counts, zeros, zeros, zeros > 0
+    )
+    seen = coarse(cells)
+    assert (seen.vehicles <= counts).all()
+    assert (seen.vehicles >= 0.39 * counts).all()
+    assert (coarse(seen).vehicles == seen.vehicles).all()
