@@ -65,7 +65,7 @@ def readme_commands_failed(house: House) -> float:
     if done.returncode:
         house.note("readme", done.stderr[-400:])
         return float("nan")
-    failed = [line for line in done.stdout.splitlines() if line]
+    failed: list[str] = json.loads(done.stdout.splitlines()[-1])
     house.note("readme", failed)
     return float(len(failed))
 

@@ -5,6 +5,7 @@ Lines that stay (router, service, agent, watch) are started and must still run a
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
@@ -99,8 +100,8 @@ def _last(log: Path) -> str:
 
 
 def main() -> int:
-    """Print what failed, a line each: for a process in a network of its own."""
-    print("\n".join(run(Path(sys.argv[1]))))
+    """Print what failed, as JSON: for a process in a network of its own."""
+    print(json.dumps(run(Path(sys.argv[1]))))
     return 0
 
 
