@@ -85,6 +85,7 @@ class Feed(ABC):
         self.stopping = threading.Event()
         self.stamps = Stamps()
         self.last = 0.0  # host's time of the last message
+        self.newest = 0.0  # the latest stamp, on the host's clock
         self._reasons: set[str] = set()
         self._waiting: deque[Heard] = deque()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -114,7 +115,9 @@ class Feed(ABC):
         if len(self._waiting) >= MOST_WAITING:
             self._waiting.popleft()
             self.lost += 1
-        self._waiting.append((self.stamps.place(self.clock.of(stamp_ns), self.last), what))
+        placed = self.stamps.place(self.clock.of(stamp_ns), self.last)
+        self._waiting.append((placed, what))
+        self.newest = max(self.newest, placed)
 
     def unreadable(self, reason: str) -> None:
         """Count a message that makes no sense; the first of its kind is logged."""

@@ -1,7 +1,8 @@
 """Rows at a fixed rate of what live sources heard: the importer's profile and merging, a tenth of a second at a time.
 
-A row is made DELAY_S after its time, so that readings to either side of it are there: what comes later is missing in it
-and not waited for. The clock makes the rows: where all sources are silent they are empty, and the estimator widens.
+A row is made DELAY_S after its time, so that readings to either side of it are there; a source that speaks but is
+behind (its host is busy) is waited for up to PATIENCE_S. What comes later still is missing, and counted. The clock
+makes the rows: where all sources are silent they are empty, and the estimator widens.
 A fix that comes after its row is moved along its own course to the first row that is left.
 """
 
@@ -16,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from edge_agent.inputs.block import Block
-from edge_agent.inputs.live.feed import Feed, HostClock
+from edge_agent.inputs.live.feed import TICK_S, Feed, HostClock
 from edge_agent.inputs.merge import COURSE_SPEED, SPARSE, found_in, made, sampled
 from edge_agent.inputs.profile import Profile
 from edge_agent.inputs.recording import Recording, Series
@@ -30,6 +31,7 @@ from schemas.vehicle import Vehicle
 RATE_HZ: Final = 100.0
 BLOCK_S: Final = 0.1
 DELAY_S: Final = 0.3  # a channel of 10 Hz has its next reading by then
+PATIENCE_S: Final = 1.0
 KEPT_S: Final = 3.0  # of readings before a row: bursts are straightened over a second
 MOST_BEHIND_S: Final = 5.0  # rows of a host that slept are left out: the estimator is told of a gap
 OLDEST_FIX_S: Final = 2.0
@@ -65,7 +67,7 @@ class LiveRows:
         self._used = dict.fromkeys(SPARSE, -math.inf)  # time of the last fix that has its row
         self._next = 0  # row
         self._date_ns: int | None = None
-        self.skipped = 0
+        self.skipped = self.late = 0  # rows left out; readings that came after their row
         self.ground: FloatArray = np.zeros(0)  # speed over ground of the last block's rows (T,) [m/s]
 
     def blocks(self) -> Generator[Block]:
@@ -78,6 +80,8 @@ class LiveRows:
             while True:
                 due = (self._next + size) / self.rate_hz + DELAY_S
                 self._wait(max(0.0, due - self._clock.now()))
+                while self._behind(due - DELAY_S) and self._clock.now() < due + PATIENCE_S:
+                    self._wait(TICK_S / 10.0)
                 behind = int((self._clock.now() - due) * self.rate_hz)
                 if behind > MOST_BEHIND_S * self.rate_hz:
                     self._next += behind
@@ -92,6 +96,13 @@ class LiveRows:
     def troubles(self) -> list[str]:
         """Sources that are silent."""
         return [trouble for feed in self.feeds if (trouble := feed.trouble)]
+
+    def _behind(self, time: float) -> bool:
+        """Whether a source has yet to tell of a time: none that is silent, and no receiver, whose fixes are rare."""
+        return any(
+            feed.heard and feed.newest < time and feed.trouble is None and "course" not in kept
+            for feed, kept in zip(self.feeds, self._readings, strict=True)
+        )
 
     def _block(self, size: int) -> Block:
         t = np.arange(self._next, self._next + size) / self.rate_hz
@@ -118,8 +129,11 @@ class LiveRows:
 
     def _recording(self, place: int, feed: Feed, oldest: float) -> Recording:
         """What a source told lately."""
-        kept = self._readings[place]
-        for name, fresh in feed.take().items():
+        kept, fresh_ones = self._readings[place], feed.take()
+        if "course" not in fresh_ones:
+            passed = oldest + KEPT_S - 1.0 / self.rate_hz
+            self.late += max((int((fresh.t < passed).sum()) for fresh in fresh_ones.values()), default=0)
+        for name, fresh in fresh_ones.items():
             before = kept.get(name)
             t, values = fresh.t, fresh.values
             if before is not None:

@@ -19,7 +19,6 @@ from edge_agent.inputs.live.rows import LiveRows
 from edge_agent.inputs.live.sources import open_sources
 from edge_agent.lab.live.peers import CHANNELS, DBC, profile_of
 from edge_agent.lab.simulation.presets import PRESETS
-from schemas.numeric import BoolArray
 from schemas.runtime.figures import Figure
 from schemas.signals import CHANNELS as ALL
 from schemas.vehicle import Vehicle
@@ -108,7 +107,7 @@ def written(kind: str, folder: Path) -> tuple[str, Path | None]:
 def lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
     """Samples lost between a source and the rows, and how many were sent.
 
-    Lost are messages that were not heard, and rows between the first and the last sample without a reading.
+    Lost are messages that were not heard, and readings that came after their row.
     """
     samples = round(seconds * RATE_HZ)
     place, source = addresses(kind)
@@ -138,12 +137,10 @@ def lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
                 sent = json.loads(line)["sent"]
                 break
     table = np.concatenate(parts)[:, [ALL.index(channel) for channel in CHANNELS]]
-    full: BoolArray = np.asarray(np.isfinite(table).all(axis=1))
-    here = np.flatnonzero(np.isfinite(table).any(axis=1))
-    inside = full[here[0] : here[-1] + 1] if len(here) else np.zeros(samples, bool)
-    short = max(samples - 2 - int(full.sum()), 0)
+    if np.isfinite(table).all(axis=1).sum() < samples // 2:
+        return samples, samples  # heard, and yet no row: nothing came in
     missing = -(-(sent - heard) * samples // max(sent, 1))
-    return max(missing, 0) + feeds[0].lost + max(int((~inside[2:-2]).sum()), short), samples
+    return max(missing, 0) + feeds[0].lost + rows.late, samples
 
 
 def crashes(folder: Path, kills: int = KILLS) -> tuple[int, int]:

@@ -1,0 +1,198 @@
+"""Live rows: one clock for all sources, linear between readings, late fixes moved, lost sources opened anew."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from edge_agent.inputs.live.feed import BELIEVED_S, WHILE_S, Feed, Heard, HostClock, Stamps
+from edge_agent.inputs.live.rows import DELAY_S, LiveRows
+from edge_agent.inputs.profile import Channel, Profile
+from edge_agent.inputs.recording import Series
+from edge_agent.lab.simulation.presets import PRESETS
+from schemas.signals import S
+from schemas.thresholds import EARTH_RADIUS_M, NS
+from tests.waiting import until
+
+CAR = PRESETS["sedan"].vehicle
+
+
+class Steered(HostClock):
+    """A host's clock that stands until it is moved."""
+
+    def __init__(self) -> None:
+        super().__init__(start_ns=1_700_000_000 * NS)
+        object.__setattr__(self, "at", [0.0])
+
+    def now(self) -> float:
+        return float(self.__dict__["at"][0])
+
+    def move(self, seconds: float) -> None:
+        self.__dict__["at"][0] += seconds
+
+
+class Scripted(Feed):
+    """A source that says what it is told to say."""
+
+    def listen(self) -> None:
+        self.stopping.wait()
+
+    def series(self, heard: list[Heard]) -> dict[str, Series]:
+        names = {name for _, values in heard for name in values}
+        found = {name: [(t, values[name]) for t, values in heard if name in values] for name in names}
+        return {name: Series(*np.array(pairs).T) for name, pairs in found.items()}
+
+    def tell(self, t: float, **values: float) -> None:
+        self.hear(self.clock.start_ns + round(t * NS), values)
+
+
+@pytest.fixture
+def clock() -> Steered:
+    return Steered()
+
+
+def rows_of(clock: Steered, *feeds: Feed, wait: Callable[[float], None] | None = None) -> LiveRows:
+    profile = Profile(name="p", channels={name: Channel(signal=name) for name in ("ax", "omega_fl")})
+    return LiveRows(feeds, profile, CAR, clock, wait=wait or clock.move)
+
+
+def test_stamps_of_the_hosts_clock_are_believed_and_those_of_another_are_moved_by_the_least_delay() -> None:
+    own, other = Stamps(), Stamps()
+    delays = [0.3, 0.05, 0.2, 0.11]
+    assert [own.place(10.0 + k, 10.0 + k + delay) for k, delay in enumerate(delays)] == [10.0, 11.0, 12.0, 13.0]
+    places = [other.place(k - 5000.0, k + delay) for k, delay in enumerate(delays)]
+    assert places[1:] == pytest.approx([1.05, 2.05, 3.05])
+    early = Stamps()
+    assert early.place(10.5, 10.1) == pytest.approx(10.1), "from the future: another clock"
+    assert own.lead == 0.0
+    assert max(delays) < BELIEVED_S
+
+
+def test_a_clock_that_is_set_under_way_is_followed() -> None:
+    stamps = Stamps()
+    for k in range(20):
+        stamps.place(k * 1.0, k + 0.02)
+    for k in range(20, 20 + round(2.5 * WHILE_S)):
+        placed = stamps.place(k - 3600.0, k + 0.02)
+    assert placed == pytest.approx(k + 0.02)
+
+
+def test_rows_are_linear_between_readings_and_empty_where_a_source_is_silent(clock: Steered) -> None:
+    feed, last = Scripted("bus", clock), 4.0
+    ticks = iter(np.arange(0.0, last + 0.01, 0.02).tolist())  # 50 Hz
+    due = [next(ticks)]
+
+    def wait(seconds: float) -> None:
+        until_then = clock.now() + seconds
+        while due and due[0] <= until_then:
+            clock.move(due[0] - clock.now())
+            feed.tell(due[0], ax=5.0 * due[0], omega_fl=7.0)
+            due[:] = [tick for tick in [next(ticks, None)] if tick is not None]
+        clock.move(until_then - clock.now())
+
+    rows = rows_of(clock, feed, wait=wait)
+    blocks = rows.blocks()
+    got = [next(blocks) for _ in range(60)]
+    t, signals = (np.concatenate([getattr(block, name)[:, 0] for block in got]) for name in ("t", "signals"))
+    told = t <= last + 1e-9
+    assert np.allclose(signals[told, S.AX], 5.0 * t[told], atol=1e-6)
+    assert np.isnan(signals[~told, S.AX]).all()
+    assert (~told).sum() > 100
+    assert (signals[:, S.DELTA + 2] == 0.0).all(), "rear wheels do not steer"
+    assert np.allclose(np.diff(t), 0.01)
+    assert (got[0].time[0] - clock.start_ns) / NS == pytest.approx(t[0], abs=1e-8)
+    assert rows.troubles() == ["bus is silent for 2 s"]
+    assert clock.now() == pytest.approx(t[-1] + 0.01 + DELAY_S)
+    blocks.close()
+    assert not feed._thread.is_alive()
+
+
+def test_a_host_that_slept_leaves_rows_out(clock: Steered) -> None:
+    feed = Scripted("bus", clock)
+    rows = rows_of(clock, feed)
+    blocks = rows.blocks()
+    before = next(blocks)
+    clock.move(60.0)
+    after = next(blocks)
+    assert after.t[0, 0] - before.t[-1, 0] > 59.0
+    assert rows.skipped == pytest.approx(6000, abs=20)
+    blocks.close()
+
+
+def test_a_late_fix_is_moved_along_its_course_and_used_once(clock: Steered) -> None:
+    bus, receiver = Scripted("bus", clock), Scripted("receiver", clock)
+    rows = rows_of(clock, bus, receiver)
+    blocks = rows.blocks()
+    for _ in range(8):
+        next(blocks)
+    now = clock.now()
+    receiver.tell(now - 0.8, latitude=50.0, longitude=10.0, speed=20.0, course=0.0)  # north, and its row has gone
+    block = next(blocks)
+    place = np.isfinite(block.signals[:, 0, S.LATITUDE])
+    assert np.flatnonzero(place).tolist() == [0]
+    moved = np.radians(block.signals[0, 0, S.LATITUDE] - 50.0) * EARTH_RADIUS_M
+    assert moved == pytest.approx(20.0 * (block.t[0, 0] - 0.005 - (now - 0.8)), rel=1e-3)
+    assert block.signals[0, 0, S.LONGITUDE] == pytest.approx(10.0, abs=1e-9)
+    assert block.signals[0, 0, S.YAW] == pytest.approx(np.pi / 2)
+    assert rows.ground[0] == 20.0
+    assert all(np.isnan(next(blocks).signals[:, 0, S.LATITUDE]).all() for _ in range(5))
+    blocks.close()
+
+
+def test_the_receivers_date_holds_where_the_hosts_is_wrong(clock: Steered) -> None:
+    bus, receiver = Scripted("bus", clock), Scripted("receiver", clock)
+    rows = rows_of(clock, bus, receiver)
+    blocks = rows.blocks()
+    next(blocks)
+    for _ in range(10):
+        receiver.tell(clock.now() + 86_400.0, latitude=50.0, longitude=10.0, speed=0.0, course=0.0)
+        block = next(blocks)
+    assert (block.time[0, 0] - clock.start_ns) / NS == pytest.approx(86_400.0 + block.t[0, 0], abs=0.01)
+    blocks.close()
+
+
+class Failing(Scripted):
+    """A driver that raises, then ends, then works."""
+
+    tries = 0
+
+    def listen(self) -> None:
+        self.tries += 1
+        if self.tries == 1:
+            raise OSError("no such device")
+        if self.tries > 2:
+            self.tell(self.clock.now(), ax=1.0)
+            self.stopping.wait()
+
+
+def test_a_source_that_raises_or_ends_is_opened_again_and_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    feed = Failing("bus", HostClock())
+    with caplog.at_level(logging.WARNING):
+        feed.start()
+        until(lambda: feed.heard)
+    feed.close()
+    assert feed.losses == 2
+    assert [record.getMessage() for record in caplog.records] == [
+        "bus: lost (no such device); trying again", "bus: lost (it ended); trying again",
+    ]  # fmt: skip
+
+
+def test_a_source_that_is_behind_is_waited_for_and_what_comes_too_late_is_counted(clock: Steered) -> None:
+    feed = Scripted("bus", clock)
+    rows = rows_of(clock, feed)
+    blocks = rows.blocks()
+    feed.tell(0.0, ax=1.0)
+    next(blocks)
+    waited = clock.now()
+    assert waited > 1.0, "its next reading is not there yet"
+    feed.tell(clock.now(), ax=1.0)
+    next(blocks)
+    assert clock.now() - waited < 0.2, "it has told of a later time"
+    assert rows.late == 0
+    feed.tell(0.05, ax=1.0)
+    next(blocks)
+    assert rows.late == 1
+    blocks.close()
