@@ -72,7 +72,7 @@ def of_service(look: Callable[[Service], object]) -> Show:
 
 def let_in(made: Service) -> list[bool]:
     """Which of thirty messages of 40 kB of two vehicles are looked at."""
-    return [made.inbox._limits.allows(key(name), 40_000) for name in ("car-1", "car-2") for _ in range(30)]
+    return [made.inbox._limits.allows(key(name), 40_000) for name in ("car-1", "car-2") for _ in range(60)]
 
 
 def queued(made: Service) -> int:

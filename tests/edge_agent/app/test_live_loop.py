@@ -27,6 +27,8 @@ VEHICLES, RATE = 3, 50.0
 class Basket:
     """Takes what the loop offers."""
 
+    broken = False
+
     def __init__(self) -> None:
         self.taken: list[RecordBlock] = []
 
