@@ -150,7 +150,7 @@ def test_a_calibrated_file_is_written_read_and_heeded(smooth: Recorded, tmp_path
     assert learned.model_copy(update={"calibration": None}) == load_vehicle(car)
     said = []
     for number, file in enumerate((car, better)):
-        out = tmp_path / f"{number}.out"
+        out = tmp_path / f"{number}.parquet"
         assert main(["replay", log, "--vehicle", str(file), "--estimator", "ckf", "--out", str(out)]) in (0, 3)
         said.append(pq.read_table(out))
     assert not said[0].equals(said[1])
