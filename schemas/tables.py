@@ -71,6 +71,10 @@ OBSERVATION: Final = (
           range=(0, 3)),
     Field("air_temperature", F32, "degC", "outside; NaN where not measured", 2.0**-4, (-90.0, 80.0)),
     Field("abs_active", I8, "-1 unknown, 0 no, 1 yes", "a slip controller intervened", range=(-1, 1)),
+    Field("used_longitudinal", F32, "-", "part of mu_utilised along the vehicle, driving positive; NaN where not said",
+          _MU_STEP, (-2.0, 2.0)),
+    Field("used_lateral", F32, "-", "part of mu_utilised across the vehicle, to the left; NaN where not said",
+          _MU_STEP, (-2.0, 2.0)),
 )  # fmt: skip
 
 # Where a vehicle was and how it moved.
@@ -99,8 +103,13 @@ IDENTITY: Final = (
 # What the service adds when it keeps a row.
 BOOKKEEPING: Final = (
     Field("received_at", NS, "ns since 1970, UTC", "clock of the service"),
-    Field("late", pa.bool_(), "-", "later than the lateness window: archived, not fused"),
+    Field("late", pa.bool_(), "-", "later than the lateness window: fused as old news where late_by says so"),
     Field("weight", F32, "-", "weight of the vehicle's vote that was used"),
+    Field("late_by", I64, "ns", "how much later than leave_time a late row was fused; 0: in time, or not fused"),
+    Field("bias", F32, "-", "relative bias of the vehicle's values that was used"),
+    Field("bias_std", F32, "-", "its standard deviation"),
+    Field("spread", F32, "-", "standard deviation of the vehicle's values over what it states that was used"),
+    Field("slope", F32, "-", "how much too low the fleet's values are for each mu that was left unused, that was used"),
 )
 
 # Whether what was said of mu is a value. Without it mu is mostly the prior, and only `mu_utilised` is known.

@@ -19,6 +19,7 @@ from schemas.config import AgentConfig
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.jit import compiled
 from schemas.runtime.records import RecordArray, Records, records
+from schemas.signals import S
 from schemas.thresholds import EXCITED_SHARE, NS, UTILISED_WINDOW_S
 from schemas.wire import Columns, Kind, column_types
 
@@ -51,6 +52,10 @@ class Visit:
     health: int  # flags of all samples
     speed_sum: float  # [m/s] over the samples
     mu_utilised: float  # largest, once the window holds nothing of the cell before
+    driving: float  # squared accelerations of all samples, by direction [m²/s⁴]
+    braking: float
+    left: float
+    right: float
     mu: float  # at the last sample, and its bounds
     mu_lower: float
     mu_upper: float
@@ -65,6 +70,8 @@ class Sample:
     health: int
     speed: float  # [m/s]
     mu_utilised: float
+    ax: float  # as measured; 0 where it is not [m/s²]
+    ay: float
     mu: float
     mu_lower: float
     mu_upper: float
@@ -86,21 +93,27 @@ class OpenVisits:
 
 
 def observe(
-    before: OpenVisits, time: IntArray, located: Located, estimates: Estimates, config: AgentConfig
-) -> tuple[OpenVisits, RecordBlock, RecordBlock]:
-    """Records of a block: time (T, N) [ns UTC] -> the carried visits, observations, states."""
+    before: OpenVisits, time: IntArray, located: Located, estimates: Estimates, config: AgentConfig,
+    signals: FloatArray | None = None,
+) -> tuple[OpenVisits, RecordBlock, RecordBlock]:  # fmt: skip
+    """Records of a block: time (T, N) [ns UTC] -> the carried visits, observations, states.
+
+    Without `signals` (T, N, channels) observations do not tell how the grip was used.
+    """
     after = OpenVisits(before.visits.copy(), before.slot.copy())
     ended = records(Visit, int(np.count_nonzero(located.closes)))
-    ended = ended[: _visit(time, located, _samples(estimates), after.visits, ended)]
+    ended = ended[: _visit(time, located, _samples(estimates, signals), after.visits, ended)]
     return after, _observations(ended, estimates.evidence, config), _states(after, time, located, estimates, config)
 
 
-def _samples(estimates: Estimates) -> RecordArray:
-    """What visits take from the estimates, as records (T, N)."""
+def _samples(estimates: Estimates, signals: FloatArray | None) -> RecordArray:
+    """What visits take from the estimates and the accelerometers, as records (T, N)."""
     samples = records(Sample, *estimates.mu.shape)
     samples["speed"] = np.hypot(estimates.vx, estimates.vy)
     for name in ("health", "mu_utilised", "mu", "mu_lower", "mu_upper"):
         samples[name] = getattr(estimates, name)
+    if signals is not None:
+        samples["ax"], samples["ay"] = np.nan_to_num(signals[..., S.AX]), np.nan_to_num(signals[..., S.AY])
     return samples
 
 
@@ -131,6 +144,7 @@ def _visit(
 def _begin(visit: Visit, time: int, cell: int, sector: int) -> None:
     """A record becomes a visit without a sample."""
     visit.enter_time, visit.cell, visit.sector, visit.samples, visit.health = time, cell, sector, 0, 0
+    visit.driving, visit.braking, visit.left, visit.right = 0.0, 0.0, 0.0, 0.0
     visit.speed_sum, visit.latitude, visit.longitude, visit.yaw = 0.0, 0.0, 0.0, 0.0
 
 
@@ -141,6 +155,10 @@ def _add(visit: Visit, time: int, sample: Sample) -> None:
     visit.samples += 1
     visit.health |= sample.health
     visit.speed_sum += sample.speed
+    visit.driving += max(sample.ax, 0.0) ** 2
+    visit.braking += max(-sample.ax, 0.0) ** 2
+    visit.left += max(sample.ay, 0.0) ** 2
+    visit.right += max(-sample.ay, 0.0) ** 2
     grown = visit.leave_time - visit.enter_time > WINDOW_NS
     visit.mu_utilised = max(visit.mu_utilised, sample.mu_utilised) if grown else sample.mu_utilised
     visit.mu, visit.mu_lower, visit.mu_upper = sample.mu, sample.mu_lower, sample.mu_upper
@@ -148,6 +166,20 @@ def _add(visit: Visit, time: int, sample: Sample) -> None:
 
 def _typed(kind: Kind, columns: dict[str, NDArray[np.generic]]) -> Columns:
     return {name: columns[name].astype(dtype, copy=False) for name, dtype in column_types(kind).items()}
+
+
+def _directions(ended: RecordArray) -> dict[str, FloatArray]:
+    """The grip used along and across the vehicle, (n,): shared out by squared acceleration; NaN where there was none.
+
+    The sign is that of the direction with more of it: a visit that braked and then drove is one of braking or driving.
+    """
+    along, across = ended["driving"] + ended["braking"], ended["left"] + ended["right"]
+    whole = np.where(along + across > 0.0, along + across, np.nan)
+    used = ended["mu_utilised"]
+    return {
+        "used_longitudinal": used * np.sqrt(along / whole) * np.where(ended["driving"] >= ended["braking"], 1.0, -1.0),
+        "used_lateral": used * np.sqrt(across / whole) * np.where(ended["left"] >= ended["right"], 1.0, -1.0),
+    }
 
 
 def _observations(ended: RecordArray, evidence: FloatArray | None, config: AgentConfig) -> RecordBlock:
@@ -163,6 +195,7 @@ def _observations(ended: RecordArray, evidence: FloatArray | None, config: Agent
         "tyre_season": np.full(n, config.tyre_season),
         "air_temperature": np.full(n, np.nan),
         "abs_active": np.full(n, ABS_UNKNOWN),
+        **_directions(ended),
     }
     limit = config.slippery_mu
     urgent = (upper < limit) | ((mu < limit) & (used >= EXCITED_SHARE * mu))

@@ -35,7 +35,9 @@ class Pipeline:
         """Estimates, observations and states of a block of at least one sample, the latter two without trip ends."""
         self._tracks, located = locate(self._tracks, block.t, block.signals)
         estimates = self._bank.advance(block.t, block.signals, located.closes)
-        self._open, observations, states = observe(self._open, block.time, located, estimates, self._config)
+        self._open, observations, states = observe(
+            self._open, block.time, located, estimates, self._config, block.signals
+        )
         self._last = block
         self._ends.drive(block.time, estimates.vx)
         return estimates, self._ends.cut(observations), self._ends.cut(states)

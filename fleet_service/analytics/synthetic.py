@@ -95,11 +95,15 @@ def _chunk(
         "log_likelihood": _likelihoods(rng, mu, used, excited), "with_likelihood": np.ones(rows, bool),
         "health": np.where(rng.random(rows) < 0.01, 16, 0).astype(np.int32), "tyre_season": zeros.astype(np.int8),
         "air_temperature": (5.0 - 8.0 * night(seconds) + rng.normal(0, 1, rows)).astype(np.float32),
-        "abs_active": np.full(rows, -1, np.int8), "vehicle": names[who[trip]], "boot": (who[trip] + 1) * 7919 + since_s,
+        "abs_active": np.full(rows, -1, np.int8), "used_longitudinal": np.full(rows, np.nan, np.float32),
+        "used_lateral": np.full(rows, np.nan, np.float32), "vehicle": names[who[trip]],
+        "boot": (who[trip] + 1) * 7919 + since_s,
         "region": grid.region_of(cell), "seq": trip * 64 + along // 10 + 1, "row": (along % 10).astype(np.int32),
         "first_held": trip * 64 + np.maximum(along // 10 - 1, 0) + 1, "estimator": np.full(rows, "aco-fckf"),
         "received_at": (leave // 50_000_000 + 20) * 50_000_000 + leave // 50_000_000 % 997 * 1000,
-        "late": zeros.astype(bool), "weight": np.full(rows, 0.75, np.float32),
+        "late": zeros.astype(bool), "weight": np.full(rows, 0.75, np.float32), "late_by": zeros,
+        "bias": 0.0 * zeros.astype(np.float32), "bias_std": np.full(rows, 0.05, np.float32),
+        "spread": np.ones(rows, np.float32), "slope": np.full(rows, 0.4, np.float32),
     }  # fmt: skip
     order = np.argsort(leave, kind="stable")
     return {name: column[order] for name, column in stepped(found).items()}

@@ -27,6 +27,7 @@ from fleet_service.archive.log import SegmentLog
 from fleet_service.archive.pseudonyms import Pseudonyms
 from fleet_service.archive.segments import Rows
 from fleet_service.fusion import observations_of
+from fleet_service.fusion.standing import ERRORS, unknown
 from fleet_service.fusion.weather import Reports
 from fleet_service.ingest.acks import Acks
 from fleet_service.ingest.budgets import NEW_CELLS_AT_ONCE, NEW_CELLS_PER_HOUR, Bucket, Tracks
@@ -214,8 +215,12 @@ class Engine:
             raised = self._alerts.updated(updated.slots)
             if raised:
                 self._tiles.acknowledge()
-        rows["late"], rows["weight"] = np.ones(len(rows["row"]), bool), np.zeros(len(rows["row"]), np.float32)
-        rows["late"][heard], rows["weight"][heard] = updated.late, updated.weight
+        n = len(rows["row"])
+        rows["late"], rows["late_by"] = np.ones(n, bool), np.zeros(n, np.int64)
+        rows["weight"], error = np.zeros(n, np.float32), unknown(n)
+        rows["late"][heard], rows["late_by"][heard] = updated.late, updated.late_by
+        rows["weight"][heard], error[heard] = updated.weight, updated.error
+        rows |= dict(zip(ERRORS, error.T, strict=True))
         self.counts["late"] += int(updated.late.sum())
         return raised
 

@@ -13,7 +13,7 @@ import numpy as np
 from fleet_service.fusion import Fusion, Observations
 from fleet_service.fusion.constants import EPOCH_NS
 from fleet_service.fusion.likelihoods import at_least, levelled
-from fleet_service.fusion.shape import unshaped
+from fleet_service.fusion.reported import as_reported
 from fleet_service.fusion.space import shares
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.encode import cell_table
@@ -54,9 +54,10 @@ def live() -> None:
 def _visits(time: int, cells: int) -> Observations:
     """One visit to each of so many cells, by two vehicles."""
     one, number, sector = np.ones(cells, np.int64), np.arange(cells), np.zeros(cells, np.int8)
-    flat = unshaped(mugrid.encode_log_likelihood(np.zeros((cells, mugrid.BINS))), np.zeros(cells))
+    flat = as_reported(mugrid.encode_log_likelihood(np.zeros((cells, mugrid.BINS))))
     return Observations(
         time=time * one, cell=number, sector=sector, second=(sector - 1).astype(np.int8),
         vehicle=number % 2, boot=one, region=one, sequence=number, evidence=flat.steps, reported=flat.reported,
+        used=np.full(cells, 0.9, np.float32), manoeuvre=np.full(cells, -1, np.int8),
         other=np.full((cells, 1), -1), other_share=np.zeros((cells, 1), np.float32),
     )  # fmt: skip

@@ -18,19 +18,29 @@ CONTAMINATION: Final = 0.15
 BIAS_RELATIVE: Final = 0.05
 BIAS_ABSOLUTE: Final = 0.01  # .015 of a vehicle, less what half a bin adds by itself
 
+# A vehicle that agreed with many others is wrong as seldom as it was found wrong, but never less than this: fixes in
+# the wrong cell, and what a sensor does that never failed before.
+CONTAMINATION_LEAST: Final = 0.04
+# No bias is believed beyond this, about three standard deviations of tyres, mass and radius together.
+BIAS_MOST: Final = 0.15
+BIAS_KNOWN_LEAST: Final = 0.03  # ... nor to be known better: tyres warm up and wear, loads change
+FLEET_BIAS: Final = 0.06  # standard deviation of the fleet's biases, before anybody was met
+
 # An error that all vehicles of a place share (the same manoeuvre, the same tyre model, the same ruts) does not average
-# out however many they are. It widens every reading of the map, once. On the whole way cells of 20 and more excited
-# vehicles err by 4 to 6 % about the mean of their surface; half a bin and the votes' own bias bear the rest.
+# out however many they are; see `shared`. Without a value:
 COMMON_RELATIVE: Final = 0.04
 COMMON_ABSOLUTE: Final = 0.01
-
-# A visit that used less than SHAPE_SHARE of the grip reads it from the tyre's shape: relative error of the reading, by
-# share used. On the whole way the likelihoods' maxima lie 13, 20, 28 and 37 % too low on dry road after visits that
-# used .75, .65, .55 and .4 of the grip, and within 10 % on all surfaces from .8 on. SHAPE_MOST is less than the last
-# of these: with .3 ice takes four passes instead of three.
-SHAPE_SHARE: Final = 0.8
-SHAPE_SLOPE: Final = 2.0
-SHAPE_MOST: Final = 0.25
+# ... with values: what every manoeuvre shares, and what one kind of it does.
+COMMON_ALWAYS: Final = 0.03
+COMMON_MANOEUVRE: Final = 0.05
+# ... and with the shape of the tyre, where less than SHARED_SHARE of a road's grip was used: relative, downward.
+SHARED_SHARE: Final = 0.8
+SHARED_SLOPE: Final = 0.25
+SHARED_MOST: Final = 0.2
+SHARED_LEAST: Final = 0.25  # share of a full weight, by its root, that a gentle value has at least
+SHARED_WIDE: Final = 0.1  # relative standard deviation at which a value has half the weight of a sharp one
+SHARED_PART: Final = 0.2  # of the stated variance that does not show between who did the same
+SHARED_ALWAYS: Final = 0.5  # part of what is shared that other manoeuvres do not average out: correlations .6 and .4
 
 # A road changes slowly (drying, polishing): random walk of μ, standard deviation after one hour.
 DRIFT_PER_ROOT_HOUR: Final = 0.04
@@ -107,6 +117,27 @@ TRUST_PRIOR: Final = 0.85
 TRUST_PRIOR_PEERS: Final = 8.0
 TRUST_NONE: Final = 0.7
 TRUST_FULL: Final = 0.9
+# How much too low a value is for each μ that was left, before the fleet told. Only values that state less than this
+# relative variance (a standard deviation of 17 %) tell: others have the tyre's shape in what they state.
+SHAPED_VARIANCE: Final = 0.03
+USED_NOISE: Final = 0.04  # of the grip used, relative: as much less of its differences' squares is real
+SLOPE_MEMORY: Final = 300.0  # squares by weight beyond which old ones count half: some two hundred comparisons
+SLOPE_PRIOR: Final = 0.0
+SLOPE_STD: Final = 0.15  # so sure is that: as some twenty comparisons
+SLOPE_MOST: Final = 0.85  # then a value tells of little more than what was used
+BIAS_PAIR: Final = 0.04  # of a pair's mean difference: what its few meetings had in common
+BIAS_MEMORY: Final = 4000.0  # inverse variance of a pair's difference beyond which old meetings count half: some thirty
+# Only who is trusted more than anybody is at first tells of others' errors: no liar in a service's first minutes.
+TELLING_TRUST: Final = 0.85
+# Who does the same as another, with a difference of the grip used of less than so much of μ.
+ALIKE_USED: Final = 0.15
+# On three rough drives the values of who did the same scattered by .2 to .4 of the variance that they state, and erred
+# by all of it: 60 % of it was shared. So a fleet that nobody knows is taken to share half.
+SPREAD_FIRST: Final = 0.7
+SPREAD_FLOOR: Final = 0.5
+SPREAD_CEILING: Final = 3.2
+SPREAD_PRIOR: Final = 0.05  # sum of stated relative variances that is imagined as right: some five comparisons
+SPREAD_MEMORY: Final = 1.0  # ... beyond which old ones count half: some hundred
 TRUST_HEARD_LEAST: Final = 0.2  # how much a vehicle's word about others counts at least: all distrusted is no end
 # Once so many vehicles are known (met so many others, and are trusted), one that is not is a newcomer: it votes with
 # this weight, is no corroborating source, and shares one vote per cell with all others that are not trusted.
@@ -115,6 +146,9 @@ ESTABLISHED_VEHICLES: Final = 10
 NEWCOMER: Final = 0.4
 SOURCE_TRUST: Final = 0.5  # less trusted vehicles vote, but are no corroborating sources for an alert
 SOURCE_SHARE: Final = 0.6  # P(slippery) from the vote alone, against the uniform prior, that makes a source of ice
+# A vehicle without a record is a source of ice only if it used this share of what it says: sixty cars on winter tyres
+# who all took a wet curve with a third of its grip said ice, having used six tenths of that.
+WITNESS_SHARE: Final = 0.8
 # A bound is a source of grip from this much grip used on: only a dry road gives it. On the best roads values lie at
 # the grid's end and are bounds, and without them nobody would clear an alert there.
 SOURCE_USED: Final = EXCITED_SHARE

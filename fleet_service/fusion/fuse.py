@@ -12,12 +12,15 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.belief import forget, read, unpack
+from fleet_service.fusion.belief import forget, unpack
+from fleet_service.fusion.late import LATE_MOST_NS, delayed, fused_at
 from fleet_service.fusion.observations import Observations, SmallArray
+from fleet_service.fusion.shared import KERNELS, read_road, shared_parts
+from fleet_service.fusion.standing import ERRORS, UNKNOWN, Standing, classes, first_standing, unknown
 from fleet_service.fusion.store.cells import Cells
-from fleet_service.fusion.store.records import NOBODY, NONE, Rows
+from fleet_service.fusion.store.records import AGED, NOBODY, NONE, USED, Rows
 from fleet_service.fusion.store.store import Store, distinct
-from fleet_service.fusion.trust import newcomer, trusted
+from fleet_service.fusion.trust import judged, newcomer
 from fleet_service.fusion.votes import PADDED, SCRATCH, P
 from fleet_service.fusion.weather import Reports, Weather, aged, no_reports, weather_of
 from fleet_service.fusion.window import Arrivals, Votes, absorb, commit
@@ -30,23 +33,41 @@ _ANY: Final = 1 << 62
 
 
 class Updated(NamedTuple):
-    """What became of observations: whether each was late or one too many, and so not fused (n,); weight that was used
-    (n,); slots that changed (k,)."""
+    """What became of observations (n,), and what changed.
+
+    Attributes:
+        late: whether each came after the checkpoint, or was one too many and so not fused.
+        late_by: how much later than its own a late one was fused [ns]; 0 for one in time or not fused.
+        weight: that was used; 0 where nothing was fused.
+        error: own error of its vehicle that was used, (n, 4), see `standing`.
+        slots: that changed, (k,).
+    """
 
     late: BoolArray
+    late_by: IntArray
     weight: Float32Array
+    error: Float32Array
     slots: IntArray
+
+
+class Before(NamedTuple):
+    """What `Updated` held the first time, when an archive is replayed."""
+
+    late: BoolArray
+    late_by: IntArray
+    weight: Float32Array
+    error: Float32Array
 
 
 class Fusion:
     """Beliefs of all cells, and what is needed to go on.
 
     Args:
-        lateness_s: L [s]; an observation older than the checkpoint is reported late and not fused.
+        lateness_s: L [s]; an observation older than the checkpoint is late, and fused as old news.
 
     Attributes:
         store: cells, windows, pairs and vehicles.
-        trusts: epoch from which they act, weights by vehicle, and that of an unknown vehicle; the oldest first.
+        standings: of the vehicles, the oldest first.
         reports: the weather that may still be asked for.
     """
 
@@ -55,13 +76,13 @@ class Fusion:
         self._kept_epochs = self._lateness_ns // c.EPOCH_NS + 2  # whose trust an observation in time may still need
         self._epoch: int | None = None
         self.store = Store()
-        self.trusts: list[tuple[int, Float32Array, float]] = [(-1, np.zeros(0, np.float32), newcomer(False))]
+        self.standings: list[Standing] = [first_standing(newcomer(False))]
         self.reports: Reports = no_reports()
         self._weather: Weather = weather_of(self.reports)
 
-    def resume(self, epoch: int | None, trusts: list[tuple[int, Float32Array, float]], reports: Reports) -> None:
-        """Go on from an epoch, the weights that were given since, and the weather; the store is set before."""
-        self._epoch, self.trusts, self.reports = epoch, trusts, reports
+    def resume(self, epoch: int | None, standings: list[Standing], reports: Reports) -> None:
+        """Go on from an epoch, the standings since, and the weather; the store is set before."""
+        self._epoch, self.standings, self.reports = epoch, standings, reports
         self._weather = weather_of(reports)
 
     @property
@@ -104,28 +125,43 @@ class Fusion:
         """First time [ns] of which no observation was taken yet; 0 before the first."""
         return 0 if self._epoch is None else (self._epoch + 1) * c.EPOCH_NS
 
-    def update(self, o: Observations, weight: Float32Array | None = None, late: BoolArray | None = None) -> Updated:
+    def update(self, o: Observations, before: Before | None = None) -> Updated:
         """Take in observations in any order.
+
+        A late one is taken at the checkpoint, as what it tells of the road at that time (`late.aged_evidence`).
 
         Args:
             o: the observations.
-            weight, late: what `Updated` held the first time, when an archive is replayed.
+            before: what `Updated` held the first time, when an archive is replayed.
         """
-        if late is None:
-            late = np.zeros(len(o.time), bool) if self.checkpoint is None else o.time < self.checkpoint
-        used = np.zeros(len(o.time), np.float32)
-        touched = [np.zeros(0, np.int64)]
+        n = len(o.time)
+        used, error = np.zeros(n, np.float32), unknown(n)
+        if before is None:
+            checkpoint = np.iinfo(np.int64).min if self.checkpoint is None else self.checkpoint
+            late = o.time < checkpoint
+            late_by = np.where(late & (checkpoint - o.time <= LATE_MOST_NS), fused_at(o.time, checkpoint) - o.time, 0)
+        else:
+            late, late_by = before.late, before.late_by
+        old = late_by > 0
+        if old.any():
+            o = delayed(o, late_by, self._weather)
+        left = late & ~old
         vehicle = self.store.vehicles_of(o.vehicle)
-        epoch = o.time // c.EPOCH_NS
-        for e in distinct(epoch[~late]).tolist():
+        epoch, touched = o.time // c.EPOCH_NS, [np.zeros(0, np.int64)]
+        for e in distinct(epoch[~left]).tolist():
             self._advance(e)
-            rows = np.flatnonzero((epoch == e) & ~late)
-            used[rows] = self._weights(e, vehicle[rows]) if weight is None else weight[rows]
-            slots, left_out = self._absorb(o, rows, vehicle, used, c.WAITING_MOST if weight is None else _ANY)
+            rows = np.flatnonzero((epoch == e) & ~left)
+            if before is None:
+                standing = self._standing(e)
+                used[rows], error[rows] = standing.weights(vehicle[rows]), standing.errors(vehicle[rows])
+            else:
+                used[rows], error[rows] = before.weight[rows], before.error[rows]
+            arrivals = _arrivals(o, vehicle, used, error, old)
+            slots, left_out = self._absorb(o, rows, arrivals, c.WAITING_MOST if before is None else _ANY)
             touched.append(slots)
-            late = late | left_out
-            used[left_out] = 0.0
-        return Updated(late, used, distinct(np.concatenate(touched)))
+            late, left = late | left_out, left | left_out
+        used[left], error[left], late_by = 0.0, np.array(UNKNOWN, np.float32), np.where(left, 0, late_by)
+        return Updated(late, late_by, used, error, distinct(np.concatenate(touched)))
 
     def update_weather(self, reports: Reports) -> None:
         """Take in weather; each report must act from `next_epoch` on at the earliest, or the map depends on when it
@@ -138,11 +174,11 @@ class Fusion:
 
     def beliefs(self, slots: IntArray, now: int) -> FloatArray:
         """Belief of each slot about its road, (k, 32), with what time did to it until `now` [ns]."""
-        return read(_beliefs(self.store.state.live, self._weather, slots, now))
+        return _beliefs(self.store.state.live, self._weather, KERNELS, slots, now)
 
     def believed(self, slots: IntArray) -> FloatArray:
         """Belief of each slot about its road, (k, 32), at its last observation."""
-        return read(self.live.belief[slots].astype(np.float64))
+        return _believed(self.store.state.live, KERNELS, slots)
 
     def slots_of(self, cell: IntArray, sector: IntArray | SmallArray) -> IntArray:
         """Slot of each cell and sector, -1 where nobody was."""
@@ -150,9 +186,15 @@ class Fusion:
 
     def trust(self, vehicle: int) -> float:
         """Weight of a vehicle's next vote."""
+        return float(self.standings[-1].weights(self._index(vehicle))[0])
+
+    def error(self, vehicle: int) -> dict[str, float]:
+        """What is known of a vehicle's own error, see `standing`."""
+        return dict(zip(ERRORS, self.standings[-1].errors(self._index(vehicle))[0].tolist(), strict=True))
+
+    def _index(self, vehicle: int) -> IntArray:
         index = self.store.known(np.array([vehicle]))
-        newest = self.trusts[-1][0]
-        return float(self._weights(newest, np.where(index < 0, self.store.vehicles, index))[0])
+        return np.where(index < 0, self.store.vehicles, index)
 
     def sources(self, slots: IntArray, side: int, since: IntArray | int) -> tuple[IntArray, IntArray]:
         """Corroborating sources: vehicles that reported GRIP or ICE of slots (k,) after `since` [ns] and are still
@@ -163,15 +205,12 @@ class Fusion:
         row, reporters = self.live.reporters[slots], self.store.state.live.reporters
         who = np.where(row[:, None] == NONE, NOBODY, reporters["source"][row, side])
         when = reporters["source_time"][row, side].astype(np.int64) * NS
-        trust = self._weights(self.trusts[-1][0], np.maximum(who, 0)) >= c.SOURCE_TRUST
+        trust = self.standings[-1].weights(np.maximum(who, 0)) >= c.SOURCE_TRUST
         counted = (who != NOBODY) & trust & (when > np.reshape(since, (-1, 1)))
         return counted.sum(axis=1), np.where(counted, when, 0).max(axis=1)
 
-    def _weights(self, epoch: int, vehicle: IntArray) -> Float32Array:
-        record = next(record for record in reversed(self.trusts) if record[0] <= epoch or record[0] < 0)
-        known, unknown = record[1], np.float32(record[2])
-        inside = vehicle < len(known)
-        return np.where(inside, np.append(known, unknown)[np.where(inside, vehicle, len(known))], unknown)
+    def _standing(self, epoch: int) -> Standing:
+        return next(found for found in reversed(self.standings) if found.epoch <= epoch or found.epoch < 0)
 
     def _advance(self, epoch: int) -> None:
         """Move T to `epoch`, one epoch at a time while the window holds anything."""
@@ -184,28 +223,36 @@ class Fusion:
             for due in store.due_windows(before):
                 commit(store.state, self._weather, store.peers, store.names, due, before)
             store.forget(before // NS)
-            weights = self.trusts[-1][1]
-            joined = np.full(store.vehicles - len(weights), newcomer(False), np.float32)
-            weights, established = trusted(store.peers, np.append(weights, joined))
-            record = (self._epoch, weights, newcomer(established))
-            self.trusts = [self.trusts[0], *self.trusts[1:][-self._kept_epochs :], record]
+            last = self.standings[-1]
+            joined = store.vehicles - len(last.weight)
+            weight = np.append(last.weight, np.full(joined, newcomer(False), np.float32))
+            standing = judged(
+                store.peers, last._replace(weight=weight, error=last.errors(np.arange(store.vehicles))), self._epoch
+            )
+            self.standings = [self.standings[0], *self.standings[1:][-self._kept_epochs :], standing]
 
     def _absorb(
-        self, o: Observations, rows: IntArray, vehicle: IntArray, weight: Float32Array, most: int
+        self, o: Observations, rows: IntArray, arrivals: Arrivals, most: int
     ) -> tuple[IntArray, BoolArray]:  # fmt: skip
         rows = rows[np.argsort(o.time[rows], kind="stable")]  # in the order of time nothing has to be computed anew
         at, keys, share = _votes(o, rows)
         slots = self.store.slots_for(keys)
         self.store.reserve(len(slots))
-        arrivals = Arrivals(
-            time=o.time, number=o.vehicle, boot=o.boot, sequence=o.sequence, vehicle=vehicle, weight=weight,
-            evidence=o.evidence, reported=o.reported,
-        )  # fmt: skip
         return slots, absorb(self.store.state, self._weather, arrivals, Votes(at, slots, share), most)
 
     def _oldest(self) -> int:
         times = self.live.time[: self.size]
         return int(times.min(initial=np.iinfo(np.int64).max, where=times > 0))
+
+
+def _arrivals(
+    o: Observations, vehicle: IntArray, weight: Float32Array, error: Float32Array, old: BoolArray
+) -> Arrivals:  # fmt: skip
+    return Arrivals(
+        time=o.time, number=o.vehicle, boot=o.boot, sequence=o.sequence, vehicle=vehicle, weight=weight,
+        evidence=o.evidence, reported=o.reported, used=(np.clip(o.used, 0.0, 2.5) * USED).astype(np.uint8),
+        shared=shared_parts(o.reported, error), manoeuvre=o.manoeuvre, error=classes(error), old=old,
+    )  # fmt: skip
 
 
 def _votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, Float32Array]:
@@ -234,7 +281,7 @@ def _recent(reports: Reports, oldest: int) -> Reports:
 
 
 @compiled
-def _beliefs(live: Rows, weather: Weather, slots: IntArray, now: int) -> FloatArray:
+def _beliefs(live: Rows, weather: Weather, kernels: Float32Array, slots: IntArray, now: int) -> FloatArray:
     belief, cells = live.belief, live.cells
     scratch = np.empty((3, SCRATCH))
     p = scratch[P]
@@ -242,9 +289,18 @@ def _beliefs(live: Rows, weather: Weather, slots: IntArray, now: int) -> FloatAr
     for k in range(len(slots)):
         slot = slots[k]
         unpack(belief, slot, p)
-        seconds = max((now - cells[slot].time) * 1e-9, 0.0) + cells[slot].aged
+        seconds = max((now - cells[slot].time) * 1e-9, 0.0) + cells[slot].aged / AGED
         drift, change, prior = aged(weather, cells[slot].key, now - int(seconds * NS), now)
         forget(p, drift, change, weather.prior[prior], scratch[PADDED])
-        for i in range(belief.shape[1]):
-            out[k, i] = p[i]
+        read_road(kernels, cells, slot, p, out[k])
+    return out
+
+
+@compiled
+def _believed(live: Rows, kernels: Float32Array, slots: IntArray) -> FloatArray:
+    p = np.empty(live.belief.shape[1])
+    out = np.empty((len(slots), live.belief.shape[1]))
+    for k in range(len(slots)):
+        unpack(live.belief, slots[k], p)
+        read_road(kernels, live.cells, slots[k], p, out[k])
     return out

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fleet_service.fusion.belief import PackedArray
 from fleet_service.fusion.fuse import Fusion
+from fleet_service.fusion.standing import ERRORS, Standing
 from fleet_service.fusion.store.cells import no_beliefs, rows_of_lines
 from fleet_service.fusion.store.records import (
     CELL,
@@ -62,14 +63,19 @@ def image_of(fusion: Fusion) -> Image:
     image["free_entries"] = {"row": state.free_entries[: int(state.used[FREE_ENTRIES])]}
     image["used"] = {"count": state.used, "more": np.array([store.size, store.vehicles, store.hour, fusion.epoch])}
     image["trust"] = {
-        "epoch": np.concatenate([np.full(len(weights), epoch) for epoch, weights, _ in fusion.trusts]),
-        "weight": np.concatenate([weights for _, weights, _ in fusion.trusts]),
-    }
+        "epoch": np.concatenate([np.full(len(standing.weight), standing.epoch) for standing in fusion.standings]),
+        "weight": np.concatenate([standing.weight for standing in fusion.standings]),
+    } | {
+        name: np.concatenate([standing.error[:, k] for standing in fusion.standings])
+        for k, name in enumerate(ERRORS)
+    }  # fmt: skip
     image["trusts"] = {
-        "epoch": np.array([epoch for epoch, _, _ in fusion.trusts]),
-        "vehicles": np.array([len(weights) for _, weights, _ in fusion.trusts]),
-        "newcomer": np.array([newcomer for _, _, newcomer in fusion.trusts]),
-    }
+        "epoch": np.array([standing.epoch for standing in fusion.standings]),
+        "vehicles": np.array([len(standing.weight) for standing in fusion.standings]),
+        "newcomer": np.array([standing.newcomer for standing in fusion.standings]),
+    } | {
+        name: np.array([standing.newcomer_error[k] for standing in fusion.standings]) for k, name in enumerate(ERRORS)
+    }  # fmt: skip
     reports = fusion.reports
     image["weather"] = {f.name: getattr(reports, f.name).reshape(-1) for f in fields(Reports)}
     return {name: {key: column.copy() for key, column in table.items()} for name, table in image.items()}
@@ -90,11 +96,13 @@ def fusion_of(image: Image, lateness_s: float) -> Fusion:
     fusion.store = Store.of(state, records["peers"], records["names"], size, vehicles, hour)
     ends = np.cumsum(image["trusts"]["vehicles"])[:-1]
     weights = np.split(image["trust"]["weight"], ends)
+    errors = np.split(np.stack([image["trust"][name] for name in ERRORS], axis=1), ends)
     epochs, newcomers = image["trusts"]["epoch"].tolist(), image["trusts"]["newcomer"].tolist()
-    trusts = list(zip(epochs, weights, newcomers, strict=True))
+    first = np.stack([image["trusts"][name] for name in ERRORS], axis=1)
+    standings = [Standing(*of) for of in zip(epochs, weights, errors, newcomers, first, strict=True)]
     columns = {f.name: image["weather"][f.name] for f in fields(Reports)}
     columns["prior"] = columns["prior"].reshape(-1, mugrid.BINS)
-    fusion.resume(None if epoch < 0 else epoch, trusts, Reports(**columns))
+    fusion.resume(None if epoch < 0 else epoch, standings, Reports(**columns))
     return fusion
 
 

@@ -11,18 +11,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.normal import log_distribution
-from fleet_service.fusion.shape import Evidence, unshaped
+from fleet_service.fusion.reported import Evidence, as_reported
 from schemas import mugrid
 from schemas.numeric import BoolArray, ByteArray, FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import Z_95
+
+_LESS: Final = 0.5 * c.UTILISED_STD
 
 
 def evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) -> Evidence:
@@ -32,12 +34,12 @@ def evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) ->
         columns: `log_likelihood` (n, 32); `mu`, `mu_lower`, `mu_upper`, `mu_utilised`, each (n,), NaN where absent.
         with_likelihood: (n,) whether the sender gave a likelihood.
 
-    A likelihood that falls towards the upper end is a value, any other a bound; see `shape.unshaped` and `levelled`.
+    A likelihood that falls towards the upper end is a value, any other a bound; see `levelled`.
     A posterior counts as a value where `mu_utilised ≥ 0.6·mu`; otherwise, and where there is no `mu`, only "at least
     mu_utilised" remains. A visit with none of them is flat.
     """
     sent = columns["log_likelihood"]
-    steps, reported = unshaped(sent, columns["mu_utilised"])
+    steps, reported = as_reported(sent)
     out = levelled(steps, columns["mu_utilised"])
     rest = np.flatnonzero(~with_likelihood)
     if len(rest):
@@ -46,14 +48,16 @@ def evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) ->
         )
         value = used >= c.VALUE_UTILISATION * mu  # False where either is NaN
         log_likelihood = np.where(value[:, None], posterior(mu, lower, upper), at_least(used))
-        out[rest] = mugrid.encode_log_likelihood(log_likelihood)
+        steps, reported[rest] = as_reported(mugrid.encode_log_likelihood(log_likelihood))
+        out[rest] = levelled(steps, used)
     return Evidence(out, reported)
 
 
 def levelled(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
     """Likelihoods (n, 32) that claim no more than the grip used (n,) supports.
 
-    A bound is made flat above `used`. A value stays as it is, and so does everything where `used` is NaN.
+    A bound is made flat from the bin on that holds `used` less half its own error: a hundred of them then leave a lower
+    end of .95·used + .04 at most. A value stays as it is, and so does everything where `used` is NaN.
     """
     out = steps.copy()
     _level(out, np.asarray(used, np.float64))
@@ -65,10 +69,10 @@ def _level(steps: ByteArray, used: FloatArray) -> None:
     for n in range(len(steps)):
         if math.isnan(used[n]) or steps[n, mugrid.BINS - 1] >= c.VALUE_DROP_STEPS:
             continue
-        place = min(max(np.searchsorted(mugrid.EDGES, used[n]) - 1, 0), mugrid.BINS - 1)
+        place = min(max(np.searchsorted(mugrid.EDGES, used[n] - _LESS) - 1, 0), mugrid.BINS - 1)
         floor = steps[n, : place + 1].min()
         for i in range(mugrid.BINS):
-            steps[n, i] = 0 if used[n] <= mugrid.CENTRES[i] else max(steps[n, i], floor) - floor
+            steps[n, i] = 0 if i >= place else max(steps[n, i], floor) - floor
 
 
 def at_least(used: FloatArray) -> FloatArray:

@@ -10,12 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.fusion.likelihoods import evidence
+from fleet_service.fusion.shared import manoeuvre_of
 from fleet_service.fusion.space import other_cells
 from schemas import grid
 from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray
 
 SmallArray = NDArray[np.int8]
 ROWS_PER_SEQ: Final = 64  # more than a batch has rows: seq and row become one number that keeps their order
+UNTOLD_SHARE: Final = 0.5  # of a value's μ, where a sender does not tell what it used: shyly, less than an excited one
+USED_MOST: Final = 2.0  # of the grip, as in the contract
 _US: Final = 1000  # ns: the archive keeps whole microseconds
 
 
@@ -31,6 +34,8 @@ class Observations:
         evidence: (n, 32) log-likelihood in steps, see `likelihoods.evidence`.
         reported: (n, 3) mean, standard deviation and P(slippery) of a value as it was reported, NaN to read them in
             `evidence`.
+        used: (n,) grip used; below EXCITED_SHARE of a value where the sender does not tell.
+        manoeuvre: (n,) how it was used, see `shared.manoeuvre_of`.
         other: (n, k) other cells in which the vehicle may have been instead, -1 where there is none.
         other_share: (n, k) probability that it was there; what is left belongs to `cell`.
     """
@@ -45,6 +50,8 @@ class Observations:
     sequence: IntArray
     evidence: ByteArray
     reported: Float32Array
+    used: Float32Array
+    manoeuvre: SmallArray
     other: IntArray
     other_share: Float32Array
 
@@ -65,6 +72,7 @@ def observations_of(columns: Mapping[str, NDArray[Any]], vehicle: IntArray) -> O
     _, second = grid.sectors_touched(np.nan_to_num(columns["yaw"]))
     first = columns["sector"].astype(np.int8)
     steps, reported = evidence(columns, columns["with_likelihood"])
+    used = np.where(np.isnan(columns["mu_utilised"]), UNTOLD_SHARE * reported[:, 0], columns["mu_utilised"])
     other, share = other_cells(columns["cell"], columns["latitude"], columns["yaw"], columns["position_std"])
     return Observations(
         time=columns["leave_time"] // _US * _US,
@@ -77,6 +85,8 @@ def observations_of(columns: Mapping[str, NDArray[Any]], vehicle: IntArray) -> O
         sequence=columns["seq"] * ROWS_PER_SEQ + columns["row"],
         evidence=steps,
         reported=reported,
+        used=np.clip(np.nan_to_num(used), 0.0, USED_MOST).astype(np.float32),
+        manoeuvre=manoeuvre_of(columns["used_longitudinal"], columns["used_lateral"]),
         other=other,
         other_share=share,
     )

@@ -1,29 +1,57 @@
-"""Reputation: how well a vehicle's values agree with those of others in the same cells. Pure, compiled where per row.
+"""What vehicles are worth, from what others found in the same cells. Pure, compiled where per row.
 
 Each vehicle keeps a table of the others that it met: how often (`met`) and how well they agreed (`agreed`). Every other
 one counts once, however often they met, and in the measure of its own trust. So a group that agrees only with itself is
 as large as the number of its members and no larger, in however many cells it drives alone; and once the many distrust
 it, its word about others is worth nothing.
 
+Values of trusted vehicles that agree tell of each other's errors too. Of the relative differences d of a pair the mean
+is the difference of their biases; the fleet's biases are a normal of FLEET_BIAS about nought, which anchors what only
+differences show. What the differences of those who did the same scatter beyond the biases, against what both state, is
+their spread: more than one, and they are surer than they should be; less, and the rest of what they state is an error
+that they share (`shared`). And where who used more of the grip reads more, all read too low who used little: that slope
+is the fleet's, for one estimator and one kind of tyre have one shape.
+
 Legend
     q    agreement of two values: 1 within PEERS_AGREE standard deviations, 0 from PEERS_DISAGREE on
     ā    mean q of a pair of vehicles over their last meetings
     m    how much the other counts: its trust, TRUST_HEARD_LEAST at least
-    T    trust, clip(((a₀ + Σ m·ā) / (n₀ + Σ m) - TRUST_NONE) / (TRUST_FULL - TRUST_NONE), 0, 1)
+    g    share that agreed, (a₀ + Σ m·ā) / (n₀ + Σ m)
+    T    trust, clip((g - TRUST_NONE) / (TRUST_FULL - TRUST_NONE), 0, 1)
+    r    weight: T·min(g, 1 - CONTAMINATION_LEAST) / (1 - CONTAMINATION), T at the least known
+    b    bias, mean of d + b_other by weight 1/(σ_d²/n + σ_b_other²), and 1/FLEET_BIAS² of nought
 """
 
 from __future__ import annotations
 
 import math
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.store.records import NOBODY
+from fleet_service.fusion.standing import Standing
+from fleet_service.fusion.store.records import NOBODY, USED
+from schemas import mugrid
 from schemas.numeric import BoolArray, Float32Array, FloatArray
 from schemas.runtime.jit import refcount_free
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS
+
+_LEAST_VARIANCE: Final = 1e-4  # nobody reads to a hundredth
+
+
+class Comparison(NamedTuple):
+    """A comparison: agreement, relative differences of the values and of the grip used, variance that both state of the
+    first; 0 where the values are not of one road; whether both did the same, and whether both are so sure of themselves
+    that the shape of their tyres is not in what they state."""
+
+    agreement: float
+    difference: float
+    used: float
+    variance: float
+    alike: bool
+    shaped: bool
 
 
 @refcount_free
@@ -32,13 +60,16 @@ def compare(
 ) -> None:  # fmt: skip
     """Compare a value with those that others gave here lately; it takes the place of its vehicle's own, or the oldest.
 
-    `names` (V,) are the vehicles' numbers, by index. Who was more probably elsewhere is compared with nobody.
+    `names` (V,) are the vehicles' numbers, by index. Who was more probably elsewhere, or comes late, is compared with
+    nobody.
     """
     here = reporters[row]
-    if entries[entry].share < c.HERE_SHARE:
+    if entries[entry].share < c.HERE_SHARE or entries[entry].old:
         return
     vehicle, now = int(entries[entry].vehicle), entries[entry].time // NS
     mean, std = float(entries[entry].mean), float(entries[entry].std)
+    used, manoeuvre = entries[entry].used / USED, int(entries[entry].manoeuvre)
+    own = _own_variance(mean, std) if entries[entry].weight >= c.TELLING_TRUST else 0.0
     reporter, reported = here.reporter, here.time
     place = 0
     for k in range(c.REPORTERS):
@@ -51,18 +82,35 @@ def compare(
         other = int(reporter[k])
         if other == NOBODY or other == vehicle or now - reported[k] > c.PEER_S:  # noqa: SIM109 not known to the compiler
             continue
-        spread = math.hypot(std, float(here.std[k]))
+        spread = math.hypot(max(std, c.NOVELTY_STD), max(float(here.std[k]), c.NOVELTY_STD))
         if spread > c.PEER_STD:
             continue
         deviations = abs(mean - here.mean[k]) / spread
         agreement = (c.PEERS_DISAGREE - deviations) / (c.PEERS_DISAGREE - c.PEERS_AGREE)
         agreement = min(max(agreement, 0.0), 1.0)
-        _note(peers, vehicle, other, _rank(names[vehicle].key, names[other].key), agreement)
-        _note(peers, other, vehicle, _rank(names[other].key, names[vehicle].key), agreement)
+        both = 0.5 * (mean + here.mean[k])
+        variance = own + here.own[k] if own > 0.0 and here.own[k] > 0.0 and agreement > 0.0 else 0.0
+        alike = manoeuvre == here.manoeuvre[k] and abs(used - here.used[k]) < c.ALIKE_USED * both
+        shaped = max(own, here.own[k]) < c.SHAPED_VARIANCE
+        found = Comparison(
+            agreement, (mean - here.mean[k]) / both, (used - here.used[k]) / both, variance, alike, shaped
+        )
+        opposite = Comparison(agreement, -found.difference, -found.used, variance, alike, shaped)
+        _note(peers, vehicle, other, _rank(names[vehicle].key, names[other].key), found)
+        _note(peers, other, vehicle, _rank(names[other].key, names[vehicle].key), opposite)
     reporter[place] = vehicle
     reported[place] = now
     here.mean[place] = mean
     here.std[place] = std
+    here.own[place] = own
+    here.used[place] = used
+    here.manoeuvre[place] = manoeuvre
+
+
+@refcount_free
+def _own_variance(mean: float, std: float) -> float:
+    """Relative variance of a value beside its bias."""
+    return max((std / max(mean, mugrid.LOWER)) ** 2 - c.BIAS_RELATIVE**2, _LEAST_VARIANCE)
 
 
 @refcount_free
@@ -78,41 +126,111 @@ def _rank(vehicle: int, other: int) -> int:
 
 
 @refcount_free
-def _note(peers: RecordArray, vehicle: int, other: int, rank: int, agreement: float) -> None:
+def _note(peers: RecordArray, vehicle: int, other: int, rank: int, found: Comparison) -> None:
+    this, variance = peers[vehicle], found.variance
+    agreement, difference = found.agreement, found.difference
+    if variance > 0.0 and found.alike:
+        this.stated += np.float32(variance)
+        this.found += np.float32(difference * difference - 2.0 * c.BIAS_RELATIVE**2)
+        if this.stated > c.SPREAD_MEMORY:
+            this.stated *= np.float32(0.5)
+            this.found *= np.float32(0.5)
+    if variance > 0.0 and found.shaped:
+        this.used_squares += np.float32((found.used * found.used - 2.0 * c.USED_NOISE**2) / variance)
+        this.used_products += np.float32(found.used * difference / variance)
+        if this.used_squares > c.SLOPE_MEMORY:
+            this.used_squares *= np.float32(0.5)
+            this.used_products *= np.float32(0.5)
     place = rank % c.PEERS
-    known = peers[vehicle].other[place]
+    known = this.other[place]
     if known != other:
-        if known != NOBODY and peers[vehicle].rank[place] < rank:
+        if known != NOBODY and this.rank[place] < rank:
             return
-        peers[vehicle].rank[place] = rank
-        peers[vehicle].other[place] = other
-        peers[vehicle].agreed[place] = 0.0
-        peers[vehicle].met[place] = 0.0
-    peers[vehicle].agreed[place] += agreement
-    peers[vehicle].met[place] += 1.0
-    if peers[vehicle].met[place] > c.PEER_MEMORY:
-        peers[vehicle].agreed[place] *= 0.5
-        peers[vehicle].met[place] *= 0.5
+        this.rank[place] = rank
+        this.other[place] = other
+        this.agreed[place] = 0.0
+        this.met[place] = 0.0
+        this.weight[place] = 0.0
+        this.difference[place] = 0.0
+    this.agreed[place] += agreement
+    this.met[place] += 1.0
+    if this.met[place] > c.PEER_MEMORY:
+        this.agreed[place] *= 0.5
+        this.met[place] *= 0.5
+    if variance > 0.0:
+        this.weight[place] += np.float32(1.0 / variance)
+        this.difference[place] += np.float32(difference / variance)
+        if this.weight[place] > c.BIAS_MEMORY:
+            this.weight[place] *= np.float32(0.5)
+            this.difference[place] *= np.float32(0.5)
 
 
-def trusted(peers: RecordArray, before: Float32Array) -> tuple[Float32Array, bool]:
-    """Trust of each vehicle, (V,), from whom it met and their trust `before`, (V,); whether the service is established.
+def judged(peers: RecordArray, before: Standing, epoch: int) -> Standing:
+    """Standing of the vehicles (V,) from an epoch on, from whom they met and how these stood `before`.
 
-    In an established one, who has met few that are trusted is a newcomer.
+    In an established service, who has met few that are trusted is a newcomer.
     """
-    vehicles = len(before)
-    other, met = peers["other"][:vehicles], peers["met"][:vehicles].astype(np.float64)
-    theirs = np.maximum(before.astype(np.float64), c.TRUST_HEARD_LEAST)[np.maximum(other, 0)]
-    weight = np.where(other != NOBODY, theirs, 0.0) * np.minimum(met, 1.0)
+    vehicles = len(before.weight)
+    other = peers["other"][:vehicles]
+    heard_of, index = other != NOBODY, np.maximum(other, 0)
+    met = peers["met"][:vehicles].astype(np.float64)
+    theirs = np.maximum(np.minimum(before.weight.astype(np.float64), 1.0), c.TRUST_HEARD_LEAST)[index]
+    weight = np.where(heard_of, theirs, 0.0) * np.minimum(met, 1.0)
     agreement = peers["agreed"][:vehicles] / np.maximum(met, 1.0)
     heard = weight.sum(axis=1)
     mean = (c.TRUST_PRIOR * c.TRUST_PRIOR_PEERS + (weight * agreement).sum(axis=1)) / (c.TRUST_PRIOR_PEERS + heard)
     trust = _scaled(mean)
     known: BoolArray = heard >= c.ESTABLISHED_PEERS
     established = int((known & (trust >= c.SOURCE_TRUST)).sum()) >= c.ESTABLISHED_VEHICLES
+    proven = np.clip(np.minimum(mean, 1.0 - c.CONTAMINATION_LEAST) / (1.0 - c.CONTAMINATION), 1.0, None)
+    trust = trust * np.where(known, proven, 1.0)
     if established:
         trust = np.where(known, trust, np.minimum(trust, c.NEWCOMER))
-    return trust.astype(np.float32), established
+    error, fleet = _errors(peers[:vehicles], before, np.where(heard_of, np.minimum(before.weight[index], 1.0), 0.0))
+    return Standing(epoch, trust.astype(np.float32), error, newcomer(established), fleet)
+
+
+def _errors(peers: RecordArray, before: Standing, trust: FloatArray) -> tuple[Float32Array, Float32Array]:
+    """Bias, how well it is known, spread, slope, (V, 4), and those of a newcomer, (4,); `trust`: of the peers."""
+    index = np.maximum(peers["other"], 0)
+    weight = peers["weight"].astype(np.float64)
+    theirs = before.error[index].astype(np.float64)
+    precision = trust * np.where(
+        weight > 0.0, 1.0 / (1.0 / np.maximum(weight, 1e-9) + c.BIAS_PAIR**2 + theirs[..., 1] ** 2), 0.0
+    )
+    told = peers["difference"] / np.maximum(weight, 1e-9) + theirs[..., 0]
+    whole = precision.sum(axis=1) + 1.0 / c.FLEET_BIAS**2
+    bias = (precision * told).sum(axis=1) / whole
+    std = np.maximum(np.sqrt(1.0 / whole), c.BIAS_KNOWN_LEAST)
+    known = (precision.sum(axis=1) > 0.0) & (std < c.BIAS_RELATIVE)
+    own = np.minimum(before.weight.astype(np.float64), 1.0)
+    spread, slope = _spread(peers, own, peers), _slope(peers, own)
+    error = np.stack(
+        [
+            np.where(known, np.clip(bias, -c.BIAS_MOST, c.BIAS_MOST), 0.0), np.where(known, std, c.BIAS_RELATIVE),
+            spread, np.full(len(bias), slope),
+        ],
+        axis=1,
+    )  # fmt: skip
+    fleet = np.array([0.0, c.BIAS_RELATIVE, _spread(peers, own, None)[0], slope])
+    return error.astype(np.float32), fleet.astype(np.float32)
+
+
+def _spread(peers: RecordArray, trust: FloatArray, of: RecordArray | None) -> FloatArray:
+    """κ of vehicles (V,), or of a newcomer (1,): the fleet's until they are known, and that SPREAD_FIRST at first."""
+    prior = c.SPREAD_PRIOR
+    fleet = (c.SPREAD_FIRST**2 * prior + (trust * peers["found"]).sum()) / (prior + (trust * peers["stated"]).sum())
+    found, stated = (0.0, 0.0) if of is None else (of["found"].astype(np.float64), of["stated"].astype(np.float64))
+    squared = (max(fleet, c.SPREAD_FLOOR**2) * prior + found) / (prior + stated)
+    return np.atleast_1d(np.sqrt(np.clip(squared, c.SPREAD_FLOOR**2, c.SPREAD_CEILING**2)))
+
+
+def _slope(peers: RecordArray, trust: FloatArray) -> float:
+    """How much too low the fleet's values are for each μ that was left: regression of the differences of values upon
+    those of the grip used, in the same places; each vehicle counts in the measure of its trust."""
+    squares = np.maximum((trust * peers["used_squares"]).sum(), 0.0) + 1.0 / c.SLOPE_STD**2
+    products = (trust * peers["used_products"]).sum() + c.SLOPE_PRIOR / c.SLOPE_STD**2
+    return float(np.clip(products / squares, 0.0, c.SLOPE_MOST))
 
 
 def newcomer(established: bool) -> float:

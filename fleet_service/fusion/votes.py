@@ -13,6 +13,7 @@ from fleet_service.fusion.belief import (
     REACH,
     VALUE,
     Bins,
+    OwnError,
     convolve_bias,
     describe,
     ensure_change,
@@ -24,8 +25,10 @@ from fleet_service.fusion.belief import (
     unpack,
     vote,
 )  # fmt: skip
+from fleet_service.fusion.shared import fade, note_value
+from fleet_service.fusion.standing import BIAS_STEP, SLOPE_STEP
 from fleet_service.fusion.store.pairs import returning
-from fleet_service.fusion.store.records import FINE, GRIP, ICE, NONE, SOURCES, Rows
+from fleet_service.fusion.store.records import AGED, FINE, GRIP, ICE, NONE, SOURCES, UNTRUSTED, USED, Rows
 from fleet_service.fusion.weather import Weather, aged
 from schemas import mugrid
 from schemas.numeric import Float32Array
@@ -51,12 +54,11 @@ def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scra
     evidence, likelihood = entries[entry].evidence, scratch[LIKELIHOOD]
     known = not math.isnan(reported[0])
     kind = VALUE if known else kind_of(evidence)
-    _clear(scratch)
-    convolve_bias(evidence, kind, scratch[PADDED], likelihood)
     entries[entry].kind = kind
+    load_likelihood(entries, entry, scratch)
     if known:
         entries[entry].mean = reported[0]
-        entries[entry].std = max(reported[1], np.float32(c.NOVELTY_STD))
+        entries[entry].std = reported[1]
         entries[entry].slippery = reported[2]
         return
     mean = mean_of(likelihood)
@@ -64,7 +66,7 @@ def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scra
     entries[entry].slippery = 0.0 if mean >= _GRIP_MEAN else _NEITHER
     if kind == VALUE:
         std, slippery = describe(likelihood, mean)
-        entries[entry].std = max(std, c.NOVELTY_STD)
+        entries[entry].std = std
         entries[entry].slippery = slippery
 
 
@@ -72,7 +74,11 @@ def describe_vote(entries: RecordArray, entry: int, reported: Float32Array, scra
 def load_likelihood(entries: RecordArray, entry: int, scratch: Bins) -> None:
     """The likelihood of an entry into the scratch again."""
     _clear(scratch)
-    convolve_bias(entries[entry].evidence, int(entries[entry].kind), scratch[PADDED], scratch[LIKELIHOOD])
+    this = entries[entry]
+    own = OwnError(
+        this.bias * BIAS_STEP, int(this.bias_class), int(this.spread_class), this.slope * SLOPE_STEP, this.used / USED
+    )  # fmt: skip
+    convolve_bias(this.evidence, int(this.kind), own, scratch[PADDED], scratch[LIKELIHOOD])
 
 
 @refcount_free_inlined
@@ -103,7 +109,7 @@ def discount(entries: RecordArray, pairs: RecordArray, entry: int) -> None:
         seen = seen or pairs[pair].time[BOUND] >= max(least, 1) or pairs[pair].time[VALUE] >= max(least, 1)
         time, mean = int(pairs[pair].time[kind]), _coarse(pairs[pair].mean[kind])
         std, spent = _coarse(pairs[pair].std), _coarse(pairs[pair].spent[kind])
-    new_mean, new_std = entries[entry].mean, entries[entry].std
+    new_mean, new_std = entries[entry].mean, max(entries[entry].std, np.float32(c.NOVELTY_STD))
     power = np.float32(1.0)
     if time > 0 and time >= least:
         renewed = -math.expm1(-max(now - time, 0) / c.VOTE_RENEWAL_S)
@@ -162,30 +168,46 @@ def update(
             mix(p, 1.0, weather.prior[prior])
     else:
         passed = (time - cells[row].time) * 1e-9
-        seconds = max(passed, 0.0) + cells[row].aged
+        seconds = max(passed, 0.0) + cells[row].aged / AGED
+        fade(cells, row, cells[row].time, time)
     change, prior = 0.0, 0
-    cells[row].aged = seconds
+    cells[row].aged = _aged(seconds)
     if seconds >= c.FORGET_S:
         drift, change, prior = aged(weather, key, time - int(seconds * NS), time)
         forget(p, drift, change, weather.prior[prior], scratch[PADDED])
-        cells[row].aged = 0.0
+        cells[row].aged = np.uint16(0)
     weight = float(entries[entry].weight)
-    if 0.0 < weight < c.SOURCE_TRUST or cells[row].untrusted[0] + cells[row].untrusted[1] > 0.0:
-        weight = _untrusted_weight(cells, row, kind, float(entries[entry].power), weight, passed)
+    if 0.0 < weight < c.SOURCE_TRUST or cells[row].untrusted[0] + cells[row].untrusted[1] > 0:
+        weight = _untrusted_weight(cells, row, kind, float(entries[entry].power), weight)
     strength = weight * entries[entry].power * entries[entry].share
     if kind == VALUE and not new:
-        ensure_change(p, change, strength, weather.prior[prior])
-    vote(p, scratch[LIKELIHOOD], (1.0 - c.CONTAMINATION) * strength)
+        ensure_change(p, change, min(strength, 1.0), weather.prior[prior])
+    vote(p, scratch[LIKELIHOOD], min((1.0 - c.CONTAMINATION) * strength, 1.0 - c.CONTAMINATION_LEAST))
     pack(p, belief, row)
     cells[row].time = time
     _count(cells, row, entries, entry)
     if kind == VALUE:
         cells[row].values += np.float32(strength)
+        if strength > 0.0:
+            note_value(cells, row, entries, entry, strength)
     if weight * entries[entry].share >= c.SOURCE_TRUST:
-        if entries[entry].slippery >= c.SOURCE_SHARE:
+        if entries[entry].slippery >= c.SOURCE_SHARE and _witnesses(entries, entry):
             _note_source(rows.reporters, sources, ICE, entries[entry].vehicle, time)
         elif entries[entry].slippery <= 1.0 - c.SOURCE_SHARE:
             _note_source(rows.reporters, sources, GRIP, entries[entry].vehicle, time)
+
+
+@refcount_free_inlined
+def _aged(seconds: float) -> np.uint16:
+    """Time that is not forgotten yet in parts of 1/AGED; it counts below FORGET_S only."""
+    return np.uint16(min(seconds, c.FORGET_S) * AGED + 0.5)
+
+
+@refcount_free_inlined
+def _witnesses(entries: RecordArray, entry: int) -> bool:
+    """Whether a value of ice counts for an alert: from a vehicle with a record, or near the limit of what it says."""
+    near = entries[entry].used >= c.WITNESS_SHARE * USED * entries[entry].mean
+    return bool(near or entries[entry].weight >= c.TELLING_TRUST)
 
 
 @refcount_free_inlined
@@ -205,18 +227,15 @@ def _count(cells: RecordArray, row: int, entries: RecordArray, entry: int) -> No
 
 
 @refcount_free_inlined
-def _untrusted_weight(cells: RecordArray, row: int, kind: int, power: float, weight: float, passed: float) -> float:
+def _untrusted_weight(cells: RecordArray, row: int, kind: int, power: float, weight: float) -> float:
     """Weight of a vote among others that are not trusted either: the k-th new one counts 1/k², all together 1.6 votes.
 
     So names cost nothing and bring nothing. A vehicle's repeated vote is discounted by its `power` already.
     """
-    left = np.float32(math.exp(-max(passed, 0.0) / c.VOTE_RENEWAL_S))
-    cells[row].untrusted[BOUND] *= left
-    cells[row].untrusted[VALUE] *= left
     if not 0.0 < weight < c.SOURCE_TRUST:
         return weight
-    others = cells[row].untrusted[kind]
-    cells[row].untrusted[kind] = others + np.float32(power)
+    others = np.float32(cells[row].untrusted[kind] / UNTRUSTED)
+    cells[row].untrusted[kind] = np.uint16(min(float(others + power) * UNTRUSTED + 0.5, 65535.0))
     return weight / float((np.float32(1.0) + others) ** 2)
 
 

@@ -30,7 +30,9 @@ WET_DRIFT: Final = 2.0
 FREEZING_C: Final = (-4.0, 1.0)  # road; below, snow is dry and the road keeps
 AIR_ABOVE_ROAD_C: Final = 2.0  # a road radiates: so much colder than the air on a clear night
 FREEZING_CHANGE: Final = 8.0
-FROST_CHANGE: Final = 2.0  # around freezing without precipitation: rime, and meltwater that freezes again
+# Around freezing without precipitation: dew and meltwater freeze as fast, and no gauge tells of them. With less a road
+# that was dry was called safe half an hour after black ice came under drivers who use a fifth of the grip.
+FROST_CHANGE: Final = 8.0
 # Warm and dry nothing comes over a road but dirt: it keeps twice as long. Not more: a gauge is not on this road.
 STEADY_CHANGE: Final = 0.5
 STEADY_C: Final = 5.0

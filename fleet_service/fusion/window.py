@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fleet_service.fusion.belief import VALUE, Bins
 from fleet_service.fusion.store.cells import copy_row, copy_sources
@@ -37,7 +38,8 @@ from schemas.runtime.records import RecordArray
 class Arrivals(NamedTuple):
     """A batch of observations, arrays of shape (n,): see `Observations`.
 
-    `vehicle` is the index of the vehicle, `number` its number; `weight` is the trust in it.
+    `vehicle` is the index of the vehicle, `number` its number; `weight` is the trust in it, `error` (n, 4) what is
+    known of its own error (`standing.classes`), `used` and `shared` as an entry has them; `old` came late.
     """
 
     time: IntArray
@@ -48,6 +50,11 @@ class Arrivals(NamedTuple):
     weight: Float32Array
     evidence: ByteArray
     reported: Float32Array
+    used: ByteArray
+    shared: ByteArray
+    manoeuvre: NDArray[np.int8]
+    error: NDArray[np.int8]
+    old: BoolArray
 
 
 class Votes(NamedTuple):
@@ -134,6 +141,10 @@ def _enter(state: State, arrivals: Arrivals, row: int) -> int:
     new.number, new.boot, new.sequence = arrivals.number[row], arrivals.boot[row], arrivals.sequence[row]
     for i in range(arrivals.evidence.shape[1]):
         new.evidence[i] = arrivals.evidence[row, i]
+    new.used, new.shared = arrivals.used[row], arrivals.shared[row]
+    new.manoeuvre, new.old = arrivals.manoeuvre[row], arrivals.old[row]
+    new.bias, new.bias_class, new.spread_class = arrivals.error[row, 0], arrivals.error[row, 1], arrivals.error[row, 2]
+    new.slope = arrivals.error[row, 3]
     return entry
 
 

@@ -19,7 +19,7 @@ stays within half a nat (contract of the log-likelihood). Both are rounded to th
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.random import Generator
@@ -31,10 +31,10 @@ from schemas.thresholds import EXCITED_SHARE
 
 BIAS_RELATIVE: Final = 0.05
 BIAS_ABSOLUTE: Final = 0.015
-# What all vehicles of a place share, relative: in six end-to-end drives (real estimator) cells of 20 and more
-# excited vehicles err about the mean of their surface by .059 dry, .046 wet and .044 snow (robust standard deviations;
-# plain ones are .088, .088 and .066).
-COMMON: Final = 0.05
+# What all vehicles of a place share, relative; more than half of it is the manoeuvre's. In six end-to-end
+# drives (real estimator) cells of 20 and more excited vehicles erred about the mean of their surface by .059 dry, .046
+# wet and .044 snow (robust standard deviations; plain ones were .088, .088 and .066).
+COMMON: Final = 0.05  # hypot(common, by_manoeuvre) of CLEAN
 NOISE_ABSOLUTE: Final = 0.02
 NOISE_AT_LIMIT: Final = 0.05  # relative
 NOISE_PER_SHARE: Final = 0.10  # ... more for each share that was left: .09 at EXCITED_SHARE
@@ -45,6 +45,37 @@ OVERCONFIDENT_STD: Final = 0.02  # of a liar
 BOUND_STD: Final = 0.05  # what the agent admits
 
 
+class ErrorModel(NamedTuple):
+    """How a fleet errs; the first fleet's as default.
+
+    Attributes:
+        bias: standard deviation of the vehicles' relative errors.
+        common: of what all vehicles of a place share, relative.
+        by_manoeuvre: of what those share who do the same there, relative.
+        tails: degrees of freedom of a visit's noise, Student's; infinite: normal.
+        stated: standard deviation that a vehicle states over the one it has.
+        share: of the grip, least and most, that an excited visit uses.
+        low: how much too low a value reads, for each share of the grip that was left.
+        tyres: relative error of all tyres of the fleet.
+        half: further relative error of every second vehicle.
+        alike: share of the passes of a place that do what most do there.
+    """
+
+    bias: float = BIAS_RELATIVE
+    common: float = 0.03
+    by_manoeuvre: float = 0.04
+    tails: float = np.inf
+    stated: float = 1.0
+    share: tuple[float, float] = (EXCITED_SHARE, 1.0)
+    low: float = 0.0
+    tyres: float = 0.0
+    half: float = 0.0
+    alike: float = 0.7
+
+
+CLEAN: Final = ErrorModel()
+
+
 @dataclass(frozen=True)
 class Errors:
     """Own errors of V vehicles: relative, additive, and the slope of their bounds [nat]; each (V,)."""
@@ -52,62 +83,84 @@ class Errors:
     relative: FloatArray
     additive: FloatArray
     slope: FloatArray
+    model: ErrorModel = CLEAN
 
     @staticmethod
-    def draw(rng: Generator, vehicles: int) -> Errors:
+    def draw(rng: Generator, vehicles: int, model: ErrorModel = CLEAN) -> Errors:
         """A fleet."""
+        relative = model.bias * rng.normal(size=vehicles)
         return Errors(
-            BIAS_RELATIVE * rng.normal(size=vehicles),
-            BIAS_ABSOLUTE * rng.normal(size=vehicles),
-            SLOPE_NATS * rng.uniform(-1.0, 1.0, vehicles),
-        )
+            relative + model.tyres + np.where(np.arange(vehicles) % 2, model.half, 0.0),
+            BIAS_ABSOLUTE * rng.normal(size=vehicles), SLOPE_NATS * rng.uniform(-1.0, 1.0, vehicles), model,
+        )  # fmt: skip
+
+
+class Passes(NamedTuple):
+    """What visits (n,) do: vehicle, friction, error shared in the place, share of the grip used, noise, manoeuvre, and
+    whether they are excited."""
+
+    vehicle: IntArray
+    mu: FloatArray
+    common: FloatArray
+    share: FloatArray
+    e: FloatArray
+    manoeuvre: IntArray
+    excited: BoolArray
 
 
 @dataclass(frozen=True)
 class SimulatedReports:
-    """What visits report: readings z and σ (n,), NaN where unexcited; grip used (n,); log-likelihood (n, 32)."""
+    """What visits report: readings z and σ (n,), NaN where unexcited; grip used (n,), and in which manoeuvre (n,);
+    log-likelihood (n, 32)."""
 
     reading: FloatArray
     std: FloatArray
     used: FloatArray
+    manoeuvre: IntArray
     log_likelihood: FloatArray
 
 
-def shares(rng: Generator, excited: BoolArray) -> FloatArray:
-    """s of visits: the upper part of the range where excited, ordinary driving else; same shape."""
-    return np.where(excited, rng.uniform(EXCITED_SHARE, 1.0, excited.shape), rng.uniform(0.05, 0.5, excited.shape))
+def shares(rng: Generator, excited: BoolArray, model: ErrorModel = CLEAN) -> FloatArray:
+    """s of visits: within the model's range where excited, ordinary driving else; same shape."""
+    ordinary = rng.uniform(0.05, min(0.5, model.share[1]), excited.shape)
+    return np.where(excited, rng.uniform(*model.share, excited.shape), ordinary)
 
 
-def noise(rng: Generator, along: IntArray) -> FloatArray:
-    """e of visits that follow each other; `along` (n,) is 0 where a drive begins."""
+def noise(rng: Generator, along: IntArray, tails: float = np.inf) -> FloatArray:
+    """e of visits that follow each other; `along` (n,) is 0 where a drive begins. Student's with `tails` degrees of
+    freedom, of standard deviation one, if these are finite."""
     e = rng.normal(size=len(along))
+    heavy = 1.0 if np.isinf(tails) else np.sqrt((tails - 2.0) / rng.chisquare(tails, len(along)))
     for step in range(1, int(along.max(initial=0)) + 1):
         here = np.flatnonzero(along == step)
         e[here] = CORRELATION * e[here - 1] + np.sqrt(1.0 - CORRELATION**2) * e[here]
-    return e
+    return np.asarray(heavy * e)
 
 
-def report(
-    rng: Generator, errors: Errors, vehicle: IntArray, mu: FloatArray, common: FloatArray, share: FloatArray,
-    e: FloatArray,
-) -> SimulatedReports:  # fmt: skip
-    """Reports of vehicles (n,) after using `share` of a grip `mu` with a `common` error and noise `e`; all (n,)."""
-    excited = share >= EXCITED_SHARE
-    relative = NOISE_AT_LIMIT + NOISE_PER_SHARE * (1.0 - share)
-    seen = np.maximum(mu * (1.0 + errors.relative[vehicle] + common) + errors.additive[vehicle], mugrid.LOWER)
+def report(rng: Generator, errors: Errors, p: Passes) -> SimulatedReports:
+    """Reports of visits (n,)."""
+    model, who = errors.model, p.vehicle
+    relative = NOISE_AT_LIMIT + NOISE_PER_SHARE * (1.0 - p.share)
+    shape = -model.low * (1.0 - p.share)
+    seen = np.maximum(
+        p.mu * (1.0 + errors.relative[who] + p.common + shape) + errors.additive[who], mugrid.LOWER
+    )  # fmt: skip
     std = np.hypot(NOISE_ABSOLUTE, relative * seen)
-    reading = seen + std * e
-    used = np.clip(share * mu + USED_STD * rng.normal(size=len(mu)), 0.02, 1.3)
+    reading = seen + std * p.e
+    used = np.clip(p.share * p.mu + USED_STD * rng.normal(size=len(p.mu)), 0.02, 1.3)
     bound = log_ndtr((mugrid.CENTRES - used[:, None]) / BOUND_STD)
     above = np.clip((mugrid.CENTRES - used[:, None]) / (mugrid.UPPER - mugrid.LOWER), 0.0, 1.0)
-    sloping = bound + errors.slope[vehicle, None] * above
-    log_likelihood = np.where(excited[:, None], likelihood(reading, relative), sloping)
-    return SimulatedReports(np.where(excited, reading, np.nan), np.where(excited, std, np.nan), used, log_likelihood)
+    sloping = bound + errors.slope[who, None] * above
+    told = likelihood(reading, model.stated * relative, model.stated * NOISE_ABSOLUTE)
+    std = np.where(p.excited, model.stated * std, np.nan)
+    return SimulatedReports(
+        np.where(p.excited, reading, np.nan), std, used, p.manoeuvre, np.where(p.excited[:, None], told, sloping)
+    )  # fmt: skip
 
 
-def likelihood(reading: FloatArray, relative: FloatArray) -> FloatArray:
+def likelihood(reading: FloatArray, relative: FloatArray, absolute: float = NOISE_ABSOLUTE) -> FloatArray:
     """ln p(z | μ) of readings (n,) with relative noise (n,), on the grid (n, 32), up to a constant."""
-    std = np.hypot(NOISE_ABSOLUTE, relative[:, None] * mugrid.CENTRES)
+    std = np.hypot(absolute, relative[:, None] * mugrid.CENTRES)
     return -0.5 * np.square((reading[:, None] - mugrid.CENTRES) / std) - np.log(std)
 
 

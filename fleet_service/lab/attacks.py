@@ -91,7 +91,7 @@ def random(rng: Generator, drive: AttackedDrive) -> Visits:
 
 def _claiming(v: Visits, lying: BoolArray, claim: FloatArray) -> Visits:
     reports = SimulatedReports(
-        v.reports.reading, v.reports.std, np.where(lying, claim, v.reports.used),
+        v.reports.reading, v.reports.std, np.where(lying, claim, v.reports.used), v.reports.manoeuvre,
         np.where(lying[:, None], agent.overconfident(claim), v.reports.log_likelihood),
     )  # fmt: skip
     return Visits(v.seconds, v.vehicle, v.place, v.mu, v.excited & ~lying, reports)
@@ -130,7 +130,7 @@ def newcomers(rng: Generator, drive: AttackedDrive) -> Visits:
 
 def _added(v: Visits, seconds: FloatArray, vehicle: IntArray, place: IntArray, claim: FloatArray) -> Visits:
     std = np.full(len(claim), agent.OVERCONFIDENT_STD)
-    reports = (claim, std, claim, agent.overconfident(claim))
+    reports = (claim, std, claim, np.zeros(len(claim), np.int64), agent.overconfident(claim))
     joined = (np.concatenate([a, b]) for a, b in zip(vars(v.reports).values(), reports, strict=True))
     both = Visits(
         np.append(v.seconds, seconds), np.append(v.vehicle, vehicle), np.append(v.place, place),

@@ -10,11 +10,13 @@ from typing import Final
 
 import numpy as np
 
-from fleet_service.lab import attacks, bars, changes, end_to_end, exact, fleets, plots
+from fleet_service.lab import attacks, bars, changes, end_to_end, exact, fleets, models, plots, situations
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
 
-SEEDS, QUICK_SEEDS = 40, 1
+# Towns, ways and errors of seeds from JUDGING on are for figures; constants are chosen on those below.
+JUDGING: Final = 20_000
+SEEDS, QUICK_SEEDS = 10, 1
 LENGTHS: Final = {end_to_end.LEVEL: (200, 60.0), end_to_end.HILLS: (120, 180.0)}  # vehicles, seconds
 EXACT_SEEDS: Final = 8  # drives of 20 minutes; nothing random is averaged there, the largest difference counts
 
@@ -34,7 +36,7 @@ def run(folder: Path, quick: bool, drives: Drives, log_line: LogLine, *, alone: 
         alone: end to end and nothing else; other figures are then not listed.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    seeds = range(QUICK_SEEDS if quick else SEEDS)
+    seeds = range(JUDGING, JUDGING + (QUICK_SEEDS if quick else SEEDS))
     found: dict[str, float] = {}
     for name, part in ([] if alone else _parts(seeds, log_line)) + _ways(drives, folder):
         began = time.perf_counter()
@@ -74,12 +76,14 @@ def _ways(drives: Drives, folder: Path) -> list[tuple[str, Part]]:
 
 
 def _parts(seeds: range, log_line: LogLine) -> list[tuple[str, Part]]:
-    few = range(min(EXACT_SEEDS, len(seeds)))
+    few = seeds[:EXACT_SEEDS]
     return [
         ("order, replay, unexcited", lambda: _exact(few)),
         ("ice comes and goes", lambda: changes.measure(seeds)),
         ("fleets and rules", lambda: fleets.measure(seeds, log_line)),
         ("attacks", lambda: attacks.measure(seeds)),
+        ("fleets that err otherwise", lambda: models.measure(seeds, log_line)),
+        ("bounds, a backlog, gentle drivers, a wet curve", lambda: situations.measure(seeds)),
     ]
 
 

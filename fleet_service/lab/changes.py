@@ -27,7 +27,7 @@ def changing(rng: Generator, before: float, after: float) -> Town:
     drawn = town.build(rng, MINUTES, 0.0)
     mu, excitement = drawn.mu.copy(), drawn.excitement.copy()
     mu[:CHANGE, :LENGTH], mu[CHANGE:, :LENGTH], excitement[:LENGTH] = before, after, EXCITEMENT
-    return Town(mu, excitement, drawn.changed, drawn.common)
+    return Town(mu, excitement, drawn.changed, drawn.common, drawn.usual)
 
 
 def delays(rng: Generator, before: float, after: float) -> IntArray:

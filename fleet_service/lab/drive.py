@@ -32,7 +32,8 @@ CELL: Final = cell_numbers()
 def rows_of(v: Visits) -> dict[str, Any]:
     """Visits as columns of the archive, as far as the fusion reads them; every row is a batch of its own."""
     n, nan = len(v), np.full(len(v), np.nan, np.float32)
-    cell = CELL[v.place]
+    cell, used = CELL[v.place], v.reports.used.astype(np.float32)
+    along, across = (used * np.array(part, np.float32)[v.reports.manoeuvre] for part in ((1, -1, 0, 0), (0, 0, 1, -1)))
     order = np.lexsort((v.seconds, v.vehicle))
     seq = np.empty(n, np.int64)
     first = np.searchsorted(v.vehicle[order], v.vehicle[order])
@@ -43,7 +44,8 @@ def rows_of(v: Visits) -> dict[str, Any]:
         "yaw": np.zeros(n, np.float32), "position_std": np.full(n, 1.5, np.float32), "boot": v.vehicle + 1,
         "region": grid.region_of(cell), "seq": seq, "row": np.zeros(n, np.int32), "with_likelihood": np.ones(n, bool),
         "log_likelihood": mugrid.encode_log_likelihood(v.reports.log_likelihood),
-        "mu": nan, "mu_lower": nan, "mu_upper": nan, "mu_utilised": v.reports.used.astype(np.float32),
+        "used_longitudinal": along, "used_lateral": across, "mu": nan, "mu_lower": nan, "mu_upper": nan,
+        "mu_utilised": used,
     }  # fmt: skip
 
 
@@ -72,22 +74,23 @@ def novel(rows: dict[str, Any], vehicle: IntArray, which: IntArray) -> IntArray:
 
 @dataclass
 class AlertWatch:
-    """A fusion with its alerts, asked minute by minute; `beliefs` (minutes, cells, 32), `alerted` (minutes, cells)."""
+    """A fusion with its alerts, asked at some minutes: `beliefs` by minute, (cells, 32), `alerted` (minutes, cells)."""
 
     fusion: Fusion
     alerts: Alerts
-    beliefs: list[FloatArray] = field(default_factory=list)
+    beliefs: dict[int, FloatArray] = field(default_factory=dict)
     alerted: list[BoolArray] = field(default_factory=list)
     late: int = 0
 
-    def snapshot(self, now: int) -> None:
-        """Note what the map says at `now` [ns]."""
+    def snapshot(self, minute: int) -> None:
+        """Note what the map says at a minute."""
+        now = START + minute * 60 * NS
         slots = self.fusion.slots_of(CELL, np.zeros(CELLS, np.int64))
         known = slots >= 0
         belief = np.tile(mugrid.PRIOR, (CELLS, 1))
         belief[known] = self.fusion.beliefs(slots[known], now)
         self.alerts.faded(now)
-        self.beliefs.append(belief)
+        self.beliefs[minute] = belief
         self.alerted.append(np.isin(slots, list(self.alerts.raised)) & known)
 
 
@@ -97,8 +100,8 @@ def minutes(o: Observations, at: FloatArray, count: int) -> Iterator[Observation
         yield o.take(rows)
 
 
-def watch(rng: Generator, v: Visits, count: int) -> AlertWatch:
-    """Deliver the visits and ask the map after each of `count` minutes."""
+def watch(rng: Generator, v: Visits, count: int, asked: tuple[int, ...] | None = None) -> AlertWatch:
+    """Deliver the visits and ask the map after each of `count` minutes, or only those `asked`."""
     rows = rows_of(v)
     at, which = arrivals(rng, v)
     kept = novel(rows, v.vehicle, which)
@@ -111,5 +114,6 @@ def watch(rng: Generator, v: Visits, count: int) -> AlertWatch:
             updated = fusion.update(part)
             watched.alerts.updated(updated.slots)
             watched.late += int(updated.late.sum())
-        watched.snapshot(START + minute * 60 * NS)
+        if asked is None or minute in asked:
+            watched.snapshot(minute)
     return watched

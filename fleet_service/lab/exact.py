@@ -12,7 +12,7 @@ from numpy.random import Generator
 from fleet_service.app.engine import Engine
 from fleet_service.fusion import Fusion, observations_of
 from fleet_service.lab import agent, town
-from fleet_service.lab.agent import Errors
+from fleet_service.lab.agent import Errors, Passes
 from fleet_service.lab.drive import CELL, LATENESS_S, rows_of
 from fleet_service.lab.messages import clock_of, messages
 from fleet_service.lab.town import Visits
@@ -79,9 +79,8 @@ def upper_shift(rng: Generator) -> float:
             who, along = rng.integers(0, vehicles, n), np.zeros(n, np.int64)
             shares = agent.shares(rng, np.zeros(n, bool))
             road: FloatArray = np.full(n, mu)
-            reports = agent.report(
-                rng, Errors.draw(rng, vehicles), who, road, 0.0 * road, shares, agent.noise(rng, along)
-            )
+            passes = Passes(who, road, 0.0 * road, shares, agent.noise(rng, along), along, along > 0)
+            reports = agent.report(rng, Errors.draw(rng, vehicles), passes)
             fusion = Fusion(LATENESS_S)
             fusion.update(observations_of(rows_of(Visits(seconds, who, along, road, along > 0, reports)), who))
             slot = fusion.slots_of(CELL[:1], np.zeros(1, np.int64))

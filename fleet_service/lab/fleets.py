@@ -10,13 +10,11 @@ import numpy as np
 
 from fleet_service.lab import rules, town
 from fleet_service.lab.agent import Errors
-from fleet_service.lab.bars import COUNTS
 from fleet_service.lab.drive import watch
 from fleet_service.lab.score import (
     LEVELS,
     Scores,
     coverage,
-    coverage_by_count,
     earlier_visits,
     excited_vehicles,
     joined,
@@ -25,7 +23,7 @@ from fleet_service.lab.score import (
     safe,
     snapshots,
 )
-from schemas.numeric import BoolArray, FloatArray
+from schemas.numeric import BoolArray
 
 VEHICLES: Final = 60
 CHANGING: Final = 0.1  # share of roads that get another surface during the drive
@@ -122,8 +120,8 @@ def _figures(fleet: Fleet, found: Found) -> dict[str, float]:
         out |= {f"{label}.rmse": rmse(scores), f"{label}.coverage90": coverage(scores)}
         out[f"{label}.interval_score"] = float(scores.interval.mean())
         best = min(best, float(scores.interval.mean()))
-    out[f"fusion.vs_best_rule.{fleet.name}"] = float(ours.interval.mean()) / best
-    if fleet.name == "clean":
+    out[f"{name}.vs_best_rule"] = float(ours.interval.mean()) / best
+    if fleet.name == FLEETS[0].name:
         out |= _curves(ours)
     if fleet.name == "mis15_dry":
         out["fusion.missed_ice.mis15"] = out[f"fusion.missed_ice.{fleet.name}"]
@@ -131,12 +129,8 @@ def _figures(fleet: Fleet, found: Found) -> dict[str, float]:
 
 
 def _curves(ours: Scores) -> dict[str, float]:
-    """Coverage and error by the number of excited vehicles, and the reliability diagram."""
-    out = {f"fusion.clean.coverage90.n{n}": share for n, share in coverage_by_count(ours).items()}
-    for n, end in zip(COUNTS, (*COUNTS[1:], VEHICLES + 1), strict=True):
-        error: FloatArray = ours.error[(ours.vehicles >= n) & (ours.vehicles < end)]
-        out[f"fusion.clean.rmse.n{n}"] = float(np.sqrt(np.mean(error**2))) if len(error) else float("nan")
-    return out | {
+    """The reliability diagram."""
+    return {
         f"fusion.clean.reliability.{level:.2f}": float(share)
         for level, share in zip(LEVELS, reliability(ours), strict=True)
     }

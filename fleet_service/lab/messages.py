@@ -56,6 +56,7 @@ def _message(
         "cell": rows["cell"][part], "sector": rows["sector"][part], "latitude": latitude[part],
         "longitude": longitude[part], "position_std": np.full(n, 1.5), "yaw": np.zeros(n), "yaw_std": np.full(n, 0.02),
         "speed": np.full(n, 13.0), "mu_utilised": rows["mu_utilised"][part],
+        "used_longitudinal": rows["used_longitudinal"][part], "used_lateral": rows["used_lateral"][part],
         "log_likelihood": rows["log_likelihood"][part],
     }  # fmt: skip
     vehicle, region = int(v.vehicle[part[0]]), int(rows["region"][part[0]])

@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
+from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.lab.bars import COUNTS
 from fleet_service.lab.town import CELLS, Town, Visits
 from schemas import mugrid
 from schemas.numeric import BoolArray, FloatArray, IntArray
+from schemas.thresholds import SLIPPERY_MU
 
 ALPHA: Final = 0.10
 ENOUGH: Final = 3  # excited vehicles, for an error to count
+BINS, BIN_ENOUGH = 10, 100  # of P(slippery); answers in a bin that counts
 LEVELS: Final = np.linspace(0.05, 0.95, 19)
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Answers beside the truth, (k,); `vehicles` are the distinct excited ones that had been there."""
+    """Answers beside the truth, (k,): `vehicles` are the distinct excited ones that had been there, `slippery` is what
+    the answer gives for P(slippery), NaN where it gives none."""
 
     vehicles: IntArray
     error: FloatArray
@@ -27,6 +32,8 @@ class Scores:
     interval: FloatArray
     rank: FloatArray
     truth: FloatArray
+    width: FloatArray
+    slippery: FloatArray
 
     def taken(self, rows: BoolArray) -> Scores:
         """Some of the answers."""
@@ -53,12 +60,13 @@ def earlier_visits(v: Visits, until_s: float, vehicles: int) -> IntArray:
 
 
 def of_intervals(
-    lower: FloatArray, mid: FloatArray, upper: FloatArray, truth: FloatArray, vehicles: IntArray, rank: FloatArray
-) -> Scores:
+    lower: FloatArray, mid: FloatArray, upper: FloatArray, truth: FloatArray, vehicles: IntArray, rank: FloatArray,
+    slippery: FloatArray,
+) -> Scores:  # fmt: skip
     """Scores of 90 % intervals, all (k,). Interval score: width, and 2/α for each unit by which the truth is missed."""
     missed = np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0)
     interval = upper - lower + 2.0 / ALPHA * missed
-    return Scores(vehicles, mid - truth, missed == 0.0, interval, rank, truth)
+    return Scores(vehicles, mid - truth, missed == 0.0, interval, rank, truth, upper - lower, slippery)
 
 
 def of_beliefs(belief: FloatArray, truth: FloatArray, vehicles: IntArray) -> Scores:
@@ -69,16 +77,19 @@ def of_beliefs(belief: FloatArray, truth: FloatArray, vehicles: IntArray) -> Sco
     bin_ = place.astype(np.int64)
     mass = np.take_along_axis(belief, bin_[:, None], axis=1)[:, 0]
     rank = np.take_along_axis(cdf, bin_[:, None], axis=1)[:, 0] - mass * (1.0 - (place - bin_))
-    return of_intervals(lower, mid, upper, truth, vehicles, rank)
+    return of_intervals(lower, mid, upper, truth, vehicles, rank, belief @ SLIPPERY_SHARE)
 
 
-def snapshots(beliefs: list[FloatArray], town: Town, v: Visits, at: tuple[int, ...], vehicles: int) -> Scores:
-    """Scores of the cells with an excited vehicle at some minutes."""
+def snapshots(
+    beliefs: Mapping[int, FloatArray], town: Town, v: Visits, at: tuple[int, ...], vehicles: int,
+    where: BoolArray | bool = True,
+) -> Scores:  # fmt: skip
+    """Scores of the cells `where` an excited vehicle was, at some minutes."""
     out = []
     for minute in at:
         n = excited_vehicles(v, town, minute, vehicles)
         truth = town.mu[minute]
-        out.append(of_beliefs(beliefs[minute - 1], truth, n).taken(n >= 1))
+        out.append(of_beliefs(beliefs[minute], truth, n).taken((n >= 1) & where))
     return joined(out)
 
 
@@ -98,12 +109,25 @@ def safe(s: Scores) -> float:
     return float((s.rank >= ALPHA / 2.0).mean()) if len(s.rank) else float("nan")
 
 
-def coverage_by_count(s: Scores) -> dict[int, float]:
-    """Coverage per class of vehicle counts."""
+def of_class(s: Scores, n: int) -> Scores:
+    """The answers of a class of COUNTS, which reaches to the next."""
     edges = (*COUNTS[1:], np.iinfo(np.int64).max)
-    return {
-        n: coverage(s.taken((s.vehicles >= n) & (s.vehicles < end))) for n, end in zip(COUNTS, edges, strict=True)
-    }  # fmt: skip
+    return s.taken((s.vehicles >= n) & (s.vehicles < edges[COUNTS.index(n)]))
+
+
+def calibration(scores: Sequence[Scores]) -> FloatArray:
+    """P(slippery) in BINS of it: answers, mean of what they give, share of truths that were slippery, (BINS, 3)."""
+    given = np.concatenate([s.slippery for s in scores])
+    truth = np.concatenate([s.truth for s in scores]) < SLIPPERY_MU
+    place = np.clip((given * BINS).astype(np.int64), 0, BINS - 1)
+    count = np.bincount(place, minlength=BINS)
+    sums = [np.bincount(place, weights=of, minlength=BINS) for of in (given, truth.astype(float))]
+    return np.stack([count, *(total / np.maximum(count, 1) for total in sums)], axis=1)
+
+
+def worst_bin(found: FloatArray) -> float:
+    """Largest difference of what is given and what is true in a bin with BIN_ENOUGH answers; 0 without one."""
+    return float(np.abs(found[:, 1] - found[:, 2])[found[:, 0] >= BIN_ENOUGH].max(initial=0.0))
 
 
 def reliability(s: Scores) -> FloatArray:

@@ -13,8 +13,9 @@ from typing import Final
 import numpy as np
 from numpy.random import Generator
 
+from fleet_service.fusion.store.records import MANOEUVRES
 from fleet_service.lab import agent
-from fleet_service.lab.agent import Errors, SimulatedReports
+from fleet_service.lab.agent import CLEAN, ErrorModel, Errors, Passes, SimulatedReports
 from schemas import grid
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.thresholds import NS
@@ -43,19 +44,21 @@ def cell_numbers(cells: int = CELLS) -> IntArray:
 @dataclass(frozen=True)
 class Town:
     """Friction (minutes + 1, cells) at the beginning of each minute, P(a pass is excited) (cells,), the minute of
-    each cell's change of surface (cells,), infinite without one, and the vehicles' common error (cells,)."""
+    each cell's change of surface (cells,), infinite without one, the vehicles' common error by manoeuvre (cells, 4),
+    and what most do there (cells,)."""
 
     mu: FloatArray
     excitement: FloatArray
     changed: FloatArray
     common: FloatArray
+    usual: IntArray
 
     def at(self, seconds: FloatArray, place: IntArray) -> FloatArray:
         """Friction at a time and place, (n,)."""
         return np.asarray(self.mu[np.minimum((seconds // 60.0).astype(np.int64), len(self.mu) - 1), place])
 
 
-def build(rng: Generator, minutes: int, changing: float) -> Town:
+def build(rng: Generator, minutes: int, changing: float, model: ErrorModel = CLEAN) -> Town:
     """Draw a town. `changing` is the share of roads that get another surface at some minute."""
     names, share = list(SURFACES.values()), [s[2] for s in SURFACES.values()]
     stretches = CELLS // STRETCH
@@ -72,8 +75,11 @@ def build(rng: Generator, minutes: int, changing: float) -> Town:
     classes, weights = zip(*EXCITEMENT, strict=True)
     excitement = np.repeat(rng.choice(classes, CELLS // ZONE, p=weights), ZONE)
     mu = np.clip(now + np.repeat(steps.cumsum(axis=0), STRETCH, axis=1), LEAST, MOST)
-    common = np.repeat(agent.COMMON * rng.spawn(1)[0].normal(size=CELLS // ZONE), ZONE)  # same towns with and without
-    return Town(mu, excitement, np.ceil(change), common)
+    own = rng.spawn(1)[0]  # the same towns whatever the errors
+    zones = CELLS // ZONE
+    common = model.common * own.normal(size=(zones, 1)) + model.by_manoeuvre * own.normal(size=(zones, MANOEUVRES))
+    usual = np.repeat(own.integers(0, MANOEUVRES, zones), ZONE)
+    return Town(mu, excitement, np.ceil(change), np.repeat(common, ZONE, axis=0), usual)
 
 
 @dataclass(frozen=True)
@@ -91,18 +97,29 @@ class Visits:
         return len(self.seconds)
 
 
-def drive(rng: Generator, town: Town, errors: Errors, minutes: float, roads_per_minute: float = 1.0) -> Visits:
-    """Let a fleet drive: each vehicle passes whole roads, `roads_per_minute` on average, at random times."""
-    vehicles = len(errors.slope)
-    passes = rng.poisson(vehicles * minutes * roads_per_minute)
+def drive(rng: Generator, town: Town, errors: Errors, minutes: float, acquainted: float = 0.0) -> Visits:
+    """Let a fleet drive: each vehicle passes a whole road every minute on average, at random times.
+
+    Until the minute `acquainted` only the first half of the roads are driven, from then on the other half, if it is not
+    nought: then vehicles know each other, and nobody knows the roads.
+    """
+    vehicles, model = len(errors.slope), errors.model
+    passes = rng.poisson(vehicles * minutes)
     begin, who = rng.random(passes) * minutes * 60.0, rng.integers(0, vehicles, passes)
     along = np.tile(np.arange(LENGTH), passes)
     seconds = np.repeat(begin, LENGTH) + along
-    vehicle, place = np.repeat(who, LENGTH), np.repeat(rng.integers(0, ROADS, passes) * LENGTH, LENGTH) + along
+    roads = rng.integers(0, ROADS, passes)
+    if acquainted:
+        roads = roads // 2 + np.where(begin < 60.0 * acquainted, 0, ROADS // 2)
+    vehicle, place = np.repeat(who, LENGTH), np.repeat(roads * LENGTH, LENGTH) + along
     excited = rng.random(len(place)) < town.excitement[place]
     mu = town.at(seconds, place)
-    shares, noise = agent.shares(rng, excited), agent.noise(rng, along)
-    reports = agent.report(rng, errors, vehicle, mu, town.common[place], shares, noise)
+    manoeuvre = np.where(
+        rng.random(len(place)) < model.alike, town.usual[place], rng.integers(0, MANOEUVRES, len(place))
+    )
+    shares, noise = agent.shares(rng, excited, model), agent.noise(rng, along, model.tails)
+    common = town.common[place, manoeuvre]
+    reports = agent.report(rng, errors, Passes(vehicle, mu, common, shares, noise, manoeuvre, excited))
     offset = rng.uniform(0.0, CELL_M, len(place)) + FIX_STD_M * rng.normal(size=len(place))
     reported_at = place + np.clip(np.floor(offset / CELL_M).astype(np.int64), -1, 1)
     reported_place = np.where(reported_at // LENGTH == place // LENGTH, reported_at, place)
@@ -113,9 +130,7 @@ def drive(rng: Generator, town: Town, errors: Errors, minutes: float, roads_per_
 
 def take(v: Visits, rows: IntArray | BoolArray) -> Visits:
     """Some of the visits."""
-    reports = SimulatedReports(
-        v.reports.reading[rows], v.reports.std[rows], v.reports.used[rows], v.reports.log_likelihood[rows]
-    )
+    reports = SimulatedReports(*(column[rows] for column in vars(v.reports).values()))
     return Visits(v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], reports)
 
 
@@ -125,6 +140,6 @@ def wrong(v: Visits, liars: BoolArray, claim: float) -> Visits:
     readings = np.where(lying, claim, v.reports.reading)
     reports = SimulatedReports(
         readings, np.where(lying, agent.OVERCONFIDENT_STD, v.reports.std), np.where(lying, claim, v.reports.used),
-        np.where(lying[:, None], agent.overconfident(claim), v.reports.log_likelihood),
+        v.reports.manoeuvre, np.where(lying[:, None], agent.overconfident(claim), v.reports.log_likelihood),
     )  # fmt: skip
     return Visits(v.seconds, v.vehicle, v.place, v.mu, v.excited & ~lying, reports)

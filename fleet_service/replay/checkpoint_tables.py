@@ -16,14 +16,8 @@ from fleet_service.fusion import Fusion
 from fleet_service.fusion.image import LAYOUT, fusion_of, image_of
 from schemas.errors import InputError
 
-VERSION: Final = f"3-{LAYOUT}"  # what is neither this nor FORMER is not read: the archive is replayed
+VERSION: Final = f"4-{LAYOUT}"  # what is not this is not read: the archive is replayed
 _KEY: Final = b"gripmap.checkpoint"
-# Versions whose tables hold the same bytes under other names: the names of then and those of now.
-FORMER: Final = {
-    "2-ad7261c1cc56b132": {
-        "kept": "base_cells", "kept_belief": "base_belief", "kept_voices": "base_sources", "voices": "reporters",
-    },
-}  # fmt: skip
 
 
 def tables_of(fusion: Fusion) -> dict[str, pa.Table]:
@@ -58,13 +52,9 @@ def fusion_from(tables: dict[str, pa.Table], lateness_s: float) -> Fusion:
         InputError: tables of another version, or not all of them.
     """
     versions = {(table.schema.metadata or {}).get(_KEY, b"").decode() for table in tables.values()}
-    names = FORMER.get(next(iter(versions), ""), {})
-    if versions != {VERSION} and not (names and len(versions) == 1):
+    if versions != {VERSION}:
         raise InputError("checkpoint", f"is not of version {VERSION}", "replay the archive instead")
-    image = {
-        names.get(name, name): {key: _unlisted(table[key]) for key in table.column_names}
-        for name, table in tables.items()
-    }
+    image = {name: {key: _unlisted(table[key]) for key in table.column_names} for name, table in tables.items()}
     try:
         return fusion_of(image, lateness_s)
     except (KeyError, ValueError) as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import fields
 from functools import reduce
 from operator import and_
 from pathlib import Path
@@ -17,12 +18,14 @@ from fleet_service.archive import layout, reading, segments
 from fleet_service.archive.load import Damaged, pass_over
 from fleet_service.archive.pseudonyms import number
 from fleet_service.archive.witnesses import numbers_of
-from fleet_service.fusion import Fusion, Updated, observations_of
+from fleet_service.fusion import Fusion, Observations, Updated, observations_of
 from fleet_service.fusion.constants import EPOCH_NS
+from fleet_service.fusion.fuse import Before
+from fleet_service.fusion.standing import ERRORS, UNKNOWN
 from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.weather import archived
 from schemas import grid
-from schemas.numeric import IntArray
+from schemas.numeric import BoolArray, IntArray
 from schemas.tables import US, US_STEP
 from schemas.wire import Kind
 
@@ -31,6 +34,7 @@ _FIRST_TIME: Final = {Kind.OBSERVATION: "enter_time", Kind.STATE: "time"}  # by 
 COLUMNS: Final = [
     *("leave_time", "cell", "sector", "latitude", "longitude", "position_std", "yaw", "mu", "mu_lower", "mu_upper"),
     *("mu_utilised", "log_likelihood", *IDENTITY, "row", "received_at", "late", "weight"),
+    *("used_longitudinal", "used_lateral", "late_by", *ERRORS),
 ]  # of what the fusion takes
 Box = tuple[float, float, float, float]  # west, south, east, north [deg]
 # Days of observations that show in the map, and of batches that may come again (ServiceConfig.oldest_s is 30 days).
@@ -145,6 +149,7 @@ def replay(
     """
     last = None if since.until is None else since.until // layout.DAY_NS + 1
     wanted = reading.Wanted(COLUMNS, since.where(), (since.begin.day, last), since.begin.after)
+    waiting: list[tuple[Observations, Before]] = []  # late rows that were fused after the end of their table
     for table in in_order(reading.Listing(root, Kind.OBSERVATION, wanted, damaged)):
         vehicle = numbers(table["vehicle"])
         rows = segments.rows_of(table.drop_columns(["vehicle"]))
@@ -153,13 +158,49 @@ def replay(
             names = np.stack([vehicle, rows["boot"], rows["region"], rows["seq"]], axis=1)
             distinct, index = np.unique(names, axis=0, return_inverse=True)
             new = ~since.known.accepted(Kind.OBSERVATION, distinct)[index.reshape(-1)]
-        weight, late = rows["weight"][new], rows["late"][new].astype(bool)
-        witness = numbers_of(root / "keys", vehicle[new])
-        o = observations_of({name: column[new] for name, column in rows.items()}, witness)
-        borders = np.flatnonzero(np.diff(o.time // EPOCH_NS)) + 1
-        for part in np.split(np.arange(len(o.time)), borders):
-            if len(part):
-                yield fusion.update(o.take(part), weight[part], late[part])
+        rows = {name: column[new] for name, column in rows.items()}
+        o = observations_of(rows, numbers_of(root / "keys", vehicle[new]))
+        before = _before(rows)
+        end = int(segments.nanoseconds(table["leave_time"]).max(initial=0)) // EPOCH_NS
+        o, before = _joined([*waiting, (o, before)])
+        epoch = (o.time + before.late_by) // EPOCH_NS
+        waiting = [_taken(o, before, epoch > end)]
+        yield from _fused(fusion, *_taken(o, before, epoch <= end))
+    if waiting:
+        yield from _fused(fusion, *waiting[0])
+
+
+def _before(rows: segments.Rows) -> Before:
+    """What was used of rows; of an older version nothing is known of the vehicles' errors."""
+    error = np.stack([rows[name] for name in ERRORS], axis=1)
+    error = np.where(np.isnan(error), np.array(UNKNOWN, np.float32), error)
+    return Before(rows["late"].astype(bool), rows["late_by"], rows["weight"], error)
+
+
+def _joined(parts: list[tuple[Observations, Before]]) -> tuple[Observations, Before]:
+    """Parts one after the other."""
+    of = Observations(
+        **{f.name: np.concatenate([getattr(o, f.name) for o, _ in parts]) for f in fields(Observations)}
+    )  # fmt: skip
+    told = [before for _, before in parts]
+    return of, Before(
+        late=np.concatenate([b.late for b in told]), late_by=np.concatenate([b.late_by for b in told]),
+        weight=np.concatenate([b.weight for b in told]), error=np.concatenate([b.error for b in told]),
+    )  # fmt: skip
+
+
+def _taken(o: Observations, before: Before, rows: BoolArray | IntArray) -> tuple[Observations, Before]:
+    """Some of the rows."""
+    return o.take(rows), Before(before.late[rows], before.late_by[rows], before.weight[rows], before.error[rows])
+
+
+def _fused(fusion: Fusion, o: Observations, before: Before) -> Iterator[Updated]:
+    """Fuse rows epoch by epoch of when they were fused."""
+    time = o.time + before.late_by
+    order = np.argsort(time, kind="stable")
+    for part in np.split(order, np.flatnonzero(np.diff(time[order] // EPOCH_NS)) + 1):
+        if len(part):
+            yield fusion.update(*_taken(o, before, part))
 
 
 def in_order(listing: reading.Listing) -> Iterator[pa.Table]:

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from fleet_service.fusion import Fusion
-from fleet_service.fusion.belief import SLIPPERY_SHARE, common_kernel, quantiles
+from fleet_service.fusion.belief import SLIPPERY_SHARE, quantiles
 from fleet_service.fusion.store.records import GRIP, ICE, SOURCES
 from fleet_service.serve.view import LOWER, UPPER
 from schemas import grid
@@ -21,9 +21,8 @@ RAISE_ABOVE: Final = 0.9  # P(slippery)
 CLEAR_BELOW: Final = 0.05
 FADE_BELOW: Final = 0.5  # ... but when nobody confirms it, it ends as soon as it is less likely than not
 LEAST_SOURCES: Final = 2  # distinct vehicles that reported it themselves: one liar, or one bad sensor, moves nothing
+MOST_ICE: Final = 4  # that ice ever needs: three insiders who flood a cell are too few
 SOURCE_NS: Final = 3600 * NS  # ... within the hour; older ice belongs to an older road
-# Of a belief about what the fleet takes the road for: how much of the road it stands for is slippery, and is at all.
-_SLIPPERY_AND_WHOLE: Final = common_kernel().T @ np.stack([SLIPPERY_SHARE, np.ones_like(SLIPPERY_SHARE)], axis=1)
 
 
 class Alerts:
@@ -75,8 +74,7 @@ class Alerts:
 
     def _slippery(self, slots: IntArray) -> FloatArray:
         """P(slippery) of each slot's road at its last observation, without the rest of what is believed of it."""
-        slippery, whole = (self._fusion.live.belief[slots].astype(np.float64) @ _SLIPPERY_AND_WHOLE).T
-        return np.asarray(slippery / whole)
+        return np.asarray(self._fusion.believed(slots) @ SLIPPERY_SHARE)
 
     def _corroborated(self, slot: int, side: int, time: int) -> bool:
         """Whether one side has enough corroborating sources: as many as the other within the hour, within limits.
@@ -86,7 +84,7 @@ class Alerts:
         slots, hour = np.array([slot]), time - SOURCE_NS
         against, last = self._fusion.sources(slots, GRIP if side == ICE else ICE, hour)
         found, _ = self._fusion.sources(slots, side, np.maximum(last, hour) if side == GRIP else hour)
-        return bool(found[0] >= np.clip(against[0], LEAST_SOURCES, SOURCES))
+        return bool(found[0] >= np.clip(against[0], LEAST_SOURCES, MOST_ICE if side == ICE else SOURCES))
 
     def faded(self, now: int) -> list[Alert]:
         """Alerts that time alone cleared until `now` [ns]: less likely than not, and no source within the hour."""

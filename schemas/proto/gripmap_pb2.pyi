@@ -17,7 +17,7 @@ KIND_OBSERVATION: Kind
 KIND_STATE: Kind
 
 class ObservationBatch(_message.Message):
-    __slots__ = ("vehicle", "boot", "region", "seq", "first_held", "estimator", "enter_time", "leave_time", "cell", "sector", "latitude", "longitude", "position_std", "yaw", "yaw_std", "speed", "mu", "mu_lower", "mu_upper", "mu_utilised", "log_likelihood", "health", "tyre_season", "air_temperature", "abs_active")
+    __slots__ = ("vehicle", "boot", "region", "seq", "first_held", "estimator", "enter_time", "leave_time", "cell", "sector", "latitude", "longitude", "position_std", "yaw", "yaw_std", "speed", "mu", "mu_lower", "mu_upper", "mu_utilised", "log_likelihood", "health", "tyre_season", "air_temperature", "abs_active", "used_longitudinal", "used_lateral")
     VEHICLE_FIELD_NUMBER: _ClassVar[int]
     BOOT_FIELD_NUMBER: _ClassVar[int]
     REGION_FIELD_NUMBER: _ClassVar[int]
@@ -43,6 +43,8 @@ class ObservationBatch(_message.Message):
     TYRE_SEASON_FIELD_NUMBER: _ClassVar[int]
     AIR_TEMPERATURE_FIELD_NUMBER: _ClassVar[int]
     ABS_ACTIVE_FIELD_NUMBER: _ClassVar[int]
+    USED_LONGITUDINAL_FIELD_NUMBER: _ClassVar[int]
+    USED_LATERAL_FIELD_NUMBER: _ClassVar[int]
     vehicle: str
     boot: int
     region: int
@@ -68,7 +70,9 @@ class ObservationBatch(_message.Message):
     tyre_season: _containers.RepeatedScalarFieldContainer[int]
     air_temperature: _containers.RepeatedScalarFieldContainer[float]
     abs_active: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, vehicle: _Optional[str] = ..., boot: _Optional[int] = ..., region: _Optional[int] = ..., seq: _Optional[int] = ..., first_held: _Optional[int] = ..., estimator: _Optional[str] = ..., enter_time: _Optional[_Iterable[int]] = ..., leave_time: _Optional[_Iterable[int]] = ..., cell: _Optional[_Iterable[int]] = ..., sector: _Optional[_Iterable[int]] = ..., latitude: _Optional[_Iterable[float]] = ..., longitude: _Optional[_Iterable[float]] = ..., position_std: _Optional[_Iterable[float]] = ..., yaw: _Optional[_Iterable[float]] = ..., yaw_std: _Optional[_Iterable[float]] = ..., speed: _Optional[_Iterable[float]] = ..., mu: _Optional[_Iterable[float]] = ..., mu_lower: _Optional[_Iterable[float]] = ..., mu_upper: _Optional[_Iterable[float]] = ..., mu_utilised: _Optional[_Iterable[float]] = ..., log_likelihood: _Optional[bytes] = ..., health: _Optional[_Iterable[int]] = ..., tyre_season: _Optional[_Iterable[int]] = ..., air_temperature: _Optional[_Iterable[float]] = ..., abs_active: _Optional[_Iterable[int]] = ...) -> None: ...
+    used_longitudinal: _containers.RepeatedScalarFieldContainer[float]
+    used_lateral: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, vehicle: _Optional[str] = ..., boot: _Optional[int] = ..., region: _Optional[int] = ..., seq: _Optional[int] = ..., first_held: _Optional[int] = ..., estimator: _Optional[str] = ..., enter_time: _Optional[_Iterable[int]] = ..., leave_time: _Optional[_Iterable[int]] = ..., cell: _Optional[_Iterable[int]] = ..., sector: _Optional[_Iterable[int]] = ..., latitude: _Optional[_Iterable[float]] = ..., longitude: _Optional[_Iterable[float]] = ..., position_std: _Optional[_Iterable[float]] = ..., yaw: _Optional[_Iterable[float]] = ..., yaw_std: _Optional[_Iterable[float]] = ..., speed: _Optional[_Iterable[float]] = ..., mu: _Optional[_Iterable[float]] = ..., mu_lower: _Optional[_Iterable[float]] = ..., mu_upper: _Optional[_Iterable[float]] = ..., mu_utilised: _Optional[_Iterable[float]] = ..., log_likelihood: _Optional[bytes] = ..., health: _Optional[_Iterable[int]] = ..., tyre_season: _Optional[_Iterable[int]] = ..., air_temperature: _Optional[_Iterable[float]] = ..., abs_active: _Optional[_Iterable[int]] = ..., used_longitudinal: _Optional[_Iterable[float]] = ..., used_lateral: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class StateBatch(_message.Message):
     __slots__ = ("vehicle", "boot", "region", "seq", "first_held", "estimator", "time", "latitude", "longitude", "position_std", "yaw", "vx", "vy", "yaw_rate", "sideslip", "mu", "mu_lower", "mu_upper", "health")

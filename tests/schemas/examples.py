@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from schemas import grid, wire
 from schemas.wire import Alert, Batch, Kind, StreamAck
 
 DATA = Path(__file__).parent / "data"
+LATER = ("used_longitudinal", "used_lateral")  # columns that came after the kept bytes
 
 
 def batch(kind: Kind, rows: int = 3) -> Batch:
@@ -36,6 +38,12 @@ def batch(kind: Kind, rows: int = 3) -> Batch:
     return Batch(kind, "volvo-240", 2**62 + 5, region, 17, 12, columns, "aco-fckf")
 
 
+def batch_of_version_1(kind: Kind) -> Batch:
+    """The batch as it was before there were other columns."""
+    whole = batch(kind)
+    return replace(whole, columns={name: c for name, c in whole.columns.items() if name not in LATER})
+
+
 def acknowledgement() -> tuple[str, list[StreamAck]]:
     """An acknowledgement of two streams."""
     return "volvo-240", [
@@ -52,8 +60,8 @@ def alert() -> Alert:
 
 
 MESSAGES: dict[str, Callable[[], bytes]] = {
-    "observation_batch": lambda: wire.encode(batch(Kind.OBSERVATION)),
-    "state_batch": lambda: wire.encode(batch(Kind.STATE)),
+    "observation_batch": lambda: wire.encode(batch_of_version_1(Kind.OBSERVATION)),
+    "state_batch": lambda: wire.encode(batch_of_version_1(Kind.STATE)),
     "ack": lambda: wire.encode_ack(*acknowledgement()),
     "alert": lambda: wire.encode_alert(alert()),
 }

@@ -8,29 +8,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.fusion.belief import FULL, PackedArray
-from fleet_service.fusion.store.records import CELL, NONE, SOURCES, Int32Array, Rows, UIntArray
+from fleet_service.fusion.store.records import CELL, NONE, SOURCES, Int32Array, Rows, UInt16Array, UIntArray
 from schemas import mugrid
-from schemas.numeric import Float32Array, IntArray
+from schemas.numeric import ByteArray, Float32Array, IntArray
 from schemas.runtime.jit import LINE, refcount_free, refcount_free_inlined
 from schemas.runtime.records import RecordArray
 
 
 class Cells(NamedTuple):
     """What is known of each slot: `belief` (n, 32) in 16 bits, see `belief.unpack`, and the columns (n,) of
-    `records.CellRecord`; `untrusted` is (n, 2)."""
+    `records.CellRecord`; `untrusted` is (n, 2), `manoeuvres` (n, 4)."""
 
     belief: PackedArray
     key: IntArray
     time: IntArray
     first: IntArray
     returned: NDArray[np.uint64]
-    aged: Float32Array
     visits: UIntArray
     vehicles: UIntArray
     values: Float32Array
-    untrusted: Float32Array
     window: Int32Array
     reporters: Int32Array
+    aged: UInt16Array
+    used: ByteArray
+    shared: ByteArray
+    untrusted: UInt16Array
+    manoeuvres: ByteArray
 
 
 def cells_of(rows: Rows) -> Cells:

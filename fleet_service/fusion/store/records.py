@@ -24,6 +24,12 @@ SOURCES: Final = 5  # remembered per slot of each side: as many as an alert ever
 # What a vehicle reported last, its mean, standard deviation and votes spent, is remembered in 16 bits: parts of 1/FINE,
 # and below 4 all. In the window as before the checkpoint, so that it does not matter which of the two is asked.
 FINE: Final = 16384.0
+AGED: Final = 4096.0  # likewise; never more than FORGET_S
+USED: Final = 100.0
+SHARED: Final = 400.0
+WEIGHT: Final = 16.0
+UNTRUSTED: Final = 64.0
+MANOEUVRES: Final = 4
 
 Int32Array = NDArray[np.int32]
 UIntArray = NDArray[np.uint32]
@@ -39,26 +45,32 @@ class CellRecord:
         first: first one [ns].
         returned: a bit for each remainder of the vehicles whose visits were forgotten, so that who comes back is not
             counted as another.
-        aged: seconds before `time` that the belief has not forgotten yet.
         visits: observations.
         vehicles: distinct vehicles.
         values: votes with a value, fractions of repeated ones summed.
-        untrusted: bounds and values of vehicles that are not trusted, as far as they are not renewed.
         window: row of the slot's window, or NONE.
         reporters: row of its recent reporters, or NONE where nobody gave a value or corroborated anything lately.
+        aged: time before `time` that the belief has not forgotten yet, in parts of 1/AGED s.
+        used: grip used by who gave values, mean by weight; in parts of 1/USED.
+        shared: relative standard deviation that their values share, likewise; in parts of 1/SHARED.
+        untrusted: bounds and values of vehicles that are not trusted, as far as not renewed; in parts of 1/UNTRUSTED.
+        manoeuvres: weight of the values by manoeuvre, see `shared`; in parts of 1/WEIGHT.
     """
 
     key: int
     time: int
     first: int
     returned: np.uint64
-    aged: np.float32
     visits: np.uint32
     vehicles: np.uint32
     values: np.float32
-    untrusted: Annotated[Float32Array, 2]
     window: np.int32
     reporters: np.int32
+    aged: np.uint16
+    used: np.uint8
+    shared: np.uint8
+    untrusted: Annotated[UInt16Array, 2]
+    manoeuvres: Annotated[ByteArray, MANOEUVRES]
 
 
 class EntryRecord:
@@ -79,6 +91,10 @@ class EntryRecord:
         mean, std, slippery: of the vote.
         number, boot, sequence: order entries of equal times: the vehicle's number, its start, the row in its stream.
         evidence: likelihood in steps, see `likelihoods.evidence`.
+        used, shared: grip used, and what its value shares with others, in parts of 1/USED and 1/SHARED.
+        bias, bias_class, spread_class, slope: what is known of the vehicle's own error, see `standing.classes`.
+        manoeuvre: see `shared`.
+        old: whether it came late, and is compared with nobody.
     """
 
     previous: np.int32
@@ -103,7 +119,14 @@ class EntryRecord:
     boot: int
     sequence: int
     evidence: Annotated[ByteArray, mugrid.BINS]
-    unused: int
+    used: np.uint8
+    shared: np.uint8
+    bias: np.int8
+    bias_class: np.int8
+    spread_class: np.int8
+    manoeuvre: np.int8
+    old: np.int8
+    slope: np.int8
 
 
 class WindowRecord:
@@ -149,23 +172,35 @@ class SourcesRecord:
 
 class ReportersRecord:
     """The recent reporters of a slot: the last REPORTERS vehicles that gave a value before the checkpoint, when [s] and
-    what; and the corroborating sources."""
+    what, the relative variance of its own part, the grip used and the manoeuvre; and the corroborating sources."""
 
     reporter: Annotated[Int32Array, c.REPORTERS]
     time: Annotated[UIntArray, c.REPORTERS]
     mean: Annotated[Float32Array, c.REPORTERS]
     std: Annotated[Float32Array, c.REPORTERS]
+    own: Annotated[Float32Array, c.REPORTERS]
+    used: Annotated[Float32Array, c.REPORTERS]
+    manoeuvre: Annotated[Int32Array, c.REPORTERS]
     source: Annotated[Int32Array, 2, SOURCES]
     source_time: Annotated[UIntArray, 2, SOURCES]
 
 
 class PeersRecord:
-    """Whom a vehicle was compared with: the other, the rank of their pair, agreement and comparisons, summed."""
+    """Whom a vehicle was compared with: the other, the rank of their pair, agreement and comparisons, summed; weight of
+    the relative differences of their values, and the differences by weight; squared differences beyond what both say of
+    themselves, and what they say; squares of the differences of their use, and their products with those of the values,
+    by weight."""
 
     other: Annotated[Int32Array, c.PEERS]
     rank: Annotated[Int32Array, c.PEERS]
     agreed: Annotated[Float32Array, c.PEERS]
     met: Annotated[Float32Array, c.PEERS]
+    weight: Annotated[Float32Array, c.PEERS]
+    difference: Annotated[Float32Array, c.PEERS]
+    stated: np.float32
+    found: np.float32
+    used_squares: np.float32
+    used_products: np.float32
 
 
 class VehicleRecord:

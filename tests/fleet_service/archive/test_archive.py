@@ -206,7 +206,7 @@ def test_keys_are_for_the_service_alone_and_a_destroyed_one_forgets(tmp_path: Pa
     assert Pseudonyms(tmp_path).of("sim-001", now) != name
 
 
-def test_a_late_observation_is_archived_with_its_mark_and_not_fused(engine: Engine, tmp_path: Path) -> None:
+def test_a_late_observation_is_archived_with_its_mark_and_fused_as_old_news(engine: Engine, tmp_path: Path) -> None:
     now = time.time_ns()
     old = batch("sim-002", 1, now - 1000 * SECOND, [0.3])
     engine.ingest([sent("sim-001", 1)], now)
@@ -215,8 +215,8 @@ def test_a_late_observation_is_archived_with_its_mark_and_not_fused(engine: Engi
     assert engine.counts["late"] == 1
     (table,) = reading.read(tmp_path, Kind.OBSERVATION)
     assert sorted(zip(table["late"].to_pylist(), table["weight"].to_pylist(), strict=True)) == [
-        (False, 0.75), (False, 0.75), (True, 0.0),
+        (False, 0.75), (False, 0.75), (True, 0.75),
     ]  # fmt: skip
     engine.close()
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
-        np.testing.assert_array_equal(again.fusion.live.visits[: again.fusion.size], [2])
+        np.testing.assert_array_equal(again.fusion.live.visits[: again.fusion.size], [3])

@@ -42,7 +42,9 @@ def old(tmp_path: Path) -> Path:
 
 
 def same(found: dict[str, Any], made: dict[str, Any]) -> None:
-    """The map is the one that the old code made, to what single precision and another machine's logarithm leave."""
+    """The map is the one that is kept beside, to what single precision and another machine's logarithm leave.
+
+    Its beliefs are what this fusion makes of the archive: one that thinks otherwise writes them anew, and says why."""
     assert found["at"] == made["at"]
     np.testing.assert_allclose(found["beliefs"], made["beliefs"], rtol=0.0, atol=1e-6)
     for now, line in zip(found["cells"], made["cells"], strict=True):
@@ -67,7 +69,9 @@ def test_the_kept_archive_is_of_the_first_version_and_holds_every_kind_of_file(o
 
 
 @pytest.mark.parametrize("begin", ["checkpoint", "log"])
-def test_a_service_on_the_kept_archive_has_the_map_that_it_was_made_with(old: Path, begin: str) -> None:
+def test_a_service_on_the_kept_archive_makes_the_same_map_of_it_with_its_checkpoint_and_without(
+    old: Path, begin: str
+) -> None:
     if begin == "log":
         drop_checkpoints(old)
     with closing(Engine(ServiceConfig(), old)) as engine:

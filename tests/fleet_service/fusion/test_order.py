@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_service.fusion import Fusion, Observations, Updated
+from fleet_service.fusion.fuse import Before
 from schemas import mugrid
 from schemas.numeric import IntArray
 from tests.fleet_service.examples import CELL, at_least, observations, value
@@ -65,20 +66,22 @@ def test_a_replay_with_the_weights_that_were_used_gives_the_same_map() -> None:
     order = delayed(o, 300.0, 4)
     fusion, told = fold_in(o, order, 300)
     late, weight = np.zeros(3000, bool), np.zeros(3000, np.float32)
+    late_by, error = np.zeros(3000, np.int64), np.zeros((3000, 4), np.float32)
     for rows, updated in told:
         late[rows], weight[rows] = updated.late, updated.weight
+        late_by[rows], error[rows] = updated.late_by, updated.error
     assert 0 < late.sum() < 2000
     assert len(np.unique(weight)) > 5
     again = Fusion(LATENESS_S)
-    again.update(o, weight, late)
+    again.update(o, Before(late, late_by, weight, error))
     assert difference(fusion, again) <= 1e-6
     assert [again.trust(v) for v in range(12)] == pytest.approx([fusion.trust(v) for v in range(12)], abs=1e-6)
 
 
-def test_an_observation_before_the_checkpoint_is_late_and_changes_nothing() -> None:
+def test_an_observation_long_before_the_checkpoint_is_late_and_changes_nothing() -> None:
     fusion = Fusion(LATENESS_S)
     fusion.update(observations([0.0], [1], value([0.8])))
-    fusion.update(observations([400.0], [2], value([0.8])))
+    fusion.update(observations([20_000.0], [2], value([0.8])))
     before = fusion.live.belief[0].copy()
     updated = fusion.update(observations([100.0], [3], value([0.2])))
     assert updated.late.tolist() == [True]

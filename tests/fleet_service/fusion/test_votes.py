@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from fleet_service.fusion import Fusion
 from fleet_service.fusion import constants as c
+from fleet_service.fusion.fuse import Before
 from fleet_service.fusion.likelihoods import evidence, levelled
 from schemas import mugrid
 from tests.fleet_service.examples import (
@@ -159,6 +160,7 @@ def test_a_flood_of_one_vehicle_is_bounded_in_the_window_and_told_as_not_fused()
     fusion.update(observations([70.0], [8], value([0.5])))
     assert fusion.waiting == c.WAITING_MOST + 1
     again = Fusion(120.0)
-    again.update(o, np.concatenate([f.weight for f in updated]), np.concatenate([f.late for f in updated]))
+    told = (np.concatenate(of) for of in zip(*((f.late, f.late_by, f.weight, f.error) for f in updated), strict=True))
+    again.update(o, Before(*told))
     again.update(observations([70.0], [8], value([0.5])))
     np.testing.assert_array_equal(belief(again), belief(fusion))

@@ -71,9 +71,9 @@ def test_a_single_visit_without_bias_is_calibrated() -> None:
     mu, who = rng.uniform(0.2, 1.0, n), np.zeros(n, np.int64)
     exactly = agent.Errors(np.zeros(1), np.zeros(1), np.zeros(1))
     along = np.tile(np.arange(4), n // 4)
-    reports = agent.report(
-        rng, exactly, who, mu, np.zeros(n), agent.shares(rng, np.ones(n, bool)), agent.noise(rng, along)
-    )
+    sure = np.ones(n, bool)
+    passes = agent.Passes(who, mu, np.zeros(n), agent.shares(rng, sure), agent.noise(rng, along), who, sure)
+    reports = agent.report(rng, exactly, passes)
     belief = np.exp(reports.log_likelihood - reports.log_likelihood.max(axis=1, keepdims=True))
     belief /= belief.sum(axis=1, keepdims=True)
     assert coverage(of_beliefs(belief, mu, who + 1)) == pytest.approx(0.9, abs=0.015)
@@ -86,18 +86,17 @@ def test_vehicles_of_one_place_share_an_error_and_more_of_them_do_not_average_it
     assert np.std(common) == pytest.approx(agent.COMMON, rel=0.15)
     n, mu = 4000, 0.6
     errors = agent.Errors(np.zeros(n), np.zeros(n), np.zeros(n))
-    readings = agent.report(
-        rng, errors, np.arange(n), np.full(n, mu), np.full(n, 0.05), np.ones(n), rng.normal(size=n)
-    ).reading  # fmt: skip
+    who, sure = np.arange(n), np.ones(n, bool)
+    passes = agent.Passes(who, np.full(n, mu), np.full(n, 0.05), np.ones(n), rng.normal(size=n), 0 * who, sure)
+    readings = agent.report(rng, errors, passes).reading
     assert readings.mean() - mu == pytest.approx(0.05 * mu, abs=0.005)
 
 
 def test_an_unexcited_visit_is_flat_above_the_grip_used_within_half_a_nat() -> None:
     rng = np.random.default_rng(2)
     n, who = 500, np.arange(500)
-    reports = agent.report(
-        rng, agent.Errors.draw(rng, n), who, np.full(n, 0.8), np.zeros(n), np.full(n, 0.2), np.zeros(n)
-    )
+    passes = agent.Passes(who, np.full(n, 0.8), np.zeros(n), np.full(n, 0.2), np.zeros(n), 0 * who, who < 0)
+    reports = agent.report(rng, agent.Errors.draw(rng, n), passes)
     above = reports.log_likelihood[:, mugrid.CENTRES > 0.35]
     assert np.ptp(above, axis=1).max() <= agent.SLOPE_NATS
 

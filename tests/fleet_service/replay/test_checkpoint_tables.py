@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from fleet_service.fusion import Fusion
-from fleet_service.replay.checkpoint_tables import FORMER, fusion_from, tables_of
+from fleet_service.replay.checkpoint_tables import fusion_from, tables_of
 from schemas.errors import InputError
 from tests.fleet_service.fusion.test_order import LATENESS_S, delayed, drive
 from tests.fleet_service.fusion.test_weather import RAIN, reports
@@ -44,22 +44,6 @@ def test_a_fusion_from_its_checkpoint_goes_on_bit_for_bit_as_the_one_that_never_
     for name in ("visits", "vehicles", "values", "returned", "untrusted"):
         np.testing.assert_array_equal(getattr(again.live, name)[there], getattr(whole.live, name)[: whole.size])
     assert [again.trust(v) for v in range(13)] == [whole.trust(v) for v in range(13)]
-
-
-@pytest.mark.parametrize("version", FORMER)
-def test_a_checkpoint_of_a_former_version_is_read_under_its_own_names(version: str) -> None:
-    o, fusion = drive(11, 1500, 900.0), Fusion(LATENESS_S)
-    fusion.update(o)
-    then = {now: name for name, now in FORMER[version].items()}
-    tables = {
-        then.get(name, name): table.replace_schema_metadata({"gripmap.checkpoint": version})
-        for name, table in tables_of(fusion).items()
-    }
-    again, slots = fusion_from(stored(tables), LATENESS_S), np.arange(fusion.size)
-    np.testing.assert_array_equal(again.believed(slots), fusion.believed(slots))
-    assert again.waiting == fusion.waiting > 0
-    with pytest.raises(InputError, match="not of version"):
-        fusion_from(tables | {"used": tables_of(fusion)["used"]}, LATENESS_S)
 
 
 def test_another_version_or_half_a_checkpoint_is_refused() -> None:

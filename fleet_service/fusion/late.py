@@ -1,0 +1,69 @@
+"""What comes later than the checkpoint: fused at the checkpoint, as what it tells of the road at that time. Pure.
+
+A road that changes is a Markov chain which leaves the uniform belief uniform and in which both directions of time are
+alike (a diffusion that reflects at the ends, and a change to anything). So the likelihood of the road at the
+checkpoint, given what was measured at time t before it, is
+
+    L_C(μ) = Σ_ν P(μ_t = ν | μ_C = μ)·L(ν) = what forgetting makes of L over C - t
+
+and a late visit to a cell where nobody was meanwhile is fused as it would have been in time. Where others were, it
+counts beside them as an old word about the road now. Late visits stand in the window like all others, the newest
+first, so that of one vehicle's own the newest counts, and their order of arrival between two checkpoints is nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from fleet_service.fusion import constants as c
+from fleet_service.fusion.belief import PADDED, PRIOR, forget, largest
+from fleet_service.fusion.observations import Observations
+from fleet_service.fusion.weather import Weather, aged
+from schemas import grid, mugrid
+from schemas.numeric import ByteArray, IntArray
+from schemas.runtime.jit import compiled
+from schemas.thresholds import NS
+
+LATE_MOST_NS: Final = int(c.CHANGE_S) * NS  # older news is mostly of another road
+_PLACES_NS: Final = NS  # after the checkpoint, in which late visits stand
+_FLOOR: Final = mugrid.FLOOR_STEPS
+
+
+def fused_at(time: IntArray, checkpoint: int) -> IntArray:
+    """When late visits of `time` (n,) [ns] stand in the window: within a second, the newest first; whole µs."""
+    age = np.clip(checkpoint - time, 0, LATE_MOST_NS)
+    return np.asarray(checkpoint + age // (LATE_MOST_NS // _PLACES_NS) // 1000 * 1000)
+
+
+def delayed(o: Observations, late_by: IntArray, weather: Weather) -> Observations:
+    """The observations, those with `late_by` (n,) [ns] above nought moved on by it."""
+    rows = np.flatnonzero(late_by)
+    evidence = o.evidence.copy()
+    evidence[rows] = aged_evidence(
+        o.evidence[rows], o.cell[rows] * grid.SECTORS, o.time[rows], o.time[rows] + late_by[rows], weather
+    )
+    return replace(o, time=o.time + late_by, evidence=evidence)
+
+
+@compiled
+def aged_evidence(evidence: ByteArray, key: IntArray, begin: IntArray, end: IntArray, weather: Weather) -> ByteArray:
+    """Likelihoods (n, 32) in steps of roads `key` (n,) at `begin`, as likelihoods of the same roads at `end` [ns]."""
+    out = np.empty_like(evidence)
+    likelihood, padded = np.empty(mugrid.BINS, np.float32), np.empty(PADDED, np.float32)
+    for n in range(len(evidence)):
+        whole = np.float32(0.0)
+        for i in range(mugrid.BINS):
+            likelihood[i] = np.exp(-np.float32(evidence[n, i]) / mugrid.STEPS_PER_NAT)
+            whole += likelihood[i]
+        for i in range(mugrid.BINS):
+            likelihood[i] /= whole
+        drift, change, _ = aged(weather, key[n], begin[n], end[n])
+        forget(likelihood, drift, change, PRIOR, padded)
+        most = largest(likelihood)
+        for i in range(mugrid.BINS):
+            steps = mugrid.STEPS_PER_NAT * np.log(most / max(likelihood[i], np.float32(1e-30)))
+            out[n, i] = np.uint8(min(steps + 0.5, float(_FLOOR)))
+    return out

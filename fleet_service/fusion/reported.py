@@ -1,0 +1,61 @@
+"""Values as they were reported: mean, standard deviation and P(slippery) of a likelihood. Compiled, pure.
+
+Whether vehicles agree, whether one reports something new, and whom an alert may call a source is judged by what was
+reported; what is made of it for the belief (`belief.convolve_bias`) is wider.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_service.fusion import constants as c
+from fleet_service.fusion.belief import SLIPPERY_SHARE
+from schemas import mugrid
+from schemas.numeric import ByteArray, Float32Array
+from schemas.runtime.jit import compiled
+
+_LIKELIHOOD: Final = np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT)
+
+
+class Evidence(NamedTuple):
+    """Likelihoods as they are used (n, 32) in steps, and values as they were reported (n, 3): mean, standard deviation
+    and P(slippery) against the uniform prior; NaN for a bound."""
+
+    steps: ByteArray
+    reported: Float32Array
+
+
+def as_reported(steps: NDArray[Any]) -> Evidence:
+    """Likelihoods (n, 32) in steps, brought to maximum 0, and the values among them described."""
+    out, reported = steps.astype(np.uint8), np.full((len(steps), 3), np.nan, np.float32)
+    _describe(out, reported)
+    return Evidence(out, reported)
+
+
+@compiled
+def _describe(steps: ByteArray, reported: Float32Array) -> None:
+    likelihood = np.empty(mugrid.BINS)
+    for n in range(len(steps)):
+        least = np.uint8(255)
+        for j in range(mugrid.BINS):
+            least = min(least, steps[n, j])
+        for j in range(mugrid.BINS):
+            steps[n, j] -= least
+            likelihood[j] = _LIKELIHOOD[steps[n, j]]
+        if steps[n, mugrid.BINS - 1] < c.VALUE_DROP_STEPS:
+            continue
+        whole, first, second, slippery = 0.0, 0.0, 0.0, 0.0
+        for i in range(mugrid.BINS):
+            whole += likelihood[i]
+            first += likelihood[i] * mugrid.CENTRES[i]
+            slippery += likelihood[i] * SLIPPERY_SHARE[i]
+        mean = first / whole
+        for i in range(mugrid.BINS):
+            second += likelihood[i] * (mugrid.CENTRES[i] - mean) ** 2
+        reported[n, 0] = mean
+        reported[n, 1] = math.sqrt(second / whole + (c.BIAS_RELATIVE * mean) ** 2 + c.BIAS_ABSOLUTE**2)
+        reported[n, 2] = slippery / whole

@@ -1,0 +1,172 @@
+"""The error that all values of a place have in common, and what is left of a belief when it is integrated out. Pure.
+
+Vehicles that do the same in the same place err alike: by the tyre's shape, which they assume, and the more, the less of
+the grip they used; by what else belongs to the manoeuvre. No number of them averages it out; other manoeuvres do, and
+who uses more. So a belief is about what the *fleet* takes a road for, and whoever reads it gets the road:
+
+    road_i = Σ_j K_ij·p_j,    K_ij ∝ exp(-½·((μ_j - μ_i)/(μ_i·σ±))²),    rows sum to 1
+    σ₋² = σ_c² + clip(SHARED_SLOPE·(SHARED_SHARE - ū/μ_i), 0, SHARED_MOST)²  where μ_j < μ_i,    σ₊ = σ_c  above
+    σ_c² = COMMON_ALWAYS² + COMMON_MANOEUVRE²/n_eff + σ_s²·(a + (1 - a)/n_eff),    n_eff = (Σ w_k)²/Σ w_k²
+
+The error is one-sided, since only what reads low falls enough towards the upper end to be a value.
+
+A sender states all of its error, and what of that does not show between senders that do the same is what they share:
+σ_s² = SHARED_PART·(1 - κ²)·stated², relative, of the cell's values by weight; a = SHARED_ALWAYS. Where values are
+known to lie too low by a slope λ, a reading is stretched by 1/(1 - λ), and what it shares with it.
+
+Legend
+    ū     grip used by who gave values, mean by weight
+    w_k   weight of the values of manoeuvre k, as far as it is not renewed
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_service.fusion import constants as c
+from fleet_service.fusion.store.records import MANOEUVRES, SHARED, USED, WEIGHT
+from schemas import mugrid
+from schemas.numeric import ByteArray, Float32Array, FloatArray
+from schemas.runtime.jit import refcount_free, refcount_free_inlined
+from schemas.runtime.records import RecordArray
+from schemas.thresholds import NS
+
+DRIVING, BRAKING, LEFT, RIGHT = range(MANOEUVRES)
+UNKNOWN: Final = -1  # of a sender that does not tell: as most others do
+USED_STEP: Final = 0.08  # of the table's rows
+USED_ROWS: Final = 16
+STATED: Final = (0.0, 0.03, 0.06, 0.1, 0.15, 0.2)  # σ_s of the table; the nearest one is taken
+_BORDERS: Final = tuple(0.5 * (a + b) for a, b in pairwise(STATED))
+KINDS: Final = (1.0, 1.5, 2.2, 3.0)  # n_eff of the table's columns; the next smaller one is taken
+TENTH_NS: Final = 360 * NS  # weights fade at the borders of so much time
+_FADES: Final = np.exp(-np.arange(64) * TENTH_NS / NS / c.VOTE_RENEWAL_S).astype(np.float32)
+_MOST: Final = 255.0
+
+
+def manoeuvre_of(longitudinal: FloatArray, lateral: FloatArray) -> NDArray[np.int8]:
+    """Manoeuvre of visits (n,) by how they used the grip; UNKNOWN where that is NaN."""
+    along = np.abs(longitudinal) >= np.abs(lateral)
+    kind = np.where(along, np.where(longitudinal >= 0.0, DRIVING, BRAKING), np.where(lateral >= 0.0, LEFT, RIGHT))
+    return np.where(np.isfinite(longitudinal) & np.isfinite(lateral), kind, UNKNOWN).astype(np.int8)
+
+
+def shared_parts(reported: Float32Array, error: Float32Array) -> ByteArray:
+    """σ_s of values (n, 3) of vehicles with errors (n, 4), in parts of 1/SHARED; 0 of bounds."""
+    mean, std = np.nan_to_num(reported[:, 0], nan=1.0), np.nan_to_num(reported[:, 1])
+    stated = np.square(std / np.maximum(mean, mugrid.LOWER)) - c.BIAS_RELATIVE**2
+    hidden = c.SHARED_PART * np.clip(1.0 - np.square(error[:, 2]), 0.0, None) * np.clip(stated, 0.0, 0.25)
+    stretched = (c.COMMON_ALWAYS**2 + c.COMMON_MANOEUVRE**2) * (np.square(1.0 / (1.0 - error[:, 3])) - 1.0)
+    return np.asarray((np.clip(np.sqrt(hidden + stretched), 0.0, STATED[-1]) * SHARED).astype(np.uint8))
+
+
+def shared_kernel(used: float, kinds: float, stated: float) -> FloatArray:
+    """K of the mean grip used, the number of kinds of manoeuvre and what is shared of what is stated, (32, 32)."""
+    centres = mugrid.CENTRES
+    always = c.COMMON_ALWAYS**2 + c.COMMON_MANOEUVRE**2 / kinds
+    always += stated**2 * (c.SHARED_ALWAYS + (1.0 - c.SHARED_ALWAYS) / kinds)
+    shape = np.clip(c.SHARED_SLOPE * (c.SHARED_SHARE - used / centres), 0.0, c.SHARED_MOST)
+    above = np.hypot(np.sqrt(always) * centres, c.COMMON_ABSOLUTE)
+    below = np.hypot(above, shape * centres)
+    away = centres[None, :] - centres[:, None]
+    kernel = np.exp(-0.5 * np.square(away / np.where(away < 0.0, below[:, None], above[:, None])))
+    return np.asarray(kernel / kernel.sum(axis=1, keepdims=True))
+
+
+def base_kernel() -> FloatArray:
+    """K where nobody gave a value: what bounds have in common, (32, 32)."""
+    std = np.hypot(c.COMMON_RELATIVE * mugrid.CENTRES, c.COMMON_ABSOLUTE)[:, None]
+    kernel = np.exp(-0.5 * np.square((mugrid.CENTRES[None, :] - mugrid.CENTRES[:, None]) / std))
+    return np.asarray(kernel / kernel.sum(axis=1, keepdims=True))
+
+
+def _table() -> Float32Array:
+    """Kernels transposed, so that the bins of a road stand beside each other; `kernel_of` finds them, (…, 32, 32)."""
+    rows = [
+        shared_kernel((row + 0.5) * USED_STEP, kinds, stated).T
+        for row in range(USED_ROWS)
+        for kinds in KINDS
+        for stated in STATED
+    ]
+    return np.stack([base_kernel().T, *rows]).astype(np.float32)
+
+
+KERNELS: Final = _table()  # handed to kernels: a global of this size is not kept in their cache
+
+
+@refcount_free_inlined
+def kernel_of(cells: RecordArray, row: int) -> int:
+    """Which kernel reads a row of cells."""
+    whole, squares = 0.0, 0.0
+    for k in range(MANOEUVRES):
+        weight = float(cells[row].manoeuvres[k])
+        whole += weight
+        squares += weight * weight
+    if whole == 0.0:
+        return 0
+    kinds, column = whole * whole / squares, 0
+    for k in range(1, len(KINDS)):
+        if kinds >= KINDS[k]:
+            column = k
+    used = min(int(cells[row].used / (USED * USED_STEP)), USED_ROWS - 1)
+    stated, place = cells[row].shared / SHARED, 0
+    for border in _BORDERS:
+        place += stated >= border
+    return 1 + (used * len(KINDS) + column) * len(STATED) + place
+
+
+@refcount_free_inlined
+def read_road(kernels: Float32Array, cells: RecordArray, row: int, p: FloatArray, road: FloatArray) -> None:
+    """Belief about the road of a belief `p` (32) about what the fleet takes it for; sums to one."""
+    kernel = kernels[kernel_of(cells, row)]
+    for i in range(mugrid.BINS):
+        road[i] = 0.0
+    for j in range(mugrid.BINS):
+        for i in range(mugrid.BINS):
+            road[i] += kernel[j, i] * p[j]
+    whole = 0.0
+    for i in range(mugrid.BINS):
+        whole += road[i]
+    for i in range(mugrid.BINS):
+        road[i] /= whole
+
+
+@refcount_free
+def note_value(cells: RecordArray, row: int, entries: RecordArray, entry: int, strength: float) -> None:
+    """Note an entry's value in its cell: manoeuvre, grip used, and what it shares with others; the gentler or wider it
+    is, the less it counts."""
+    used, shared = entries[entry].used / USED, entries[entry].shared / SHARED
+    gentle = used / (max(float(entries[entry].mean), mugrid.LOWER) * c.SHARED_SHARE)
+    weight = strength * min(max(gentle, c.SHARED_LEAST), 1.0) ** 2 / (1.0 + (shared / c.SHARED_WIDE) ** 2)
+    before, largest = 0.0, 0
+    for k in range(MANOEUVRES):
+        before += cells[row].manoeuvres[k]
+        if cells[row].manoeuvres[k] > cells[row].manoeuvres[largest]:
+            largest = k
+    part = weight / (before / WEIGHT + weight)
+    cells[row].used = _mean(cells[row].used, used * USED, part)
+    cells[row].shared = _mean(cells[row].shared, shared * SHARED, part)
+    kind = int(entries[entry].manoeuvre) if entries[entry].manoeuvre >= 0 else largest
+    added = cells[row].manoeuvres[kind] + weight * WEIGHT + 0.5
+    cells[row].manoeuvres[kind] = np.uint8(min(max(added, 1.0), _MOST))
+
+
+@refcount_free_inlined
+def _mean(before: int, new: float, part: float) -> np.uint8:
+    return np.uint8(min(before + part * (new - before) + 0.5, _MOST))
+
+
+@refcount_free
+def fade(cells: RecordArray, row: int, begin: int, end: int) -> None:
+    """Let the weights of the manoeuvres, and the votes of those that are not trusted, fade between two times [ns]."""
+    borders = min(end // TENTH_NS - begin // TENTH_NS, len(_FADES) - 1)
+    if borders > 0:
+        for k in range(2):
+            cells[row].untrusted[k] = np.uint16(cells[row].untrusted[k] * _FADES[borders])
+        for k in range(MANOEUVRES):
+            weight = cells[row].manoeuvres[k]
+            if weight > 0:  # never to nothing: that there were values is not forgotten
+                cells[row].manoeuvres[k] = np.uint8(max(weight * _FADES[borders], 1.0))

@@ -1,0 +1,155 @@
+"""Situations in which a map deceives itself: bounds by the hundred, an outage, gentle drivers on ice, a wet curve.
+
+Each is as short as it can be; the truth is known by construction. Pure.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from google.protobuf import json_format
+from numpy.random import Generator
+
+from fleet_service.fusion import Fusion, Observations, observations_of
+from fleet_service.fusion.weather import Reports
+from fleet_service.lab import agent, town
+from fleet_service.lab.agent import Errors, Passes
+from fleet_service.lab.drive import CELL, LATENESS_S, rows_of
+from fleet_service.lab.town import START, Visits
+from fleet_service.serve.alerts import Alerts
+from schemas import grid, mugrid, wire
+from schemas.numeric import FloatArray, IntArray
+from schemas.thresholds import GRAVITY, NS
+from schemas.wire import Batch, Kind
+
+USED: Final = (0.05, 0.12, 0.24, 0.48, 0.7)
+BOUNDED: Final = 100  # vehicles that only say "at least"
+BACKLOG: Final = 20  # vehicles of an outage
+HOUR_S: Final = 3600.0
+ICE, DRY = 0.18, 0.85
+FREEZING_C: Final = -1.0
+CARS, CURVES = 60, 20  # fleets on a wet curve
+WET, GENTLE = 0.60, 0.30
+WINTER: Final = agent.CLEAN._replace(share=(0.25, 0.35), low=0.65, tyres=-0.05, alike=1.0)
+VALUED: Final = 0.3  # of such passes look like values: a tenth to a third with common tyres
+
+
+def bounded(used: float, path: str) -> float:
+    """Lower end less `used`, or than the prior's, after BOUNDED vehicles that used so much, by one path of the wire."""
+    n, nan = BOUNDED, float("nan")
+    cell = np.full(n, CELL[0])
+    latitude, longitude = grid.centre(cell)
+    columns: dict[str, Any] = {
+        "enter_time": START + np.arange(n) * 5 * NS, "latitude": latitude, "longitude": longitude, "yaw": np.zeros(n),
+        "mu_utilised": np.full(n, used), "mu": np.full(n, nan), "mu_lower": np.full(n, nan),
+        "mu_upper": np.full(n, nan),
+    }  # fmt: skip
+    if "likelihood" in path:
+        above = np.where(used > mugrid.CENTRES, -6.0, 0.3 * mugrid.CENTRES)
+        columns["log_likelihood"] = np.tile(mugrid.encode_log_likelihood(above), (n, 1))
+    else:
+        columns |= {"mu": np.full(n, 0.9), "mu_lower": np.full(n, 0.2), "mu_upper": np.full(n, 1.14)}
+    fusion = Fusion(LATENESS_S)
+    for k in range(n):
+        one = {name: column[k : k + 1] for name, column in columns.items()}
+        fusion.update(_received(Batch(Kind.OBSERVATION, "car-1", 1, 0, 1, 1, one), k, as_json="json" in path))
+    slot = fusion.slots_of(CELL[:1], np.zeros(1, np.int64))
+    lower = float(mugrid.quantiles(fusion.beliefs(slot, int(fusion.live.time[slot[0]])), 0.05)[0])
+    return lower - max(used, float(mugrid.quantiles(mugrid.PRIOR, 0.05)))
+
+
+def _received(batch: Batch, vehicle: int, *, as_json: bool) -> Observations:
+    """A batch as the service reads it from its bytes."""
+    payload, encoding = wire.encode(batch), wire.ENCODING[Kind.OBSERVATION]
+    if as_json:
+        message = wire.MESSAGES[Kind.OBSERVATION].FromString(payload)
+        payload, encoding = json_format.MessageToJson(message).encode(), wire.JSON
+    found = wire.decode(payload, encoding, Kind.OBSERVATION)
+    columns = dict(found.columns)
+    given = columns["log_likelihood"].shape[1] > 0
+    if not given:
+        columns["log_likelihood"] = np.zeros((found.rows, mugrid.BINS), np.uint8)
+    identity = {"boot": 1, "region": found.region, "seq": 1, "row": 0}
+    columns |= {name: np.full(found.rows, value) for name, value in identity.items()}
+    columns["with_likelihood"] = np.full(found.rows, given)
+    return observations_of(columns, np.full(found.rows, vehicle))
+
+
+def lower_excess() -> float:
+    """The worst of all grips used and paths."""
+    paths = ("protobuf posterior", "json posterior", "protobuf likelihood", "json likelihood")
+    return max(bounded(used, path) for used in USED for path in paths)
+
+
+def backlog_fused(rng: Generator) -> float:
+    """Share of an hour's rows that are fused when they come after an outage, while another vehicle drives on."""
+    place, errors = town.build(rng, 60, 0.0), Errors.draw(rng, BACKLOG + 1)
+    visits = town.drive(rng, place, errors, 60)
+    o = observations_of(rows_of(visits), visits.vehicle)
+    live = o.vehicle == BACKLOG
+    fusion = Fusion(LATENESS_S)
+    fusion.update(o.take(live))
+    found = [fusion.update(o.take(rows)) for rows in np.array_split(np.flatnonzero(~live), 50)]
+    late = np.concatenate([updated.late for updated in found])
+    fused = np.concatenate([updated.late_by > 0 for updated in found])
+    return float(fused[late].mean())
+
+
+def safe_excess(rng: Generator) -> float:
+    """Safe deceleration less the truth's half an hour after black ice came under drivers who use a fifth of the grip,
+    on a road that was dry for an hour; the weather is known to be FREEZING_C, and nothing falls."""
+    seconds: FloatArray = np.concatenate([np.sort(rng.random(60)) * HOUR_S, HOUR_S + np.sort(rng.random(60)) * 1800.0])
+    icy = seconds >= HOUR_S
+    n, who = len(seconds), rng.integers(0, 40, len(seconds))
+    share: FloatArray = np.where(icy, 0.2, rng.uniform(0.6, 1.0, n))
+    mu: FloatArray = np.where(icy, ICE, DRY)
+    nothing = np.zeros(n, np.int64)
+    passes = Passes(who, mu, np.zeros(n), share, rng.normal(size=n), nothing, ~icy)
+    reports = agent.report(rng, Errors.draw(rng, 40), passes)
+    visits = Visits(seconds, who, nothing, mu, ~icy, reports)
+    fusion = Fusion(LATENESS_S)
+    fusion.update_weather(_weather(FREEZING_C))
+    fusion.update(observations_of(rows_of(visits), who))
+    slot = fusion.slots_of(CELL[:1], np.zeros(1, np.int64))
+    lower = mugrid.quantiles(fusion.beliefs(slot, START + int((HOUR_S + 1800.0) * NS)), 0.05)
+    return GRAVITY * (float(lower[0]) - ICE)
+
+
+def _weather(temperature: float) -> Reports:
+    nothing = np.full((1, mugrid.BINS), np.nan)
+    region = grid.region_of(CELL[:1])
+    value: FloatArray = np.array([temperature])
+    reports = [Reports(region, np.array([START + h * 3600 * NS]), value, value, 0.0 * value, nothing) for h in (0, 1)]
+    return Reports(*(np.concatenate(of) for of in zip(*(vars(r).values() for r in reports), strict=True)))
+
+
+def false_alert(rng: Generator) -> bool:
+    """Whether CARS on winter tyres whom nobody knows, who all take a wet curve gently, make an alert of it."""
+    n, who = CARS, np.arange(CARS)
+    share = rng.uniform(*WINTER.share, n)
+    valued = rng.random(n) < VALUED
+    mu: FloatArray = np.full(n, WET)
+    common = np.full(n, WINTER.common * rng.normal())
+    turning: IntArray = np.full(n, 2)
+    passes = Passes(who, mu, common, share, rng.normal(size=n), turning, valued)
+    seconds = np.asarray(20.0 * who, np.float64)
+    visits = Visits(seconds, who, 0 * who, mu, valued, agent.report(rng, Errors.draw(rng, n, WINTER), passes))
+    o, fusion = observations_of(rows_of(visits), who), Fusion(LATENESS_S)
+    alerts, raised = Alerts(fusion), False
+    for k in range(n):
+        raised |= any(alert.raised for alert in alerts.updated(fusion.update(o.take(np.array([k]))).slots))
+    return raised
+
+
+def measure(seeds: range) -> dict[str, float]:
+    """All situations."""
+    few = seeds[:4]
+    return {
+        "fusion.bounds.lower_excess": lower_excess(),
+        "fusion.backlog.fused": min(backlog_fused(np.random.default_rng([seed, 13])) for seed in few),
+        "fusion.gentle_after_dry.safe_excess": max(safe_excess(np.random.default_rng([seed, 17])) for seed in few),
+        "fusion.same_manoeuvre.false_alerts": float(
+            sum(false_alert(np.random.default_rng([seeds[0], 19, k])) for k in range(CURVES))
+        ),
+    }

@@ -1,0 +1,37 @@
+"""The lower end exceeds what somebody used by no more than its own error, by whatever path and however many."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fleet_service.fusion import Fusion
+from fleet_service.fusion import constants as c
+from fleet_service.fusion.likelihoods import levelled
+from fleet_service.lab import situations
+from schemas import mugrid
+from tests.fleet_service.examples import at_least, belief, interval, observations
+
+PATHS = ("protobuf posterior", "json posterior", "protobuf likelihood", "json likelihood")
+
+
+@pytest.mark.parametrize("path", PATHS)
+@settings(max_examples=6, deadline=None)
+@given(st.floats(0.0, 0.53))  # from .54 on the posterior of .9 is a value
+def test_a_hundred_vehicles_are_no_more_than_one_by_every_path(path: str, used: float) -> None:
+    assert situations.bounded(used, path) <= c.UTILISED_STD
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.floats(0.1, 0.9), st.integers(1, 400))
+def test_any_number_of_bounds_leaves_a_belief_that_is_flat_above_what_was_used(used: float, vehicles: int) -> None:
+    fusion = Fusion(120.0)
+    o = observations(np.arange(vehicles) * 2.0, np.arange(vehicles), at_least(np.full(vehicles, used)))
+    fusion.update(replace(o, evidence=levelled(o.evidence, np.full(vehicles, used))))
+    lower, upper = interval(belief(fusion))
+    assert lower <= max(used, interval(mugrid.PRIOR)[0]) + c.UTILISED_STD
+    assert upper >= interval(mugrid.PRIOR)[1] - 0.02

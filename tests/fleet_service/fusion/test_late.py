@@ -1,0 +1,64 @@
+"""Late is old, not nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fleet_service.fusion import Fusion, Updated
+from fleet_service.fusion import constants as c
+from fleet_service.fusion.fuse import Before
+from tests.fleet_service.examples import CELL, START, belief, observations, slippery, value
+from tests.fleet_service.fusion.test_order import difference, drive
+
+LIVE = observations([3600.0], [50], value([0.8]), cell=CELL + 9)  # somebody reports "now"
+
+
+def late(order: np.ndarray, parts: int) -> tuple[Fusion, list[tuple[np.ndarray, Updated]]]:
+    """An hour's backlog after a live report."""
+    fusion = Fusion(120.0)
+    fusion.update(LIVE)
+    o = drive(7, 400, 3000.0)
+    return fusion, [(rows, fusion.update(o.take(rows))) for rows in np.array_split(order, parts)]
+
+
+def test_a_backlog_of_an_hour_is_fused_and_its_order_of_arrival_is_nothing() -> None:
+    straight, told = late(np.arange(400), 4)
+    mixed, _ = late(np.random.default_rng(1).permutation(400), 37)
+    assert all(updated.late.all() for _, updated in told)
+    fused = np.concatenate([updated.late_by > 0 for _, updated in told])
+    assert fused.mean() > 0.95
+    assert difference(straight, mixed) <= 1e-6
+
+
+def test_a_late_visit_to_a_cell_where_nobody_was_counts_as_it_would_have_in_time() -> None:
+    o, found = observations([600.0], [1], value([0.2])), []
+    for parts in ((o, LIVE), (LIVE, o)):
+        fusion = Fusion(120.0)
+        for part in parts:
+            fusion.update(part)
+        found.append(belief(fusion, now=START + 3600 * 10**9))
+    assert 0.5 < slippery(found[0]) < 0.95
+    np.testing.assert_allclose(found[0], found[1], atol=0.02)
+
+
+def test_what_is_older_than_the_forgetting_time_is_archived_and_not_fused() -> None:
+    fusion = Fusion(120.0)
+    fusion.update(observations([c.CHANGE_S + 1000.0], [50], value([0.8]), cell=CELL + 9))
+    updated = fusion.update(observations([100.0], [1], value([0.2])))
+    assert updated.late.all()
+    assert not updated.late_by.any()
+    assert not len(updated.slots)
+
+
+def test_a_replay_fuses_what_was_late_where_it_was_fused() -> None:
+    fusion, told = late(np.random.default_rng(2).permutation(400), 5)
+    o, n = drive(7, 400, 3000.0), 400
+    found = Before(np.zeros(n, bool), np.zeros(n, np.int64), np.zeros(n, np.float32), np.zeros((n, 4), np.float32))
+    for rows, updated in told:
+        found.late[rows], found.late_by[rows] = updated.late, updated.late_by
+        found.weight[rows], found.error[rows] = updated.weight, updated.error
+    again = Fusion(120.0)
+    first = again.update(LIVE)
+    assert not first.late.any()
+    again.update(o, found)
+    assert difference(fusion, again) <= 1e-6

@@ -1,0 +1,44 @@
+"""Values are described as they were reported, whatever is made of them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from fleet_service.fusion import Fusion
+from fleet_service.fusion import constants as c
+from fleet_service.fusion.likelihoods import evidence
+from fleet_service.fusion.reported import as_reported
+from schemas import mugrid
+from tests.fleet_service.examples import CELL, observations, value
+
+
+def told(mu: float, std: float = 0.05) -> np.ndarray:
+    """A value as bytes, (1, 32)."""
+    return mugrid.encode_log_likelihood(-0.5 * np.square((mugrid.CENTRES - mu) / std))[None]
+
+
+def test_a_value_is_described_as_it_was_told_and_a_bound_is_not() -> None:
+    steps, reported = as_reported(np.vstack([told(0.85), np.minimum(told(0.3), 200) + 7, 0 * told(0.3)]))
+    np.testing.assert_array_equal(steps[0], told(0.85)[0])
+    assert steps[1].min() == 0
+    assert reported[:2, 0] == pytest.approx([0.85, 0.3], abs=0.01)
+    assert reported[0, 1] == pytest.approx(np.hypot(0.05, np.hypot(c.BIAS_RELATIVE * 0.85, c.BIAS_ABSOLUTE)), rel=0.02)
+    assert reported[:2, 2] == pytest.approx([0.0, 0.97], abs=0.03)
+    assert np.isnan(reported[2]).all()
+
+
+def test_who_lies_is_compared_with_what_others_reported_and_not_with_what_is_used_of_it() -> None:
+    rng = np.random.default_rng(2)
+    fusion, n = Fusion(120.0), 1200
+    who = rng.integers(0, 12, n)
+    reading = np.where(who == 0, 0.25, 0.85 + 0.04 * rng.normal(size=n))
+    steps = mugrid.encode_log_likelihood(value(reading))
+    used = np.where(who == 0, 0.25, 0.5).astype(np.float32)
+    evidence_, reported = evidence({"log_likelihood": steps, "mu_utilised": used}, np.ones(n, bool))
+    o = observations(np.arange(n) * 1.0, who, value(reading))
+    o = dataclasses.replace(o, cell=CELL + np.arange(n) // 30, evidence=evidence_, reported=reported, used=used)
+    fusion.update(o)
+    assert fusion.trust(0) < 0.2 < 0.8 < fusion.trust(1)

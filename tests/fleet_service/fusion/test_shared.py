@@ -1,0 +1,62 @@
+"""What vehicles of one place have in common: no number of them averages it out, other manoeuvres do."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet_service.fusion import Fusion, shared
+from fleet_service.fusion import constants as c
+from schemas import mugrid
+from tests.fleet_service.examples import belief, interval, observations, value
+
+_rising = st.lists(st.floats(0.0, 1.0), min_size=32, max_size=32).map(np.sort).filter(lambda p: p.sum() > 0.1)
+
+
+@pytest.mark.parametrize("used", [0.1, 0.5, 1.0])
+@pytest.mark.parametrize("stated", [0.0, 0.2])
+def test_a_kernel_is_a_probability_for_every_road_and_leaves_the_prior_where_it_is(used: float, stated: float) -> None:
+    kernel = shared.shared_kernel(used, 1.0, stated)
+    np.testing.assert_allclose(kernel.sum(axis=1), 1.0, atol=1e-14)
+    np.testing.assert_allclose(kernel @ mugrid.PRIOR, mugrid.PRIOR, atol=1e-15)
+
+
+@given(_rising)
+def test_what_bounds_share_never_lowers_the_upper_end_of_a_rising_belief(p: np.ndarray) -> None:
+    road = shared.base_kernel() @ p
+    assert np.diff(road).min() >= -1e-12
+    assert mugrid.quantiles(road / road.sum(), 0.95) >= mugrid.quantiles(mugrid.PRIOR, 0.95) - 1e-9
+
+
+def width(used: float, manoeuvres: np.ndarray, mu: float = 0.6) -> float:
+    """Of the interval, after thirty vehicles that agree."""
+    fusion, n = Fusion(120.0), len(manoeuvres)
+    o = observations(np.arange(n) * 1.0, np.arange(n), value(np.full(n, mu)))
+    o = dataclasses.replace(o, used=np.full(n, used, np.float32), manoeuvre=manoeuvres.astype(np.int8))
+    fusion.update(o)
+    lower, upper = interval(belief(fusion))
+    return upper - lower
+
+
+def test_many_who_do_the_same_are_no_certainty_and_other_manoeuvres_make_it_surer() -> None:
+    same, mixed = np.full(30, shared.BRAKING), np.arange(30) % 4
+    spread = np.hypot(c.COMMON_ALWAYS, c.COMMON_MANOEUVRE) * 0.6
+    assert width(0.6, same) > 3.0 * spread
+    assert width(0.6, mixed) < 0.95 * width(0.6, same)
+    assert width(0.2, same) > 1.2 * width(0.6, same)
+
+
+def test_who_does_not_tell_what_it_did_did_the_same_as_all_others() -> None:
+    same = np.full(30, shared.BRAKING)
+    unknown = np.where(np.arange(30) % 2, shared.UNKNOWN, shared.BRAKING)
+    assert width(0.6, unknown) == pytest.approx(width(0.6, same), abs=1e-3)
+
+
+def test_a_manoeuvre_is_told_by_the_larger_part_of_the_grip_used() -> None:
+    along, across = np.array([0.5, -0.5, 0.1, 0.1, np.nan]), np.array([0.1, 0.1, 0.5, -0.5, 0.5])
+    expected = [shared.DRIVING, shared.BRAKING, shared.LEFT, shared.RIGHT, shared.UNKNOWN]
+    assert shared.manoeuvre_of(along, across).tolist() == expected
