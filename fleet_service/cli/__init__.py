@@ -54,7 +54,7 @@ COMMANDS: Final = (
                    "fleet-service export map --archive archive --out map.parquet"),
     ServiceCommand(
         "analyze",
-        "ask the archive: grip, worst, spells, before-after, vehicles, calibration, weather, replay",
+        "ask the archive: grip, worst, spells, before-after, vehicles, calibration, weather, change-rates, replay",
         "fleet-service analyze worst --archive archive --from 2026-01-01 --out worst.html",
     ),
     ServiceCommand("certs", "certificates and router configurations for everyone on a list",

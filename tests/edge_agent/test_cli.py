@@ -90,9 +90,9 @@ def test_replay_writes_one_row_per_sample_as_the_contract_says(drive: Path, tmp_
 def test_the_estimates_of_half_a_log_are_bit_for_bit_those_of_the_whole(drive: Path, tmp_path: Path) -> None:
     log, half = pq.read_table(drive / "log.parquet"), tmp_path / "half.parquet"
     pq.write_table(log.slice(0, 411), half)
-    assert main(replay(drive, tmp_path / "whole.out")) == 0
-    assert main(replay(drive, tmp_path / "half.out", log=half)) == 0
-    whole, first = pq.read_table(tmp_path / "whole.out"), pq.read_table(tmp_path / "half.out")
+    assert main(replay(drive, tmp_path / "whole.parquet")) == 0
+    assert main(replay(drive, tmp_path / "half-out.parquet", log=half)) == 0
+    whole, first = pq.read_table(tmp_path / "whole.parquet"), pq.read_table(tmp_path / "half-out.parquet")
     assert first.num_rows == 411
     for name in whole.column_names:
         expected, found = (np.array(table[name].to_pylist(), dtype=float)[:411] for table in (whole, first))
@@ -100,9 +100,9 @@ def test_the_estimates_of_half_a_log_are_bit_for_bit_those_of_the_whole(drive: P
 
 
 def test_publishing_changes_no_estimate(drive: Path, tmp_path: Path, router: Router, service: Service) -> None:
-    assert main(replay(drive, tmp_path / "plain.out")) == 0
-    assert main(replay(drive, tmp_path / "sent.out", "--publish", "--trust", *config(tmp_path, router))) == 0
-    assert pq.read_table(tmp_path / "plain.out").equals(pq.read_table(tmp_path / "sent.out"))
+    assert main(replay(drive, tmp_path / "plain.parquet")) == 0
+    assert main(replay(drive, tmp_path / "sent.parquet", "--publish", "--trust", *config(tmp_path, router))) == 0
+    assert pq.read_table(tmp_path / "plain.parquet").equals(pq.read_table(tmp_path / "sent.parquet"))
 
 
 def test_replay_publishes_observations_and_states_at_the_time_of_the_drive_and_waits(

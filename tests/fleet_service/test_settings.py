@@ -112,7 +112,7 @@ SETTINGS: Final[dict[str, tuple[object, Show]]] = {
     "lateness_s": (1000.0, of_engine(refused)),
     "clock_ahead_s": (120.0, of_engine(refused)),
     "oldest_s": (400.0, of_engine(refused)),
-    "public_vehicles": (2, of_engine(lambda engine: len(engine.tiles(time.time_ns())))),
+    "public_vehicles": (9, of_engine(lambda engine: len(engine.tiles(time.time_ns())))),
     "weather": ("{rain}", of_engine(lambda engine: engine.counts["weather"])),
     "compact_s": (10.0, of_jobs),
     "checkpoint_s": (10.0, of_jobs),

@@ -179,6 +179,7 @@ def test_a_reader_that_is_overtaken_begins_again(tmp_path: Path, monkeypatch: py
 
 
 def test_only_one_compacts_at_a_time(tmp_path: Path) -> None:
+    (tmp_path / "inbox").mkdir()
     with compacting(tmp_path), pytest.raises(InputError, match="^archive: .* is being compacted; "):
         compact(tmp_path)
     with pytest.raises(InputError, match="^archive: .* is no folder; "):

@@ -47,6 +47,7 @@ def test_old_raw_rows_go_and_their_roll_ups_stay(tmp_path: Path) -> None:
 
 
 def test_too_few_days_are_refused_since_a_batch_may_come_again(tmp_path: Path) -> None:
+    (tmp_path / "inbox").mkdir()
     with pytest.raises(InputError, match="^raw-days: 7 are too few "):
         retention.retire(tmp_path, 7, DATE)
 
@@ -124,7 +125,7 @@ def test_parts_are_exported(tmp_path: Path, what: str, ending: str, capsys: pyte
 @pytest.mark.parametrize(
     ("words", "start"),
     [
-        (["map", "--out", "map.parquet"], "error: to: there is no snapshot"),
+        (["map", "--snapshot", "--out", "map.parquet"], "error: to: there is no snapshot"),
         (["observations", "--out", "x.xls"], "error: out: x.xls has no known ending"),
         (["observations", "--from", "yesterday", "--out", "x.csv"], "error: from: 'yesterday' is no time"),
         (["observations", "--out", "/nowhere/at/all.csv"], "error: out: cannot write"),
@@ -133,6 +134,7 @@ def test_parts_are_exported(tmp_path: Path, what: str, ending: str, capsys: pyte
 def test_a_wrong_export_is_one_line(
     tmp_path: Path, words: list[str], start: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    (tmp_path / "inbox").mkdir()
     assert main(["export", *words, "--archive", str(tmp_path)]) == 2
     assert capsys.readouterr().err.startswith(start)
 
