@@ -54,7 +54,7 @@ def run(site: Site) -> list[Figure]:
         figure("faults.kill.acknowledged_lost", total["acknowledged_lost"]),
         figure("faults.kill.doubled", total["doubled"]),
         figure("faults.kill.unacknowledged_lost_at_end", total["lost"]),
-        # 7e-6 and more in quick runs, found in the last minutes of a session and not explained: the bar stands in the whole run
+        # over the bar in quick runs and not explained yet: the bar stands in the whole run
         _shown(site, "faults.kill.map_difference", difference, "of mu, its bounds, P(slippery)"),
         figure("faults.kill.upkeep", len(upkeep)),
         _shown(site, "faults.kill.kills", kills, "processes killed"),
