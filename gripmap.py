@@ -1,7 +1,8 @@
 """GripMap under one name: the public faces of `edge_agent` and `fleet_service`.
 
     import gripmap
-    bank = gripmap.create("fckf", [vehicle])
+    log, vehicle = gripmap.simulate_manoeuvre("slalom", mu=0.5)
+    bank = gripmap.make_bank("fckf", [vehicle])
 
 The distribution brings four top-level packages with plain names. Another package of such a name, a folder `schemas` of
 one's own for instance, may come first on the path and hide one of them: importing this module tells which and where.
@@ -39,14 +40,14 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401 whatever a face holds
     """A name of a face, loaded when it is first asked for."""
     for face in FACES:
         package = importlib.import_module(face)
-        if name in getattr(package, "__all__", ()):
+        if name in package.__all__:
             return getattr(package, name)
     raise AttributeError(f"gripmap has no {name!r}; it has {', '.join(__dir__())}")
 
 
 def __dir__() -> list[str]:
     """Every name of the faces."""
-    return sorted({name for face in FACES for name in getattr(importlib.import_module(face), "__all__", ())})
+    return sorted({name for face in FACES for name in importlib.import_module(face).__all__})
 
 
 def edge_agent_main() -> int:

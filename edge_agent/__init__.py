@@ -9,8 +9,7 @@ The names of `__all__` are what other programs may rely on; they are loaded when
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import Any
+from schemas.runtime import face
 
 _FACE = {
     "ESTIMATORS": "edge_agent.estimators",
@@ -23,7 +22,7 @@ _FACE = {
     "CHANNELS": "schemas.signals",
     "Block": "edge_agent.inputs.block",
     "estimate": "edge_agent.app.library",
-    "estimators": "edge_agent.app.library",
+    "known_estimators": "edge_agent.app.library",
     "load_memberships": "edge_agent.app.library",
     "load_vehicle": "edge_agent.app.library",
     "make_bank": "edge_agent.app.library",
@@ -32,16 +31,4 @@ _FACE = {
     "simulate_manoeuvre": "edge_agent.lab.simulation",
     "to_table": "edge_agent.app.library",
 }
-__all__ = sorted(_FACE)
-
-
-def __getattr__(name: str) -> Any:  # noqa: ANN401 whatever stands behind a name
-    """A name of the face."""
-    if name not in _FACE:
-        raise AttributeError(f"edge_agent has no {name!r}; its face is {', '.join(__all__)}")
-    return getattr(import_module(_FACE[name]), name)
-
-
-def __dir__() -> list[str]:
-    """The face."""
-    return __all__
+__all__, __getattr__, __dir__ = face.lazy(__name__, _FACE)

@@ -9,8 +9,7 @@ The names of `__all__` are what other programs may rely on; they are loaded when
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import Any
+from schemas.runtime import face
 
 _FACE = {
     "QUESTIONS": "fleet_service.analytics.questions",
@@ -22,16 +21,4 @@ _FACE = {
     "map_of_archive": "fleet_service.analytics.library",
     "write_answer": "fleet_service.analytics.library",
 }
-__all__ = sorted(_FACE)
-
-
-def __getattr__(name: str) -> Any:  # noqa: ANN401 whatever stands behind a name
-    """A name of the face."""
-    if name not in _FACE:
-        raise AttributeError(f"fleet_service has no {name!r}; its face is {', '.join(__all__)}")
-    return getattr(import_module(_FACE[name]), name)
-
-
-def __dir__() -> list[str]:
-    """The face."""
-    return __all__
+__all__, __getattr__, __dir__ = face.lazy(__name__, _FACE)

@@ -3,7 +3,7 @@
 A *quadint* at zoom z interleaves the bits of the Web-Mercator tile column x and row y (x in the even bits), so that its
 base-4 digits are the quadkey and a parent is a shift: `parent = cell >> 2·(21 - z)`.
 
-    cell     zoom 21   9 m (60° north) to 19 m (equator)   the canonical cell, int64
+    cell     zoom 21   10 m (60° north) to 19 m (equator)   the canonical cell, int64
     tile     zoom 14   one map message
     region   zoom 10   one key of observations
     zone     zoom 7    one folder of the archive

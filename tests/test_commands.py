@@ -46,7 +46,7 @@ def test_the_version_is_that_of_the_distribution(name: str, capsys: Capture) -> 
 def test_the_example_of_each_help_is_a_command_that_is_understood(name: str, command: str, example: str) -> None:
     words = shlex.split(example.partition(" > ")[0])
     assert words[:2] == [name, command]
-    parser = LINES[name].parser_of(command)
+    parser = commandline.parser_of(*LINES[name].LINE, command)
     assert parser.parse_args(commandline.joined(words[1:])).command == command
 
 

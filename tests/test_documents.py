@@ -45,7 +45,7 @@ def test_every_command_of_the_root_readme_is_understood_and_writes_where_git_loo
             continue
         words = shlex.split(command)
         if words[0] in LINES:
-            arguments = LINES[words[0]].parser_of(words[1]).parse_args(commandline.joined(words[1:]))
+            arguments = commandline.parser_of(*LINES[words[0]].LINE, words[1]).parse_args(commandline.joined(words[1:]))
             written = [
                 str(getattr(arguments, name))
                 for name in ("out", "archive", "vehicle_out")

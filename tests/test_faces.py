@@ -37,6 +37,8 @@ def test_every_name_of_a_face_is_there_and_documented(face: object) -> None:
     with pytest.raises(AttributeError, match="its face is"):
         _ = face.no_such_name  # type: ignore[attr-defined]
     assert set(names) <= set(dir(gripmap))
+    folder = Path(str(face.__file__)).parent  # type: ignore[attr-defined]
+    assert not [name for name in names if (folder / name).exists()], "a room of that name would hide it once imported"
 
 
 def test_importing_a_face_loads_nothing_heavy() -> None:

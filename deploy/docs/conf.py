@@ -20,6 +20,7 @@ myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
 suppress_warnings = ["myst.xref_missing"]  # links to source files and folders lead out of the site
 
+napoleon_use_ivar = True  # attributes that a docstring explains are fields already
 autodoc_typehints = "description"
 autodoc_member_order = "bysource"
 

@@ -114,7 +114,7 @@ def plot(estimates: dict[str, pa.Table], *, truth: pa.Table | None = None, title
     return figure
 
 
-def estimators() -> Iterator[tuple[str, str]]:
+def known_estimators() -> Iterator[tuple[str, str]]:
     """Names of all estimators, those of other packages too, with a line about each."""
     from edge_agent.app.estimator_factory import known
 

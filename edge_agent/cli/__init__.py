@@ -6,30 +6,19 @@ it is chosen, so that help is quick.
 
 from __future__ import annotations
 
-import argparse
-import importlib
 import logging
 import sys
 import traceback
 from collections.abc import Sequence
 from contextlib import nullcontext
-from typing import Final, NamedTuple
+from typing import Final
 
 from schemas.runtime import commandline, talk
+from schemas.runtime.commandline import Command
 
 FAILED: Final = commandline.FAILED
 BAD_INPUT: Final = commandline.BAD_INPUT
 LIVE: Final = ("run", "fleet")  # commands that drive for hours
-
-
-class Command(NamedTuple):
-    """A subcommand: its module has `add_arguments(parser)` and `run(args) -> int`."""
-
-    name: str
-    module: str
-    help: str
-    example: str
-
 
 COMMANDS: Final = (
     Command("simulate", "edge_agent.cli.simulate", "write the signal log of a manoeuvre, with truth",
@@ -53,13 +42,14 @@ COMMANDS: Final = (
     Command("completion", "edge_agent.cli.completion", "print what completes these commands in a shell",
             "edge-agent completion bash > ~/.local/share/bash-completion/completions/edge-agent"),
 )  # fmt: skip
+LINE: Final = ("edge-agent", "Friction and motion of a vehicle from its sensors.", COMMANDS)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line; returns the exit code."""
     arguments = commandline.joined(sys.argv[1:] if argv is None else argv)
     chosen = next((argument for argument in arguments if not argument.startswith("-")), None)
-    args = parser_of(chosen).parse_args(arguments)
+    args = commandline.parser_of(*LINE, chosen).parse_args(arguments)
     level = logging.DEBUG if args.verbose else logging.ERROR if args.quiet else logging.INFO
     logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
     talk.speak(quiet=args.quiet)
@@ -79,19 +69,3 @@ def main(argv: Sequence[str] | None = None) -> int:
     if left_behind.is_set():
         end_now(code)
     return code
-
-
-def parser_of(*chosen: str | None) -> argparse.ArgumentParser:
-    """All commands by name, and the options of those chosen."""
-    parser = argparse.ArgumentParser(
-        prog="edge-agent", description="Friction and motion of a vehicle from its sensors."
-    )
-    parser.add_argument("--version", action=commandline.VersionAction)
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for command in COMMANDS:
-        sub = commandline.add_command(commands, command.name, command.help, command.example)
-        if command.name in chosen:
-            module = importlib.import_module(command.module)
-            module.add_arguments(sub)
-            sub.set_defaults(run=module.run)
-    return parser

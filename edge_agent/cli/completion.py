@@ -14,7 +14,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the script."""
-    from edge_agent.cli import COMMANDS, parser_of
+    from edge_agent.cli import COMMANDS, LINE
 
-    print(commandline.completion(parser_of(*(command.name for command in COMMANDS)), args.shell))
+    parser = commandline.parser_of(*LINE, *(command.name for command in COMMANDS))
+    print(commandline.completion(parser, args.shell))
     return 0

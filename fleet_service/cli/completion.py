@@ -14,7 +14,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the script."""
-    from fleet_service.cli import COMMANDS, parser_of
+    from fleet_service.cli import COMMANDS, LINE
 
-    print(commandline.completion(parser_of(*(command.name for command in COMMANDS)), arguments.shell))
+    parser = commandline.parser_of(*LINE, *(command.name for command in COMMANDS))
+    print(commandline.completion(parser, arguments.shell))
     return 0

@@ -9,9 +9,10 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from importlib import import_module
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from schemas.errors import InputError
 
@@ -20,6 +21,29 @@ BAD_INPUT: Final = 2
 INTERRUPTED: Final = 130  # 128 + SIGINT, as shells have it
 SHELLS: Final = ("bash", "zsh", "tcsh")
 _NEGATIVE: Final = re.compile(r"^-[\d.]")
+
+
+class Command(NamedTuple):
+    """A subcommand: its module has `add_arguments(parser)` and `run(arguments) -> int`."""
+
+    name: str
+    module: str
+    help: str
+    example: str
+
+
+def parser_of(prog: str, description: str, commands: Iterable[Command], *chosen: str | None) -> argparse.ArgumentParser:
+    """All commands by name, and the options of those chosen; the modules of the others are not imported."""
+    parser = argparse.ArgumentParser(prog=prog, description=description)
+    parser.add_argument("--version", action=VersionAction)
+    subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for command in commands:
+        sub = add_command(subparsers, command.name, command.help, command.example)
+        if command.name in chosen:
+            module = import_module(command.module)
+            module.add_arguments(sub)
+            sub.set_defaults(run=module.run)
+    return parser
 
 
 def joined(argv: Sequence[str]) -> list[str]:

@@ -21,6 +21,7 @@ from fleet_service.analytics.questions import QUESTIONS
 from fleet_service.cli import main
 from schemas import wire
 from schemas.config import ZenohSettings
+from schemas.runtime.commandline import Command
 from schemas.runtime.zenoh_session import open_session
 from tests.faults.processes import Part
 from tests.fleet_service.app.test_service import Fleet
@@ -36,7 +37,7 @@ README = Path(cli.__file__).parents[1] / "README.md"
 
 @pytest.mark.parametrize("command", cli.COMMANDS, ids=lambda command: str(command.name))
 def test_every_command_has_help_and_stands_in_the_readme_with_all_its_options(
-    command: cli.ServiceCommand, capsys: pytest.CaptureFixture[str]
+    command: Command, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit, match="0"):
         main([command.name, "--help"])
@@ -53,7 +54,10 @@ def test_the_help_of_analyze_names_every_question() -> None:
 
 
 def test_help_comes_without_what_commands_need() -> None:
-    words = "import sys; from fleet_service import cli; cli.parser_of(None); print(*sys.modules)"
+    words = (
+        "import sys; from schemas.runtime import commandline; from fleet_service import cli; "
+        "commandline.parser_of(*cli.LINE, None); print(*sys.modules)"
+    )
     loaded = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True).stdout.split()
     assert "fleet_service.cli" in loaded
     assert not {"numpy", "pyarrow", "zenoh", "numba", "pydantic"} & set(loaded)

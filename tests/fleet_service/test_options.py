@@ -25,9 +25,10 @@ import pytest
 import zenoh
 from cryptography import x509
 
-from fleet_service.cli import COMMANDS, ServiceCommand, main
+from fleet_service.cli import COMMANDS, main
 from schemas import grid, wire
 from schemas.config import ZenohSettings
+from schemas.runtime.commandline import Command
 from tests.faults.processes import Part
 from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.archive.kept import DATA, PLACES
@@ -142,7 +143,7 @@ def done(words: list[str], folder: Path, capsys: Capture) -> Done:
     return Done(code, text, files)
 
 
-def options(command: ServiceCommand) -> set[str]:
+def options(command: Command) -> set[str]:
     """What a command takes."""
     parser = argparse.ArgumentParser(add_help=False)
     importlib.import_module(command.module).add_arguments(parser)

@@ -1,0 +1,46 @@
+"""The pages of the docs' folder: their examples run, their tables are those of the contract."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+import edge_agent.cli
+from fleet_service.analytics import synthetic
+from fleet_service.archive.compaction import compact
+from schemas import grid, tables
+from tests.house import ROOT
+
+DOCS = ROOT / "deploy" / "docs"
+
+
+def test_the_examples_of_the_reference_run_in_their_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    examples = re.findall(r"^```python\n(.*?)^```", (DOCS / "api.md").read_text(), re.DOTALL | re.MULTILINE)
+    assert len(examples) >= 4
+    drive = ["simulate", "slalom", "--duration", "2", "--out", str(tmp_path / "drive.parquet")]
+    assert edge_agent.cli.main([*drive, "--vehicle-out", str(tmp_path / "drive.json")]) == 0
+    world = synthetic.SyntheticFleet(rows=6000, days=1, vehicles=20, roads=4, length=30, icy=2)
+    synthetic.write(tmp_path / "archive", world, 2000)
+    compact(tmp_path / "archive")
+    monkeypatch.chdir(tmp_path)
+    capsys.readouterr()
+    for example in examples:
+        exec(compile(example, "api.md", "exec"), {})
+        assert capsys.readouterr().out
+    assert {"drive.svg", "worst.geojson"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_the_page_of_answers_has_every_column_of_the_map_the_sectors_and_the_cell_sizes() -> None:
+    page = (DOCS / "answers.md").read_text()
+    rows = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
+    named = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
+    assert sorted(named) == sorted(field.name for field in tables.MAP_CELL)
+    assert ", ".join(f"{number} {name}" for number, name in enumerate(grid.HEADINGS)) in page
+    for latitude, words in ((0.0, "19 m at the equator"), (57.7, "10 m in Gothenburg")):
+        _, south, _, north = grid.bounds(grid.cell_of(latitude, 11.97))
+        assert f"{float(north - south) * 111_320.0:.0f} m" == words[: words.index("m") + 1]
+        assert words in page
