@@ -1,0 +1,122 @@
+"""The horizon: what is known of each metre ahead, and how fast one may go there. Pure.
+
+A metre of which nothing is known stays unknown: it limits no speed and warns of nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from edge_agent.ahead.known import MEASURED, UNKNOWN, HeardMap, PlaceBelief
+from edge_agent.ahead.path import NONE, Path
+from schemas import mugrid
+from schemas.numeric import BoolArray, FloatArray, IntArray
+from schemas.thresholds import GRAVITY
+
+REACTION_S: Final = 1.5  # of a driver who is told (Green, Transportation Human Factors 2, 2000: 1.2 to 1.5 s)
+MARGIN_M: Final = 10.0  # a cell: where a stretch begins is known no better
+COMFORT: Final = 3.0  # [m/s^2] braking that is not felt as hard; adaptive cruise may brake with 3.5 (ISO 15622)
+COMFORT_ACROSS: Final = 3.0  # [m/s^2] in bends
+SIGHT_M: Final = 60.0  # within which one wants to be able to stop, in a town
+UNKNOWN_LOWER: Final = mugrid.LOWER + 0.05 * (mugrid.UPPER - mugrid.LOWER)  # lower end of a road nobody has measured
+SHORTEST_M: Final = 150.0
+LONGEST_M: Final = 1000.0
+# Beside the 0.9 from which on the service alerts: such a belief has faded to this after half an hour without a link.
+WARN_ABOVE: Final = 0.8
+LEAST_VEHICLES: Final = 2  # as for an alert: one bad sensor warns nobody
+
+
+class Horizon(NamedTuple):
+    """What lies ahead on one path, each (M,); NaN where unknown.
+
+    Attributes:
+        path: the metres.
+        key: the place that is spoken of, NONE where nothing is known.
+        mu: median; NaN also where only lower bounds are known. mu_lower, mu_upper: 5 and 95 %.
+        p_slippery: P(mu < 0.4).
+        age_s: since the last observation.
+        basis: known.UNKNOWN, BOUND, MEASURED, BORROWED.
+        slippery: worth a warning.
+        alerted: an alert stands.
+        safe_speed: [m/s]; infinite where nothing limits it.
+    """
+
+    path: Path
+    key: IntArray
+    mu: FloatArray
+    mu_lower: FloatArray
+    mu_upper: FloatArray
+    p_slippery: FloatArray
+    age_s: FloatArray
+    basis: IntArray
+    slippery: BoolArray
+    alerted: BoolArray
+    safe_speed: FloatArray
+
+
+def horizon_length(speed: float) -> float:
+    """How far to look [m]: as far as it takes to stop on a road of which nothing is known."""
+    stop = speed * (REACTION_S + 2.0) + MARGIN_M + speed**2 / (2.0 * UNKNOWN_LOWER * GRAVITY)
+    return float(min(max(stop, SHORTEST_M), LONGEST_M))
+
+
+def look_ahead(path: Path, known: HeardMap, now: int) -> Horizon:
+    """The horizon along a path, now [ns]."""
+    places, inverse = np.unique(path.places, return_inverse=True)
+    found = known.look_up(places, now)
+    inverse = inverse.reshape(path.places.shape)
+    there = (found.basis != UNKNOWN)[inverse] & (path.places != NONE)
+    # the first place that is measured, else the first of which anything is known; an alert goes before both
+    rank = np.where(there, np.where(found.alerted[inverse], 0, np.where(found.basis[inverse] == MEASURED, 1, 2)), 3)
+    column = rank.argmin(axis=1)
+    row = inverse[np.arange(len(column)), column]
+    nothing = rank.min(axis=1) == 3
+    slippery = worth_a_warning(found)
+    values = (
+        np.where(nothing, np.nan, column[row])
+        for column in (found.mu, found.mu_lower, found.mu_upper, found.p_slippery, found.age_s)
+    )
+    mu, lower, upper, p, age = values
+    basis = np.where(nothing, UNKNOWN, found.basis[row])
+    return Horizon(
+        path, np.where(nothing, NONE, places[row]), mu, lower, upper, p, age, basis,
+        np.where(nothing, False, slippery[row]), np.where(nothing, False, found.alerted[row]),
+        safe_speed(path.curvature, np.where(basis == MEASURED, lower, np.nan)),
+    )  # fmt: skip
+
+
+def worth_a_warning(found: PlaceBelief) -> BoolArray:
+    """Which places (n,) are slippery enough, and surely enough, to warn of."""
+    firm = (found.basis == MEASURED) & (found.p_slippery >= WARN_ABOVE) & (found.vehicles >= LEAST_VEHICLES)
+    return np.asarray(found.alerted | firm)
+
+
+def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
+    """Speed [m/s] at each metre (M,) at which bends are held and one can stop within SIGHT_M, on the lower end of grip.
+
+    Before a slower place it falls with a comfortable deceleration, or with what the road bears beside cornering. Where
+    nothing is measured (NaN) the road limits nothing by itself, and nobody is asked to brake harder than it may bear.
+    """
+    measured, bend = np.isfinite(mu_lower), np.abs(np.nan_to_num(curvature))
+    grip = GRAVITY * np.where(measured, mu_lower, UNKNOWN_LOWER)
+    held = np.minimum(grip, COMFORT_ACROSS) / np.maximum(bend, 1e-6)
+    stop = grip * (np.sqrt(REACTION_S**2 + 2.0 * SIGHT_M / grip) - REACTION_S)
+    squares = np.where(measured, np.minimum(held, stop**2), np.inf).tolist()
+    brakes, bends = np.minimum(grip, COMFORT).tolist(), bend.tolist()
+    for k in range(len(squares) - 2, -1, -1):
+        if squares[k + 1] < squares[k]:
+            across = min(squares[k + 1] * bends[k] / brakes[k], 1.0)
+            squares[k] = min(squares[k], squares[k + 1] + 2.0 * brakes[k] * math.sqrt(1.0 - across * across))
+    return np.asarray(np.sqrt(np.array(squares)))
+
+
+def braking_from(horizon: Horizon) -> FloatArray:
+    """Half the square of the speed that can be braked away from the car to each metre, (M,) [m^2/s^2].
+
+    On the lower end of grip, comfortably at the most; an unknown road bears what one must expect of any.
+    """
+    lower = np.where(np.isfinite(horizon.mu_lower), horizon.mu_lower, UNKNOWN_LOWER)
+    return np.asarray(np.cumsum(np.minimum(GRAVITY * lower, COMFORT)))

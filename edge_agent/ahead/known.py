@@ -1,0 +1,206 @@
+"""What a car has heard of the map, with ages: bounded, and fading to unknown. Pure: time comes in.
+
+A cell's belief is made from what a tile says of it: the share of μ below lower, median and upper end, and P(slippery).
+From then on it fades as it does in the map: a road may have changed since, and then nothing is known of it.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from schemas import grid, mugrid
+from schemas.numeric import BoolArray, FloatArray, IntArray
+from schemas.thresholds import NS, SLIPPERY_MU
+from schemas.wire import Alert
+
+UNKNOWN, BOUND, MEASURED, BORROWED = range(4)
+BASES: Final = ("unknown", "bound", "measured", "borrowed")
+CHANGE_S: Final = 10800.0  # mean time between changes that leave nothing of what was known, as in the map
+HELD_S: Final = 3600.0  # what was not heard again for so long is unknown: by then 28 % of it has changed
+ALERT_HELD_S: Final = 600.0  # alerts that stand are put again every few seconds
+MOST_CELLS: Final = 20_000  # 6 MB: fifty kilometres of road with its side streets
+MOST_ALERTS: Final = 4096
+SLIPPERY_BINS: Final[FloatArray] = np.clip(
+    (SLIPPERY_MU - mugrid.EDGES[:-1]) / np.diff(mugrid.EDGES), 0.0, 1.0
+)  # share of each bin that is slippery
+
+
+class HeardCells(NamedTuple):
+    """Cells as heard, (n,); belief (n, 32) on the friction grid."""
+
+    key: IntArray
+    belief: FloatArray
+    basis: IntArray
+    vehicles: IntArray
+    last_time: IntArray  # [ns] of the last observation
+    heard: IntArray  # [ns] when the car heard of it
+
+
+class PlaceBelief(NamedTuple):
+    """What is known of places, each (n,); NaN and UNKNOWN where nothing is."""
+
+    key: IntArray
+    mu: FloatArray
+    mu_lower: FloatArray
+    mu_upper: FloatArray
+    p_slippery: FloatArray
+    age_s: FloatArray
+    basis: IntArray
+    vehicles: IntArray
+    alerted: BoolArray
+
+
+def belief_of(lower: FloatArray, mu: FloatArray, upper: FloatArray, slippery: FloatArray) -> FloatArray:
+    """Probabilities on the friction grid (n, 32) of what is said of n cells; `mu` may be NaN.
+
+    The distribution function goes straight from one known value to the next.
+    """
+    n = len(lower)
+    said = np.isfinite(mu)
+    middle = np.where(said, mu, (lower + upper) / 2.0)
+    x = np.column_stack([np.full(n, mugrid.LOWER), lower, middle, upper, np.full(n, mugrid.UPPER)])
+    x = np.maximum.accumulate(np.clip(x, mugrid.LOWER, mugrid.UPPER), axis=1)
+    f = np.tile([0.0, 0.05, 0.5, 0.95, 1.0], (n, 1))
+    out = np.empty((n, mugrid.BINS))
+    for k in range(n):
+        at = int(np.searchsorted(x[k], SLIPPERY_MU))
+        below, above = f[k, max(at - 1, 0)], f[k, min(at, 4)]
+        knots = np.insert(x[k], at, SLIPPERY_MU)
+        shares = np.insert(f[k], at, min(max(slippery[k], below), above))
+        knots += np.arange(6) * 1e-9  # strictly upward
+        upto = np.interp(mugrid.EDGES, knots, shares, left=0.0, right=1.0)
+        upto[0], upto[-1] = 0.0, 1.0
+        out[k] = np.diff(upto)
+    return out
+
+
+NOTHING: Final = HeardCells(
+    np.zeros(0, np.int64), np.zeros((0, mugrid.BINS)), *(np.zeros(0, np.int64) for _ in range(4))
+)
+
+
+class HeardMap:
+    """The cache of one car: tiles that were heard, the latest with MOST_CELLS cells, and alerts that stand."""
+
+    def __init__(self, most_cells: int = MOST_CELLS) -> None:
+        self._most = most_cells
+        self._tiles: OrderedDict[int, HeardCells] = OrderedDict()
+        self._alerts: dict[int, tuple[Alert, int]] = {}
+        self._all: HeardCells | None = NOTHING  # of all tiles, by key; None when it has to be made anew
+
+    @property
+    def cells(self) -> int:
+        """Cells that are held."""
+        return sum(len(cells.key) for cells in self._tiles.values())
+
+    @property
+    def alerts(self) -> list[Alert]:
+        """Alerts that stand, as far as the car has heard."""
+        return [alert for alert, _ in self._alerts.values()]
+
+    def take(self, tile: int, cells: HeardCells, now: int) -> None:
+        """Cells of a tile were heard: what is said of them replaces what was known of them."""
+        before = self._tiles.pop(tile, NOTHING)
+        kept = ~np.isin(before.key, cells.key) & (now - before.heard < HELD_S * NS)
+        self._tiles[tile] = _joined([_some(before, kept), cells])
+        self._all = None
+        while len(self._tiles) > 1 and self.cells > self._most:
+            self._tiles.popitem(last=False)
+
+    def alert(self, alert: Alert, now: int) -> bool:
+        """An alert was heard; whether that is news."""
+        key = alert.cell * grid.SECTORS + alert.sector
+        before = self._alerts.get(key)
+        if alert.raised:
+            if before is not None and before[0].time > alert.time:
+                return False
+            if before is None and len(self._alerts) >= MOST_ALERTS:
+                return False
+            self._alerts[key] = (alert, now)
+            return before is None or before[0] != alert
+        return self._alerts.pop(key, None) is not None
+
+    def standing(self, tile: int, alerts: list[Alert], now: int) -> bool:
+        """All alerts that stand in a tile were heard; whether that is news."""
+        keys = {alert.cell * grid.SECTORS + alert.sector for alert in alerts}
+        gone = [key for key in self._alerts if key not in keys and int(grid.tile_of(key // grid.SECTORS)) == tile]
+        for key in gone:
+            del self._alerts[key]
+        news = [self.alert(alert, now) for alert in alerts]
+        return any(news) or bool(gone)
+
+    def forget(self, now: int) -> None:
+        """Drop what is too old to say anything."""
+        for tile in [tile for tile, cells in self._tiles.items() if now - cells.heard.max() > HELD_S * NS]:
+            del self._tiles[tile]
+            self._all = None
+        for key in [key for key, (_, at) in self._alerts.items() if now - at > ALERT_HELD_S * NS]:
+            del self._alerts[key]
+
+    def look_up(self, key: IntArray, now: int) -> PlaceBelief:
+        """What is known now of places (n,)."""
+        belief, basis, last, at, vehicles = self._rows(key)
+        alerted = np.zeros(len(key), np.bool_)
+        for k in np.flatnonzero(np.isin(key, np.fromiter(self._alerts, np.int64, len(self._alerts)))).tolist():
+            alert, heard = self._alerts[int(key[k])]
+            if now - heard > ALERT_HELD_S * NS:
+                continue
+            alerted[k] = True
+            if alert.time >= last[k]:
+                said = (np.array([value]) for value in (alert.mu_lower, alert.mu, alert.mu_upper, alert.p_slippery))
+                belief[k], basis[k], last[k], at[k] = belief_of(*said)[0], MEASURED, alert.time, heard
+                vehicles[k] = alert.vehicles
+        since = np.maximum(now - at, 0) / NS
+        share = -np.expm1(-since / CHANGE_S)[:, None]
+        faded = (1.0 - share) * belief + share * mugrid.PRIOR
+        there = (basis != UNKNOWN) & (since <= HELD_S)
+        lower, mu, upper = (np.where(there, mugrid.quantiles(faded, q), np.nan) for q in (0.05, 0.5, 0.95))
+        return PlaceBelief(
+            key, np.where(basis == BOUND, np.nan, mu), lower, upper, np.where(there, faded @ SLIPPERY_BINS, np.nan),
+            np.where(there, np.maximum(now - last, 0) / NS, np.nan), np.where(there, basis, UNKNOWN),
+            np.where(there, vehicles, 0), alerted & there,
+        )  # fmt: skip
+
+    def belief(self, key: int, now: int) -> FloatArray | None:
+        """What is believed now of one place, (32,); None where nothing is known, or only a bound."""
+        belief, basis, last, at, _ = self._rows(np.array([key]))
+        if basis[0] != MEASURED or now - at[0] > HELD_S * NS:
+            return None
+        share = -np.expm1(-max(now - int(last[0]), 0) / NS / CHANGE_S)
+        return np.asarray((1.0 - share) * belief[0] + share * mugrid.PRIOR)
+
+    def keys(self) -> IntArray:
+        """Places that were heard of, sorted."""
+        return self._whole().key
+
+    def _whole(self) -> HeardCells:
+        if self._all is None:
+            found = _joined(list(self._tiles.values()))
+            order = np.argsort(found.key)
+            self._all = _some(found, order)
+        return self._all
+
+    def _rows(self, key: IntArray) -> tuple[FloatArray, IntArray, IntArray, IntArray, IntArray]:
+        """Belief, basis, last_time, heard and vehicles of places (n,)."""
+        whole = self._whole()
+        if not len(whole.key):
+            zero = np.zeros(len(key), np.int64)
+            return np.tile(mugrid.PRIOR, (len(key), 1)), zero, zero.copy(), zero.copy(), zero.copy()
+        row = np.minimum(np.searchsorted(whole.key, key), len(whole.key) - 1)
+        hit = whole.key[row] == key
+        belief = np.where(hit[:, None], whole.belief[row], mugrid.PRIOR)
+        basis, last, heard, vehicles = (
+            np.where(hit, column[row], 0) for column in (whole.basis, whole.last_time, whole.heard, whole.vehicles)
+        )
+        return belief, basis, last, heard, vehicles
+
+
+def _some(cells: HeardCells, rows: IntArray | BoolArray) -> HeardCells:
+    return HeardCells._make(column[rows] for column in cells)
+
+
+def _joined(parts: list[HeardCells]) -> HeardCells:
+    return HeardCells._make(np.concatenate(columns) for columns in zip(NOTHING, *parts, strict=True))

@@ -1,0 +1,160 @@
+"""The way ahead as metres: which cells and sectors of the map each metre lies in. Pure.
+
+Legend
+    s        distance ahead of the car                                             [m]     (M,)  1, 2, 3 …
+    key      cell·4 + sector: a place of the map                                   int64
+    places   (M, C) keys that a metre may lie in, the likeliest first; NONE where there is none
+
+A car of the fleet may have been a lane beside, and its fix 1.5 m off; so the metres ask a little to the left and right
+too, and near the edge of a sector in both.
+"""
+
+from __future__ import annotations
+
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+
+from schemas import grid
+from schemas.numeric import FloatArray, IntArray
+from schemas.thresholds import METRES_PER_DEGREE
+
+Kind = Literal["route", "road", "corridor"]
+NONE: Final = -1
+BESIDE_M: Final = 4.0  # a lane's width and a receiver's error; no other carriageway of the same direction is as near
+SMOOTH_M: Final = 15  # in which a corner of a given route is driven: 9.5 m of radius at a right angle
+OFF_ROUTE_M: Final = 20.0  # from the line of a route: a receiver's error, a wide road, a coarse route
+BACK_M: Final = 20.0  # a fix may jump back by so much
+ASTRAY: Final = np.radians(60.0)  # who heads so much otherwise is on another road
+CORRIDOR_M: Final = 150.0  # a road without bends in sight; beyond, where it leads is anybody's guess
+CORRIDOR_WIDENS: Final = 0.05  # per metre: a bend of a kilometre's radius
+
+
+class Pose(NamedTuple):
+    """Where a car is: [deg], yaw [rad from east], speed [m/s], time [ns UTC]."""
+
+    latitude: float
+    longitude: float
+    yaw: float
+    speed: float
+    time: int
+
+
+class Path(NamedTuple):
+    """One way on, from the car.
+
+    Attributes:
+        kind: route: given; road: as the map shows it; corridor: straight on.
+        distance: (M,) [m].
+        places: (M, C) keys.
+        curvature: (M,) [1/m], positive to the left; NaN where nobody knows.
+        x, y: (M,) [m] east and north of the car.
+    """
+
+    kind: Kind
+    distance: FloatArray
+    places: IntArray
+    curvature: FloatArray
+    x: FloatArray
+    y: FloatArray
+
+
+def plane(latitude: FloatArray, longitude: FloatArray, pose: Pose) -> tuple[FloatArray, FloatArray]:
+    """East and north [m] of the car; exact to a centimetre within a kilometre."""
+    east = METRES_PER_DEGREE * np.cos(np.radians(pose.latitude))
+    return (np.asarray(longitude) - pose.longitude) * east, (np.asarray(latitude) - pose.latitude) * METRES_PER_DEGREE
+
+
+def degrees(x: FloatArray, y: FloatArray, pose: Pose) -> tuple[FloatArray, FloatArray]:
+    """Latitude and longitude [deg] of points [m] beside the car."""
+    east = METRES_PER_DEGREE * np.cos(np.radians(pose.latitude))
+    return pose.latitude + y / METRES_PER_DEGREE, pose.longitude + x / east
+
+
+def along(kind: Kind, line: FloatArray, pose: Pose, length: float, first: IntArray | None = None) -> Path:
+    """The way along a line (n, 2) [m] that begins at the car, at most `length` [m].
+
+    `first` (n,) are keys that are known at the line's points; they come before those that follow from the position.
+    """
+    run = _run(line)
+    count = max(int(min(run[-1], length)), 1)
+    s = np.arange(1.0, count + 1.0)
+    x, y = np.interp(s, run, line[:, 0]), np.interp(s, run, line[:, 1])
+    yaw = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x))) if count > 1 else np.full(1, pose.yaw)
+    smooth = _smoothed(yaw, SMOOTH_M)
+    curvature = np.gradient(smooth) if kind == "route" and count > 1 else np.full(count, np.nan)
+    widen = BESIDE_M + (CORRIDOR_WIDENS * s if kind == "corridor" else 0.0)
+    places = _places(x, y, smooth, widen, pose)
+    if first is not None:
+        nearest = np.abs(run[None, :] - s[:, None]).argmin(axis=1)
+        places = np.concatenate([first[nearest][:, None], places], axis=1)
+    return Path(kind, s, places, curvature, x, y)
+
+
+def corridor(pose: Pose, length: float) -> Path:
+    """Straight on along the heading."""
+    reach = min(length, CORRIDOR_M)
+    end = [reach * np.cos(pose.yaw), reach * np.sin(pose.yaw)]
+    return along("corridor", np.array([[0.0, 0.0], end]), pose, length)
+
+
+class GivenRoute:
+    """A given route, and how far the car has come on it.
+
+    Args:
+        latitude: (n,) [deg] of its points, two at the least.
+        longitude: (n,) [deg].
+    """
+
+    def __init__(self, latitude: FloatArray, longitude: FloatArray) -> None:
+        self._latitude, self._longitude = latitude, longitude
+        self._metre = 0.0
+
+    def ahead(self, pose: Pose, length: float) -> Path | None:
+        """The way on along the route; None when the car has left it."""
+        x, y = plane(self._latitude, self._longitude, pose)
+        line = np.column_stack([x, y])
+        place = self._match(line, pose)
+        if place is None:
+            return None
+        run = _run(line)
+        self._metre = place
+        rest = run > place
+        here = [np.interp(place, run, x), np.interp(place, run, y)]
+        ahead = np.concatenate([[here], line[rest]])
+        return along("route", ahead, pose, length) if len(ahead) > 1 else None
+
+    def _match(self, line: FloatArray, pose: Pose) -> float | None:
+        """Metre of the route at which the car is: the next one on from the last, heading the same way."""
+        step, start = np.diff(line, axis=0), line[:-1]
+        size = np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)
+        share = np.clip(-(start * step).sum(axis=1) / size**2, 0.0, 1.0)
+        off = np.hypot(*(start + share[:, None] * step).T)
+        turned = np.abs((np.arctan2(step[:, 1], step[:, 0]) - pose.yaw + np.pi) % (2 * np.pi) - np.pi)
+        fits = (off <= OFF_ROUTE_M) & (turned <= ASTRAY)
+        if not fits.any():
+            return None
+        at = _run(line)[:-1] + share * size
+        onward = fits & (at >= self._metre - BACK_M)
+        among = np.flatnonzero(onward if onward.any() else fits)
+        # the nearest of those a little further on; a loop that is driven twice is not jumped ahead in
+        cost = off[among] + 0.1 * np.maximum(at[among] - self._metre, 0.0)
+        return float(at[among[int(cost.argmin())]])
+
+
+def _places(x: FloatArray, y: FloatArray, yaw: FloatArray, widen: FloatArray | float, pose: Pose) -> IntArray:
+    sectors = [np.asarray(sector, np.int64) for sector in grid.sectors_touched(yaw)]
+    columns = []
+    for side in (0.0, 1.0, -1.0):
+        cell = grid.cell_of(*degrees(x - side * widen * np.sin(yaw), y + side * widen * np.cos(yaw), pose))
+        columns += [np.where(sector >= 0, cell * grid.SECTORS + sector, NONE) for sector in sectors]
+    return np.column_stack(columns)
+
+
+def _smoothed(values: FloatArray, width: int) -> FloatArray:
+    padded = np.pad(values, width // 2, mode="edge")
+    return np.convolve(padded, np.full(width, 1.0 / width), mode="valid")[: len(values)]
+
+
+def _run(line: FloatArray) -> FloatArray:
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])

@@ -1,0 +1,118 @@
+"""The road as the map shows it: from cell to cell and sector to sector, as vehicles visited them one after the other.
+
+Two places of the map follow each other when the second lies within two cells, in front, and vehicles head there as they
+must to come from the first. Where a road forks all ways are followed, the straightest first.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from edge_agent.ahead.path import Path, Pose, along, plane
+from schemas import grid
+from schemas.numeric import IntArray
+
+LINK_CELLS: Final = 2.3  # sides of a cell: the next one, its diagonal, and a gap of one that nobody's fix fell into
+BEGIN_CELLS: Final = 1.6  # from the car to the first
+TURN: Final = math.radians(95.0)  # between two links: the right angle of a junction within a cell
+LEAN: Final = math.radians(
+    70.0
+)  # of a link from the axis of the sector that it leads to: 45 and what a cell's corner adds
+FORK: Final = math.radians(50.0)  # links that differ by more lead to different roads
+MOST_WAYS: Final = 3
+LEAST_OWN: Final = 2  # places of a way that no other has
+MOST_STEPS: Final = 120
+
+
+def ways_on(pose: Pose, keys: IntArray, length: float) -> list[Path]:
+    """The ways on among known places `keys` (n,), at most `length` [m] long; none where the map shows no road here."""
+    latitude, longitude = grid.centre(keys // grid.SECTORS)
+    x, y = plane(latitude, longitude, pose)
+    near = np.hypot(x, y) <= length
+    places = dict(zip(keys[near].tolist(), zip(x[near].tolist(), y[near].tolist(), strict=True), strict=True))
+    west, _, east, _ = (float(side) for side in grid.bounds(grid.cell_of(pose.latitude, pose.longitude)))
+    side = (east - west) * math.cos(math.radians(pose.latitude)) * 111e3
+    by_cell: dict[tuple[int, int], list[int]] = {}
+    for key, (px, py) in places.items():
+        by_cell.setdefault((math.floor(px / side), math.floor(py / side)), []).append(key)
+    graph = _Neighbours(places, by_cell, side)
+    begin = graph.onward((0.0, 0.0), pose.yaw, BEGIN_CELLS)
+    if not begin:
+        return []
+    ways = [[begin[0]]]
+    done: list[list[int]] = []
+    while ways and len(done) < MOST_WAYS:
+        done.append(_followed(graph, ways.pop(0), pose, length, ways))
+    for way in (
+        done[::-1] if len(done) > 1 else []
+    ):  # one that joins another, or ends where another bends, is no way of its own
+        if len(set(way).difference(*(other for other in done if other is not way))) < LEAST_OWN:
+            done.remove(way)
+    return [_as_path(way, places, pose, length) for way in done]
+
+
+class _Neighbours:
+    def __init__(
+        self, places: dict[int, tuple[float, float]], by_cell: dict[tuple[int, int], list[int]], side: float
+    ) -> None:
+        self.places, self._by_cell, self.side = places, by_cell, side
+
+    def onward(self, here: tuple[float, float], heading: float, cells: float) -> list[int]:
+        """Places that may come next, the likeliest first; one of each road."""
+        reach, found = cells * self.side, []
+        column, row = math.floor(here[0] / self.side), math.floor(here[1] / self.side)
+        wide = math.ceil(cells)
+        for i in range(column - wide, column + wide + 1):
+            for j in range(row - wide, row + wide + 1):
+                for key in self._by_cell.get((i, j), ()):
+                    dx, dy = self.places[key][0] - here[0], self.places[key][1] - here[1]
+                    distance = math.hypot(dx, dy)
+                    if not 0.3 * self.side < distance <= reach:
+                        continue
+                    link = math.atan2(dy, dx)
+                    turn, lean = _apart(link, heading), _apart(link, (key % grid.SECTORS) * math.pi / 2.0)
+                    if turn <= TURN and lean <= LEAN:
+                        found.append((distance * (1.0 + 2.0 * turn + 0.5 * lean), key, link))
+        chosen: list[tuple[int, float]] = []
+        for _, key, link in sorted(found):
+            if all(_apart(link, other) > FORK for _, other in chosen):
+                chosen.append((key, link))
+        return [key for key, _ in chosen]
+
+
+def _followed(graph: _Neighbours, way: list[int], pose: Pose, length: float, forks: list[list[int]]) -> list[int]:
+    """Follow a way to its end; what forks off is put on `forks`."""
+    run, passed = 0.0, set(way)
+    for _ in range(MOST_STEPS):
+        here = graph.places[way[-1]]
+        heading = _heading(way, graph.places, pose)
+        onward = [key for key in graph.onward(here, heading, LINK_CELLS) if key not in passed]
+        if not onward or run >= length:
+            break
+        if len(forks) < MOST_WAYS:
+            forks += [[*way, key] for key in onward[1:]]
+        run += math.dist(here, graph.places[onward[0]])
+        way = [*way, onward[0]]
+        passed.add(onward[0])
+    return way
+
+
+def _heading(way: list[int], places: dict[int, tuple[float, float]], pose: Pose) -> float:
+    """Of the last three links: centres of cells along a slanting road zigzag."""
+    last = [(0.0, 0.0), *(places[key] for key in way)][-4:]
+    dx, dy = last[-1][0] - last[0][0], last[-1][1] - last[0][1]
+    return math.atan2(dy, dx) if math.hypot(dx, dy) > 1.0 else pose.yaw
+
+
+def _as_path(way: list[int], places: dict[int, tuple[float, float]], pose: Pose, length: float) -> Path:
+    line = np.array([(0.0, 0.0), *(places[key] for key in way)])
+    smooth = line.copy()
+    smooth[1:-1] = (line[:-2] + line[1:-1] + line[2:]) / 3.0
+    return along("road", smooth, pose, length, np.array([way[0], *way]))
+
+
+def _apart(a: float, b: float) -> float:
+    return abs((a - b + math.pi) % (2.0 * math.pi) - math.pi)

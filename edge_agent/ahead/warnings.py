@@ -1,0 +1,193 @@
+"""Warnings: one when a slippery stretch comes within reach, updated when it changes, ended when it is over. Pure.
+
+Reach is the way that it takes to stop before the stretch at the present speed: reaction, a margin, and braking at the
+lower end of grip on the road up to it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+import numpy as np
+
+from edge_agent.ahead.horizon import MARGIN_M, REACTION_S, Horizon, braking_from, worth_a_warning
+from edge_agent.ahead.known import HeardMap
+from edge_agent.ahead.path import Kind, Pose
+from schemas import grid
+from schemas.numeric import BoolArray
+from schemas.thresholds import NS
+
+State = Literal["raised", "updated", "ended"]
+UPDATE_S: Final = 1.0  # between two looks: a stretch may come by so much nearer before it is told
+LINK_M: Final = 30.0  # nearer stretches are one
+ABSENT_S: Final = 2.0  # for which a stretch is not seen before it is over: fixes jump
+NEAR_M: Final = 30.0  # who was so near to a stretch that is no longer ahead has passed it
+CHANGED_MU: Final = 0.05
+CHANGED_PLACES: Final = 2
+SLOWEST: Final = 0.5  # [m/s] who stands has no time to a stretch
+
+
+@dataclass(frozen=True)
+class GripWarning:
+    """A warning, as it is told.
+
+    Attributes:
+        id: the same from raised to ended.
+        state: raised; updated: it became longer, or its grip another; ended: passed, cleared or left.
+        time: of this message [ns UTC].
+        distance_m, length_m: to the stretch's beginning, and of what can be seen of it.
+        time_s: until it is reached at the present speed; infinite for who stands.
+        mu, mu_lower, p_slippery: at its worst metre.
+        age_s: of the youngest observation there.
+        safe_speed: at its beginning [m/s].
+        way: by which it is reached: route, road or corridor.
+        sure: whether it lies on every way that is known to go on.
+        reason: why, in words.
+    """
+
+    id: str
+    state: State
+    time: int
+    distance_m: float
+    length_m: float
+    time_s: float
+    mu: float
+    mu_lower: float
+    p_slippery: float
+    age_s: float
+    safe_speed: float
+    way: Kind
+    sure: bool
+    reason: str
+
+    def line(self) -> str:
+        """All of it in a line for people."""
+        if self.state == "ended":
+            return f"warning over: {self.reason}; id {self.id}"
+        where = "here" if self.distance_m <= 0.0 else f"in {self.distance_m:.0f} m"
+        return (
+            f"slippery {where}, for {self.length_m:.0f} m: mu {self.mu:.2f} (at least {self.mu_lower:.2f}), "
+            f"safe {3.6 * self.safe_speed:.0f} km/h, known for {self.age_s:.0f} s; {self.reason}; id {self.id}"
+        )
+
+
+@dataclass(frozen=True)
+class Active:
+    """A warning that stands: what was told of it, its places, and where and when it was seen last."""
+
+    told: GripWarning
+    places: frozenset[int]
+    seen: int
+    distance_m: float
+
+
+@dataclass(frozen=True)
+class _Stretch:
+    places: frozenset[int]
+    start: float
+    end: float
+    worst: int
+    room: float  # half the square of the speed that can be braked away before it
+    horizon: Horizon
+
+
+def warn(
+    active: tuple[Active, ...], horizons: list[Horizon], pose: Pose, known: HeardMap
+) -> tuple[tuple[Active, ...], list[GripWarning]]:
+    """The warnings that stand after a look ahead, and what is to be told.
+
+    Args:
+        active: those that stood before.
+        horizons: of every way on; the likeliest first.
+        pose: of the car.
+        known: what the car has heard, ahead or not.
+    """
+    told: list[GripWarning] = []
+    stretches = [stretch for horizon in horizons for stretch in _stretches(horizon, pose.speed)]
+    kept: dict[str, Active] = {one.told.id: one for one in active}
+    for places, ways in _by_place(stretches):
+        nearest = min(ways, key=lambda stretch: stretch.start)
+        before = next((one for one in kept.values() if one.places & places), None)
+        sure = len({id(way.horizon) for way in ways}) == len(horizons)
+        if before is None:
+            if nearest.room > 0.5 * pose.speed**2:
+                continue
+            first = min(nearest.places)
+            name = f"{grid.quadkey(first // grid.SECTORS, grid.CELL_ZOOM)}{first % grid.SECTORS}-{pose.time // NS:x}"
+            one = _warning(name, "raised", nearest, pose, sure)
+            told.append(one)
+            kept[name] = Active(one, places, pose.time, nearest.start)
+            continue
+        name, one = before.told.id, _warning(before.told.id, "updated", nearest, pose, sure)
+        grown = len(places - before.places) >= CHANGED_PLACES
+        if grown or abs(one.mu - before.told.mu) >= CHANGED_MU:
+            told.append(one)
+            kept[name] = Active(one, before.places | places, pose.time, nearest.start)
+        else:
+            kept[name] = replace(before, seen=pose.time, distance_m=nearest.start)
+    for name, last in list(kept.items()):
+        if last.seen == pose.time:
+            continue
+        stands = worth_a_warning(known.look_up(np.array(sorted(last.places)), pose.time)).any()
+        if not stands or pose.time - last.seen > ABSENT_S * NS:
+            told.append(_ended(last, pose, stands=bool(stands)))
+            del kept[name]
+    return tuple(kept.values()), told
+
+
+def _stretches(horizon: Horizon, speed: float) -> list[_Stretch]:
+    """Runs of slippery metres of a horizon; those that are less than LINK_M apart are one."""
+    brakes = np.concatenate([[0.0], braking_from(horizon)])
+    begins = math.ceil(speed * (REACTION_S + UPDATE_S) + MARGIN_M)  # where the brakes bite at the latest
+    found = []
+    for first, last in _runs(horizon.slippery):
+        places = frozenset(horizon.key[first : last + 1][horizon.slippery[first : last + 1]].tolist())
+        worst = first + int(np.nanargmin(np.where(horizon.slippery, horizon.mu, np.nan)[first : last + 1]))
+        room = float(brakes[first] - brakes[min(begins, first)])
+        found.append(_Stretch(places, float(first), float(last + 1), worst, room, horizon))
+    return found
+
+
+def _runs(mask: BoolArray) -> list[tuple[int, int]]:
+    at = np.flatnonzero(mask)
+    if not len(at):
+        return []
+    breaks = np.flatnonzero(np.diff(at) > LINK_M)
+    return list(zip(at[np.append(0, breaks + 1)].tolist(), at[np.append(breaks, len(at) - 1)].tolist(), strict=True))
+
+
+def _by_place(stretches: list[_Stretch]) -> list[tuple[frozenset[int], list[_Stretch]]]:
+    """Stretches of several ways that have places in common are the same."""
+    groups: list[tuple[frozenset[int], list[_Stretch]]] = []
+    for stretch in stretches:
+        same = [group for group in groups if group[0] & stretch.places]
+        groups = [group for group in groups if not group[0] & stretch.places]
+        places = stretch.places.union(*(group[0] for group in same))
+        groups.append((places, [*(way for group in same for way in group[1]), stretch]))
+    return groups
+
+
+def _warning(name: str, state: State, stretch: _Stretch, pose: Pose, sure: bool) -> GripWarning:
+    horizon, k = stretch.horizon, stretch.worst
+    first, last = int(stretch.start), int(stretch.end)
+    age = float(np.nanmin(horizon.age_s[first:last]))
+    reason = "an alert stands" if horizon.alerted[first:last].any() else "the map says so"
+    return GripWarning(
+        id=name, state=state, time=pose.time, distance_m=stretch.start, length_m=stretch.end - stretch.start,
+        time_s=stretch.start / pose.speed if pose.speed > SLOWEST else math.inf,
+        mu=float(horizon.mu[k]), mu_lower=float(horizon.mu_lower[k]), p_slippery=float(horizon.p_slippery[k]),
+        age_s=age, safe_speed=float(horizon.safe_speed[first:last].min()), way=horizon.path.kind, sure=sure,
+        reason=reason,
+    )  # fmt: skip
+
+
+def _ended(one: Active, pose: Pose, *, stands: bool) -> GripWarning:
+    if not stands:
+        reason = "it is no longer slippery there, or nobody knows"
+    elif one.distance_m <= NEAR_M:
+        reason = "passed"
+    else:
+        reason = "the car took another way"
+    return replace(one.told, state="ended", time=pose.time, reason=reason)

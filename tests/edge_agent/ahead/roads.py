@@ -1,0 +1,57 @@
+"""Roads for the tests of what lies ahead: straight lines of known cells near Gothenburg."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from edge_agent.ahead import known, path
+from edge_agent.ahead.known import HeardCells, HeardMap
+from edge_agent.ahead.path import Pose
+from schemas import grid
+from schemas.numeric import FloatArray, IntArray
+from schemas.thresholds import NS
+from schemas.wire import Alert
+
+NOW = 1_790_000_000 * NS
+HOME = Pose(57.7, 11.97, 0.3, 14.0, NOW)
+
+
+def line(length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0) -> tuple[FloatArray, FloatArray]:
+    """Latitude and longitude [deg] of a straight road from the car, a point a metre."""
+    s = np.arange(start, length)
+    return path.degrees(s * math.cos(yaw), s * math.sin(yaw), HOME)
+
+
+def keys_on(length: float = 400.0, yaw: float = HOME.yaw, start: float = 0.0) -> IntArray:
+    """The places of that road in its order, each once."""
+    key = grid.cell_of(*line(length, yaw, start)) * grid.SECTORS + int(grid.sector_of(yaw))
+    return key[np.sort(np.unique(key, return_index=True)[1])]
+
+
+def cells(key: IntArray, mu: float, *, width: float = 0.1, basis: int = known.MEASURED, at: int = NOW) -> HeardCells:
+    """HeardCells of one friction."""
+    said = np.full(len(key), mu)
+    slippery = np.full(len(key), 1.0 if mu + width < 0.4 else 0.0 if mu - width > 0.4 else 0.5)
+    belief = known.belief_of(said - width, said, said + width, slippery)
+    return HeardCells(
+        key, belief, np.full(len(key), basis), np.full(len(key), 3), np.full(len(key), at), np.full(len(key), at)
+    )
+
+
+def told(parts: list[HeardCells]) -> HeardMap:
+    """A cache that has heard of these cells."""
+    cache = HeardMap()
+    for part in parts:
+        for tile in np.unique(grid.tile_of(part.key // grid.SECTORS)).tolist():
+            inside = grid.tile_of(part.key // grid.SECTORS) == tile
+            cache.take(tile, HeardCells._make(column[inside] for column in part), NOW)
+    return cache
+
+
+def alert(key: int, *, raised: bool = True, time: int = NOW) -> Alert:
+    """An alert of ice at a place."""
+    cell, sector = divmod(int(key), grid.SECTORS)
+    latitude, longitude = grid.centre(cell)
+    return Alert(cell, sector, raised, time, 0.15, 0.1, 0.22, 0.98, 3, float(latitude), float(longitude), "P(mu < 0.4)")

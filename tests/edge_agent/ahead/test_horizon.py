@@ -1,0 +1,181 @@
+"""The horizon: metres to cells, unknown that stays unknown, fading, the cache, and the safe speed."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from edge_agent.ahead import known
+from edge_agent.ahead.horizon import (
+    COMFORT,
+    SIGHT_M,
+    UNKNOWN_LOWER,
+    WARN_ABOVE,
+    horizon_length,
+    look_ahead,
+    safe_speed,
+)
+from edge_agent.ahead.known import ALERT_HELD_S, CHANGE_S, HELD_S, HeardMap, belief_of
+from edge_agent.ahead.path import NONE, GivenRoute, corridor
+from edge_agent.ahead.roads import ways_on
+from schemas import grid, mugrid
+from schemas.thresholds import GRAVITY, NS
+from tests.edge_agent.ahead.roads import HOME, NOW, alert, cells, keys_on, line, told
+
+
+def test_along_a_route_each_metre_lies_in_the_cell_of_its_place() -> None:
+    path = GivenRoute(*line()).ahead(HOME, 200.0)
+    assert path is not None
+    assert path.kind == "route"
+    latitude, longitude = line()
+    assert len(path.distance) == 200
+    assert path.places[99, 0] // grid.SECTORS == grid.cell_of(latitude[100], longitude[100])
+    assert path.places[99, 0] % grid.SECTORS == 0  # it heads east
+    assert np.abs(path.curvature).max() < 1e-6
+
+
+def test_a_route_goes_on_where_the_car_is_and_is_none_for_who_left_it() -> None:
+    route = GivenRoute(*line())
+    latitude, longitude = line()
+    further = HOME._replace(latitude=float(latitude[300]), longitude=float(longitude[300]))
+    path = route.ahead(further, 500.0)
+    assert path is not None
+    assert len(path.distance) in (98, 99)
+    assert route.ahead(further._replace(latitude=57.701), 500.0) is None
+    assert route.ahead(further._replace(yaw=HOME.yaw + math.pi), 500.0) is None, "the other way is another road"
+
+
+def test_a_loop_that_is_driven_twice_is_not_jumped_ahead_in() -> None:
+    latitude, longitude = line(100.0)
+    twice = GivenRoute(
+        np.concatenate([latitude, latitude[::-1], latitude]), np.concatenate([longitude, longitude[::-1], longitude])
+    )
+    path = twice.ahead(HOME, 500.0)
+    assert path is not None
+    assert len(path.distance) > 290
+
+
+def test_unknown_stays_unknown() -> None:
+    horizon = look_ahead(corridor(HOME, 300.0), HeardMap(), NOW)
+    assert not horizon.basis.any()
+    assert (horizon.key == NONE).all()
+    assert np.isnan(horizon.mu_lower).all()
+    assert np.isnan(horizon.p_slippery).all()
+    assert np.isinf(horizon.safe_speed).all()
+    assert not horizon.slippery.any()
+
+
+def test_a_bound_is_no_value_and_gives_no_advice() -> None:
+    horizon = look_ahead(corridor(HOME, 100.0), told([cells(keys_on(), 0.3, basis=known.BOUND)]), NOW)
+    assert (horizon.basis == known.BOUND).any()
+    assert np.isnan(horizon.mu).all()
+    assert not horizon.slippery.any()
+    assert np.isinf(horizon.safe_speed).all()
+
+
+def test_what_is_heard_of_a_cell_is_what_it_said() -> None:
+    belief = belief_of(*(np.array([value]) for value in (0.31, 0.5, 0.8, 0.17)))
+    assert belief.sum() == pytest.approx(1.0)
+    bin_width = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS
+    for share, value in ((0.05, 0.31), (0.5, 0.5), (0.95, 0.8)):
+        assert mugrid.quantiles(belief, share)[0] == pytest.approx(value, abs=bin_width)
+    assert (belief @ known.SLIPPERY_BINS)[0] == pytest.approx(0.17, abs=0.05)
+
+
+def test_without_a_network_the_horizon_fades_to_unknown() -> None:
+    cache = told([cells(keys_on(), 0.8, width=0.05)])
+    path = corridor(HOME, 60.0)
+    fresh, later, gone = (look_ahead(path, cache, NOW + round(s * NS)) for s in (0.0, 1800.0, HELD_S + 1.0))
+    seen = fresh.basis == known.MEASURED
+    assert seen.any()
+    assert (later.mu_lower[seen] < fresh.mu_lower[seen] - 0.1).all(), "the interval opens"
+    assert later.age_s[seen] == pytest.approx(1800.0)
+    assert not gone.basis.any()
+
+
+def test_a_warning_fades_in_half_an_hour_and_an_alert_that_is_not_repeated_in_ten_minutes() -> None:
+    said = cells(keys_on(), 0.15, width=0.05)
+    said = said._replace(belief=0.9 * said.belief + 0.1 * cells(said.key, 0.8, width=0.05).belief)
+    cache, path = told([said]), corridor(HOME, 60.0)
+    share = -math.expm1(-2400.0 / CHANGE_S)
+    assert 0.9 * (1.0 - share) + 0.304 * share < WARN_ABOVE
+    assert look_ahead(path, cache, NOW + 1500 * NS).slippery.any()
+    assert not look_ahead(path, cache, NOW + 2400 * NS).slippery.any()
+    alone = HeardMap()
+    alone.alert(alert(keys_on()[3]), NOW)
+    assert look_ahead(path, alone, NOW + NS).alerted.any()
+    assert not look_ahead(path, alone, NOW + round((ALERT_HELD_S + 1) * NS)).alerted.any()
+
+
+def test_the_cache_is_bounded_and_gives_up_what_was_heard_longest_ago() -> None:
+    cache = HeardMap(most_cells=50)
+    first = cells(keys_on(), 0.5)
+    far = cells(keys_on(3000.0, start=2500.0), 0.5)
+    cache.take(1, first, NOW)
+    cache.take(2, far, NOW)
+    assert cache.cells == len(far.key)
+    assert np.isin(cache.keys(), far.key).all()
+
+
+def test_a_part_of_a_tile_replaces_only_what_it_speaks_of() -> None:
+    keys = keys_on(100.0)
+    cache = HeardMap()
+    cache.take(1, cells(keys, 0.8), NOW)
+    cache.take(1, cells(keys[:3], 0.2), NOW + NS)
+    found = cache.look_up(keys, NOW + NS)
+    assert found.mu[:3] == pytest.approx(0.2, abs=0.03)
+    assert found.mu[3:] == pytest.approx(0.8, abs=0.03)
+
+
+def test_alerts_that_no_longer_stand_are_forgotten_with_the_tile_that_says_so() -> None:
+    cache, keys = HeardMap(), keys_on()
+    tile = int(grid.tile_of(keys[3] // grid.SECTORS))
+    assert cache.alert(alert(keys[3]), NOW)
+    assert not cache.alert(alert(keys[3]), NOW + NS), "put again, it is no news"
+    assert cache.standing(tile, [], NOW)
+    assert not cache.alerts
+    assert cache.alert(alert(keys[3]), NOW)
+    assert cache.alert(alert(keys[3], raised=False), NOW)
+
+
+def test_the_map_shows_the_road_around_a_bend_and_both_ways_at_a_fork() -> None:
+    straight = keys_on(90.0, yaw=0.0)
+    east, north = grid.deinterleave(straight[-1:] // grid.SECTORS)
+    up = grid.interleave(np.repeat(east, 8), north - np.arange(1, 9)) * grid.SECTORS + 1
+    on = grid.interleave(east + np.arange(1, 9), np.repeat(north, 8)) * grid.SECTORS
+    pose = HOME._replace(yaw=0.0)
+    bent = ways_on(pose, np.sort(np.concatenate([straight, up])), 250.0)
+    assert len(bent) == 1
+    assert set(up.tolist()) <= set(bent[0].places[:, 0].tolist())
+    forked = ways_on(pose, np.sort(np.concatenate([straight, up, on])), 250.0)
+    assert len(forked) == 2
+    assert set(on.tolist()) & set(forked[0].places[:, 0].tolist()), "straight on comes first"
+    assert ways_on(pose, up[4:], 250.0) == [], "no road here"
+
+
+def test_the_other_carriageway_is_no_way_on() -> None:
+    back = keys_on(90.0, yaw=0.0) + 2
+    assert ways_on(HOME._replace(yaw=0.0), back, 200.0) == []
+
+
+def test_the_safe_speed_lets_one_stop_in_sight_and_falls_comfortably_before_a_slower_place() -> None:
+    lower = np.concatenate([np.full(100, 0.8), np.full(50, 0.12)])
+    speed = safe_speed(np.zeros(150), lower)
+    v, a = speed[120], 0.12 * GRAVITY
+    assert v * 1.5 + v * v / (2 * a) == pytest.approx(SIGHT_M)
+    assert -np.diff(speed[:101] ** 2).min() / 2.0 <= COMFORT + 1e-9
+    assert (np.diff(speed) <= 1e-9).all()
+
+
+def test_the_safe_speed_holds_a_bend_and_says_nothing_of_an_unknown_one() -> None:
+    bend = np.where(np.arange(80) > 50, 1.0 / 30.0, 0.0)
+    assert safe_speed(bend, np.full(80, 0.2))[60] == pytest.approx(math.sqrt(0.2 * GRAVITY * 30.0))
+    assert np.isinf(safe_speed(bend, np.full(80, np.nan))).all()
+
+
+def test_one_looks_as_far_as_it_takes_to_stop_on_an_unknown_road() -> None:
+    assert horizon_length(14.0) > 14.0 * 1.5 + 14.0**2 / (2 * UNKNOWN_LOWER * GRAVITY)
+    assert horizon_length(0.0) == 150.0
+    assert horizon_length(80.0) == 1000.0
