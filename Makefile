@@ -3,7 +3,9 @@ PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
 
-.PHONY: setup demo test test-shuffled check package docs lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test usability
+TESTS := $(BIN)/python -m pytest -q --numprocesses auto --dist loadfile
+
+.PHONY: setup demo test test-all test-shuffled check package docs lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test usability
 
 setup: $(STAMP)  ## make .venv and install everything, pinned
 
@@ -17,10 +19,13 @@ demo: setup  ## router, fleet service and simulated vehicles; ends with the map 
 	$(BIN)/python -m deploy.demo
 
 test: setup  ## the tests that take seconds, a process a core; says what the slowest cost
-	$(BIN)/python -m pytest -q --numprocesses auto --dist loadfile --durations 10
+	$(TESTS) --durations 10 -m 'not long and not campaign'
 
-test-shuffled: setup  ## ten times in an order drawn anew: none may lean on another
-	for round in 1 2 3 4 5 6 7 8 9 10; do $(BIN)/python -m pytest -q --numprocesses auto --dist loadfile --random-order || exit 1; done
+test-all: setup  ## these, and the campaigns in their quick form
+	$(TESTS) --durations 10
+
+test-shuffled: setup  ## all ten times in an order drawn anew: none may lean on another
+	for round in 1 2 3 4 5 6 7 8 9 10; do $(TESTS) --random-order || exit 1; done
 
 docs: setup  ## the documentation site, .docs/index.html; a warning is an error
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[docs]'
@@ -34,7 +39,7 @@ lint: setup
 types: setup
 	$(BIN)/mypy
 
-check: lint types test package faults-quick  ## what CI runs
+check: lint types test-all package faults-quick  ## what CI runs
 
 package: setup  ## wheel and sdist, installed in a fresh environment outside the repository and used there
 	$(BIN)/python -m tests.packaging

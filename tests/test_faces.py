@@ -112,6 +112,7 @@ busiest = their_plugin:busiest
 """
 
 
+@pytest.mark.campaign
 def test_estimator_source_and_question_of_another_distribution_are_found(tmp_path: Path) -> None:
     from tests.fleet_service.archive.kept import DATA
 

@@ -41,6 +41,8 @@ def driven(trip: Trip, drive: Recorded) -> tuple[list[bool], list[Block]]:
         admitted.append(trip.admitted())
         blocks.append(block)
     trip.end()
+    if trip._looking is not None:
+        trip._looking.result()
     trip.close()
     return admitted, blocks
 

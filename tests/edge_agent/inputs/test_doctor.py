@@ -124,6 +124,7 @@ def test_estimates_that_are_not_plausible_have_an_exit_code_of_their_own(tmp_pat
     assert "NOT PLAUSIBLE" in capsys.readouterr().err
 
 
+@pytest.mark.campaign
 @pytest.mark.timeout(600)  # processes are started, and kernels may have to be compiled
 def test_only_the_inputs_are_evaluated_where_so_asked(tmp_path: Path) -> None:
     words = ["evaluate", "--only", "inputs", "--quick", "--recorded", str(BLF), "--out", str(tmp_path)]

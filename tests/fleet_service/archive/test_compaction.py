@@ -100,6 +100,7 @@ def operations(monkeypatch: pytest.MonkeyPatch, die_at: int) -> list[str]:
     return seen
 
 
+@pytest.mark.campaign
 def test_it_may_die_before_any_change_of_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fill(tmp_path / "0", 2, 16)
     whole = {kind: identities(tmp_path / "0", kind) for kind in Kind}

@@ -28,6 +28,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, name, value)
 
 
+@pytest.mark.campaign
 @pytest.mark.usefixtures("small")
 def test_a_quick_campaign_writes_every_figure_with_its_bar_the_table_and_the_plots(tmp_path: Path) -> None:
     assert main(["evaluate", "--out", str(tmp_path), "--quick", "--skip-whole-way"]) == 0

@@ -161,6 +161,7 @@ def test_misuse_is_one_line_and_exit_code_two(
     assert capsys.readouterr().err.startswith(f"error: {field}:")
 
 
+@pytest.mark.campaign
 def test_the_quick_campaign_writes_figures_report_and_plots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", "--out", str(tmp_path), "--quick", "--plots", "svg"]) in (0, 1)
     output = capsys.readouterr()
@@ -182,6 +183,7 @@ def test_the_quick_campaign_writes_figures_report_and_plots(tmp_path: Path, caps
     }
 
 
+@pytest.mark.campaign
 def test_more_seeds_are_driven_and_no_plots_drawn_where_so_asked(tmp_path: Path) -> None:
     assert main(["evaluate", "--out", str(tmp_path), "--quick", "--seeds", "3", "--no-plots"]) in (0, 1)
     assert json.loads((tmp_path / "figures.json").read_text())[0]["seeds"] == [FIGURES, FIGURES + 1, FIGURES + 2]
