@@ -5,7 +5,7 @@ STAMP := .venv/.installed
 
 TESTS := $(BIN)/python -m pytest -q --numprocesses auto --dist loadfile
 
-.PHONY: setup demo test test-all test-shuffled check package docs lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test usability
+.PHONY: setup demo test test-all test-shuffled check package docs lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test usability figures
 
 setup: $(STAMP)  ## make .venv and install everything, pinned
 
@@ -53,6 +53,9 @@ faults-quick: setup  ## the same mechanisms in two minutes
 usability: setup  ## the first hour of a new user as figures; wants chromium and unshare; writes .usability/figures.json
 	$(BIN)/python -m tests.usability
 
+figures: setup  ## keep what the campaigns' last runs measured in deploy/figures, and write the READMEs' numbers anew
+	$(BIN)/python -m tests.usability.kept
+
 soak: setup  ## half an hour of steady load: does anything grow?
 	$(BIN)/python -m tests.faults.soak
 
@@ -79,4 +82,4 @@ lock: setup  ## write the installed versions to constraints.txt
 	$(BIN)/python -m pip freeze --exclude-editable --exclude gripmap > constraints.txt
 
 clean:
-	rm -rf .venv .demo .docs dist .bench .analytics .faults build *.egg-info
+	rm -rf .venv .demo .docs dist .bench .analytics .evaluation .faults .usability build *.egg-info

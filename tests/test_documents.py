@@ -5,13 +5,15 @@ from __future__ import annotations
 import ast
 import re
 import shlex
+from pathlib import Path
 
 import pytest
 
-from schemas.runtime import commandline
+from schemas.runtime import commandline, figures
+from schemas.runtime.figures import Figure
 from tests.house import ROOT
 from tests.test_commands import LINES
-from tests.usability import readme, stale
+from tests.usability import kept, readme, stale
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
@@ -59,3 +61,40 @@ def test_files_that_a_page_links_to_are_there(page: str) -> None:
     links = re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", (ROOT / page).read_text(encoding="utf-8"))
     local = [link for link in links if "://" not in link]
     assert not [link for link in local if not ((ROOT / page).parent / link).exists()]
+
+
+def test_figures_that_pages_quote_are_those_that_are_kept() -> None:
+    """`make figures` writes both anew."""
+    quoted = [quote for page in kept.pages() for quote in kept.quotes(page)]
+    assert len(quoted) > 30
+    measured = [quote for quote in quoted if (kept.FOLDER / f"{quote.file}.json").exists()]
+    assert len(measured) >= 8
+    there = [line for line in kept.stale() if any(f" {quote.name} " in f"{line} " for quote in measured)]
+    assert there == []
+    assert all(quote.said for quote in quoted), "defined and never quoted"
+    for name in {quote.file for quote in measured}:
+        assert all(row["commit"] for row in kept.kept(name).values())
+
+
+def test_a_quoted_figure_that_changes_is_found_and_written_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page, left = tmp_path / "README.md", tmp_path / "left.json"
+    page.write_text('Covers [95 %][demo.a], and [.11][demo.b].\n\n[demo.a]: figures/demo.json "{:.0%}"\n'
+                    '[demo.b]: figures/demo.json "{:.2f}"\n')  # fmt: skip
+    monkeypatch.setattr(kept, "ROOT", tmp_path)
+    monkeypatch.setattr(kept, "FOLDER", tmp_path / "figures")
+    monkeypatch.setattr(kept, "pages", lambda: [page])
+    figures.write(left, "demo", [1], [Figure("demo.a", 0.955, "", 0.9, "more"), Figure("demo.b", 0.125, "", 0.12)])
+    assert len(kept.stale()) == 2
+    assert kept.take("demo", left).startswith("demo: 2 figures")
+    assert [line.partition(" is ")[2] for line in kept.stale()] == [
+        "[96 %][demo.a], not [95 %][demo.a]", "**[.12][demo.b]**, not [.11][demo.b]"
+    ]  # fmt: skip
+    assert kept.renew() == ["README.md"]
+    assert page.read_text().startswith("Covers [96 %][demo.a], and **[.12][demo.b]**.\n")
+    assert kept.stale() == []
+    assert kept.renew() == []
+    figures.write(left, "demo --quick", [1], [Figure("demo.a", 0.5, "")])
+    assert "as it was" in kept.take("demo", left)
+    assert kept.stale() == []

@@ -31,7 +31,7 @@ from schemas.runtime.palette import ESTIMATORS, GRIP_RANGE, SURFACES, TRUTH, sha
 from tests.browser import opened
 from tests.house import ROOT
 from tests.sight import SIGHTS, difference, lab
-from tests.usability import mistakes, stale, waiting
+from tests.usability import kept, mistakes, stale, waiting
 from tests.usability.wrong_logs import unnoticed
 
 FOLDER: Final = ROOT / ".usability"
@@ -165,13 +165,8 @@ def options_undocumented(house: House) -> float:
 
 
 def figures_stale(house: House) -> float:
-    """Figures of the root README that are not those of its figures.json."""
-    if not stale.FIGURES.exists():
-        house.note(
-            "stale", f"{stale.FIGURES.relative_to(ROOT)} is not kept yet: copy .demo/figures.json of a quiet machine"
-        )
-        return float("nan")
-    found = stale.stale_figures()
+    """Figures that pages quote and that are not those of the files in deploy/figures."""
+    found = kept.stale()
     house.note("stale", found)
     return float(len(found))
 

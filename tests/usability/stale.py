@@ -1,10 +1,9 @@
-"""Pages against code: options that no page mentions, tables of modules, figures that are not those of their file."""
+"""Pages against code: options that no page mentions, and the pages of options."""
 
 from __future__ import annotations
 
 import argparse
 import importlib
-import json
 import re
 from collections.abc import Iterator
 from typing import Any, Final
@@ -13,15 +12,7 @@ import edge_agent.cli
 import fleet_service.cli
 from tests.house import ROOT
 
-FIGURES: Final = ROOT / "deploy" / "demo" / "figures.json"  # of the demo whose figures the root README shows
 HALVES: Final[dict[str, Any]] = {"edge_agent": edge_agent.cli, "fleet_service": fleet_service.cli}
-# rows of the root README's table: words in the row, the figure it shows, how it is written
-ROWS: Final = (
-    ("truth inside the 90 % interval", "demo.map.coverage90", "{:.0%}"),
-    ("error of measured cells", "demo.map.rmse", "{:.2f}"),
-    ("excited passes over new ice", "demo.alert.delay_passes", "{:.0f}"),
-    ("wall time after installation", "demo.wall_s", "{:.0f} s"),
-)
 
 
 def options() -> Iterator[tuple[str, str, str]]:
@@ -67,19 +58,6 @@ def undocumented() -> list[str]:
         for half in HALVES
     }
     return [f"{half} {name} {option}" for half, name, option in options() if not re.search(rf"{option}\b", pages[half])]
-
-
-def stale_figures() -> list[str]:
-    """Rows of the root README's table of the demo that say another number than the file."""
-    rows = {row["name"]: row["value"] for row in json.loads(FIGURES.read_text()) if "name" in row}
-    found = []
-    lines = (ROOT / "README.md").read_text().splitlines()
-    for words, name, form in ROWS:
-        (line,) = (line for line in lines if line.startswith(f"| {words}"))
-        said, expected = line.split("|")[2].strip(), form.format(rows[name])
-        if said.lstrip("0") != expected.lstrip("0"):
-            found.append(f"{words}: {said}, not {expected}")
-    return found
 
 
 def main() -> None:
