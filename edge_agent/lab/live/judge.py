@@ -7,6 +7,8 @@ import socket
 import subprocess
 import sys
 import time
+import urllib.error
+import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -27,6 +29,7 @@ RATE_HZ: Final = 100.0
 MULTICAST: Final = "239.74.163.2"
 COUNTED: Final = ("can", "ros2", "vss")
 PATIENCE_S: Final = 60.0
+START_S: Final = 300.0  # an agent whose kernels are compiled first
 SETTLED_S: Final = 2.0  # after the last sample: rows come late by design
 KILLS: Final = 3  # of each source while an agent drives
 
@@ -144,35 +147,59 @@ def lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
 
 
 def crashes(folder: Path, kills: int = KILLS) -> tuple[int, int]:
-    """Agents that did not end as they should although their sources were killed and came back, and how often."""
+    """Agents that did not notice each loss and each return of their sources, or did not end as they should; losses."""
     vehicle = folder / "car.json"
     vehicle.write_text(Vehicle.model_validate(PRESETS["sedan"].vehicle).model_dump_json(exclude_none=True))
-    bad = tries = 0
+    bad = losses = 0
     for kind in (*COUNTED, "gpsd"):
         place, source = addresses(kind)
         name, dbc = written("can" if kind == "gpsd" else kind, folder)
-        config = folder / f"{kind}.agent.json"
-        spool = {"spool": str(folder / f"{kind}.sqlite"), "estimator": "ckf"}
-        config.write_text(json.dumps({"zenoh": {"connect": ["tcp/127.0.0.1:9"]}, **spool}), encoding="utf-8")
+        config, port = folder / f"{kind}.agent.json", free_port()
+        settings = {"spool": str(folder / f"{kind}.sqlite"), "estimator": "ckf", "metrics_port": port}
+        config.write_text(json.dumps({"zenoh": {"connect": ["tcp/127.0.0.1:9"]}, **settings}), encoding="utf-8")
         words = ["run", "--source", source, "--profile", name, "--vehicle", str(vehicle), "--name", "car-one"]
         words += ["--config", str(config), "--trust", *(["--dbc", str(dbc)] if dbc else [])]
         if kind == "gpsd":  # positions beside a bus
             words += ["--source", addresses("can")[1]]
         command = [sys.executable, "-c", "import sys; from edge_agent.cli import main; sys.exit(main(sys.argv[1:]))"]
         agent = subprocess.Popen([*command, *words], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
+        fine = _shows(agent, port, source, silent=True, patience_s=START_S)
         for _ in range(kills):
             with peer(kind, place, 100_000) as running:
                 running.go()
                 running.until("ready")
                 running.go()
-                time.sleep(SETTLED_S)
-            tries += 1
-            bad += agent.poll() is not None
-        time.sleep(SETTLED_S)
+                fine &= _shows(agent, port, source, silent=False)
+            losses += 1
+            fine &= _shows(agent, port, source, silent=True)
         agent.terminate()
         said, _ = agent.communicate(timeout=PATIENCE_S)
-        bad += agent.returncode != 0 or not said.strip().endswith("}")
-    return bad, tries
+        bad += not (fine and agent.returncode == 0 and said.strip().endswith("}"))
+    return bad, losses
+
+
+def _shows(
+    agent: subprocess.Popen[str], port: int, source: str, *, silent: bool, patience_s: float = PATIENCE_S
+) -> bool:
+    """Whether the health of a running agent comes to say that a source is silent, or no longer says so."""
+    deadline = time.monotonic() + patience_s
+    while agent.poll() is None and time.monotonic() < deadline:
+        troubles = _troubles(port)
+        if "the agent is starting" not in troubles and troubles and silent == any(source in line for line in troubles):
+            return True  # its router is away: something troubles it all the time
+        time.sleep(0.1)
+    return False
+
+
+def _troubles(port: int) -> list[str]:
+    """What an agent's `/healthz` says is wrong, nothing while it does not answer."""
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=PATIENCE_S) as answer:
+            return list(json.load(answer)["troubles"])
+    except urllib.error.HTTPError as answer:
+        return list(json.load(answer)["troubles"])
+    except OSError:
+        return []
 
 
 def figures(folder: Path, seconds: float, kills: int = KILLS) -> list[Figure]:
