@@ -26,6 +26,7 @@ from fleet_service.archive.load import count_set_aside, set_aside
 from fleet_service.archive.log import SegmentLog
 from fleet_service.archive.pseudonyms import Pseudonyms
 from fleet_service.archive.segments import Rows
+from fleet_service.archive.witnesses import mend
 from fleet_service.fusion import observations_of
 from fleet_service.fusion.standing import ERRORS, unknown
 from fleet_service.fusion.weather import Reports
@@ -89,6 +90,7 @@ class Engine:
         self._tracks, self._places = Tracks(), Bucket(NEW_CELLS_AT_ONCE, NEW_CELLS_PER_HOUR)
         self._turn = 0  # of the alerts that are told again
         self.failing = False  # the last segment could not be written
+        self.counts["witnesses_damaged"] += mend(root / "keys")
         begin = restart(root, config.lateness_s)
         self.fusion, streams = begin.fusion, begin.streams
         self.counts["checkpoints_refused"] += begin.refused
@@ -154,6 +156,11 @@ class Engine:
     def unsettled(self) -> int:
         """Batches that are admitted and not on disk yet."""
         return self._log.unsettled
+
+    @property
+    def newest(self) -> int:
+        """Latest time that a record told which was let in [ns]; a restart finds the same as `seen`."""
+        return self._streams.newest
 
     @property
     def hangs_s(self) -> float:
@@ -278,6 +285,7 @@ class Engine:
 
     def _acknowledged(self, durable: Callable[[], list[BatchId]]) -> list[tuple[str, bytes]]:
         try:
+            self._intake.sync()
             self._intake.settled(durable())
         except OSError:
             self.counts["segment_failures"] += 1

@@ -21,6 +21,7 @@ _FAMILIES: Final = (  # prefix of the counts, name, label, text
 )
 _SINGLE: Final = {
     "key_failures": "batches without a key for their month: it is damaged, or cannot be written",
+    "witnesses_damaged": "lines of keys/MONTH.witnesses that were damaged when the service began",
     "too_many_gaps": "batches with too many missing before them",
     "clock_doubted": "batches neither let in nor refused, since the time is in doubt",
     "checkpoints_refused": "checkpoints that were damaged, of another version, or died of",

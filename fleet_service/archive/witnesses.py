@@ -4,12 +4,18 @@
     keys/2026-01.witnesses      which pseudonym of the month is whose number; goes with the month's key
 
 One car must not be two witnesses because a month ended, or because it says so. The second file is for restarts and
-replays, which see pseudonyms; a line that is lost or damaged makes one vehicle two again there, and nothing else.
+replays, which see pseudonyms; a line that is lost or damaged makes one vehicle two again there, and nothing else. So
+a service looks through them when it starts, counts what is damaged and takes it out; the vehicle's next batch writes
+its line again.
 """
 
 from __future__ import annotations
 
+import errno
+import os
 import re
+from collections.abc import Iterator
+from contextlib import suppress
 from hashlib import blake2b
 from pathlib import Path
 from typing import Final
@@ -18,6 +24,7 @@ import numpy as np
 
 from fleet_service.archive.pseudonyms import kept_key
 from schemas.numeric import IntArray
+from schemas.runtime.durable import sync_directory, written
 
 ENDING: Final = ".witnesses"
 _KEY: Final = "witness.key"
@@ -37,12 +44,13 @@ class Witnesses:
         self._folder = folder
         self._key: bytes | None = None
         self._known: set[int] | None = None
+        self._unsynced: set[Path] = set()
 
     def of(self, vehicle: str, month: str, pseudonym: int) -> int:
-        """Number of a vehicle, which has this pseudonym in this month (2026-01).
+        """Number of a vehicle, which has this pseudonym in this month (2026-01); durable after `sync`.
 
         Raises:
-            OSError: the key can neither be read nor written.
+            OSError: the key can neither be read nor written, or the line not be written.
         """
         if self._key is None or self._known is None:
             self._key = kept_key(self._folder / _KEY)
@@ -51,23 +59,61 @@ class Witnesses:
         if pseudonym not in self._known:
             path = self._folder / f"{month}{ENDING}"
             path.touch(_SECRET)
-            with path.open("ab") as file:
-                file.write(_line(pseudonym, number))
+            self._unsynced.add(path)
+            with path.open("r+b", buffering=0) as file:
+                file.seek(file.seek(0, os.SEEK_END) // _LINE * _LINE)  # over what a full disk left of a line
+                if file.write(_line(pseudonym, number)) != _LINE:
+                    raise OSError(errno.ENOSPC, "no room for a line", str(path))
             self._known.add(pseudonym)
         return number
+
+    def sync(self) -> None:
+        """Make the new lines durable: before anything of their vehicles is acknowledged.
+
+        Raises:
+            OSError: the disk is full or broken; it is tried again at the next call.
+        """
+        for path in sorted(self._unsynced):
+            if path.exists():  # else the month was forgotten meanwhile
+                with path.open("rb") as file:
+                    os.fsync(file.fileno())
+                sync_directory(self._folder)
+            self._unsynced.discard(path)
 
 
 def read(folder: Path) -> dict[int, int]:
     """Numbers by pseudonym, of all months; without lines that are damaged."""
-    out = {}
-    for path in sorted(folder.glob(f"*{ENDING}")):
-        if _MONTH.fullmatch(path.stem):
-            data = path.read_bytes()
-            for at in range(0, len(data) - _LINE + 1, _LINE):
-                pseudonym, number = (int.from_bytes(data[at + k : at + k + 8], signed=True) for k in (0, 8))
-                if data[at : at + _LINE] == _line(pseudonym, number):
-                    out[pseudonym] = number
-    return out
+    return {pseudonym: number for path in _files(folder) for pseudonym, number in _whole(path.read_bytes())}
+
+
+def mend(folder: Path) -> int:
+    """Take damaged lines out, and what is no line, where the disk lets it; returns how many there were.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
+    damaged = 0
+    for path in _files(folder):
+        data = path.read_bytes()
+        good = b"".join(_line(*both) for both in _whole(data))
+        if len(good) < len(data):
+            damaged += -(-(len(data) - len(good)) // _LINE)
+            with suppress(OSError), written(path, _SECRET) as file:
+                file.write(good)
+    return damaged
+
+
+def _files(folder: Path) -> list[Path]:
+    """Of all months."""
+    return [path for path in sorted(folder.glob(f"*{ENDING}")) if _MONTH.fullmatch(path.stem)]
+
+
+def _whole(data: bytes) -> Iterator[tuple[int, int]]:
+    """Pseudonym and number of every line that is as it was written."""
+    for at in range(0, len(data) - _LINE + 1, _LINE):
+        pseudonym, number = (int.from_bytes(data[at + k : at + k + 8], signed=True) for k in (0, 8))
+        if data[at : at + _LINE] == _line(pseudonym, number):
+            yield pseudonym, number
 
 
 def numbers_of(folder: Path, pseudonyms: IntArray) -> IntArray:

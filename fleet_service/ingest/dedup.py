@@ -30,7 +30,7 @@ class SequenceTracker:
         witness: number that the map knows it by, in every month; 0 until it is heard.
         low: every seq up to here is settled, or will never come.
         seen: the accepted ones above.
-        newest: time of the newest accepted batch's first record [ns].
+        newest: newest time of an accepted record, by which a batch is too old [ns].
     """
 
     __slots__ = ("key", "low", "newest", "seen", "vehicle", "witness")
@@ -45,7 +45,7 @@ class SequenceTracker:
         return seq <= self.low or seq in self.seen
 
     def accept(self, seq: int, time: int = 0) -> bool:
-        """Note a seq and the time of its first record [ns]; False if too many are missing before it (not noted)."""
+        """Note a seq and the newest time of its records [ns]; False if too many are missing before it (not noted)."""
         if seq == self.low + 1:
             self.low = seq
             self._close()

@@ -31,6 +31,7 @@ from schemas.grid import cell_of
 from schemas.keys import Parsed
 from schemas.numeric import BoolArray, IntArray
 from schemas.runtime.batch_decoder import decode_many
+from schemas.tables import US_STEP
 from schemas.thresholds import NS
 from schemas.wire import Kind
 from schemas.wire.batches import Decoded, Head, Heads
@@ -157,6 +158,14 @@ class BatchIntake:
                 out[kind] = accepted
         return out
 
+    def sync(self) -> None:
+        """Make durable who the vehicles of accepted batches are.
+
+        Raises:
+            OSError: the disk is full or broken.
+        """
+        self._witnesses.sync()
+
     def settled(self, batches: Sequence[BatchId]) -> None:
         """The batches' rows are on disk: acknowledge them."""
         self._pending.difference_update(batches)
@@ -181,7 +190,7 @@ class BatchIntake:
             else:
                 self._refuse(str(owners[place].name), found.heads.at(place), rules[broken[place]])
         new = self._new(kind, found.heads, time, broken < 0)
-        return self._rows(kind, new, time, found, clock) if new else AcceptedBatches([], {})
+        return self._rows(kind, new, found, clock) if new else AcceptedBatches([], {})
 
     def _tell_time(self, owners: Sequence[Parsed], time: IntArray) -> None:
         for owner, told in zip(owners, time.tolist(), strict=True):
@@ -231,9 +240,7 @@ class BatchIntake:
         stream.vehicle, stream.witness = vehicle, witness
         return stream
 
-    def _rows(
-        self, kind: Kind, new: dict[BatchId, int], time: IntArray, found: Decoded, clock: Clock
-    ) -> AcceptedBatches:
+    def _rows(self, kind: Kind, new: dict[BatchId, int], found: Decoded, clock: Clock) -> AcceptedBatches:
         batches, (rows, heads, sizes) = list(new), _chosen(found, list(new.values()))
         rows["region"] = np.repeat(heads.region, sizes)
         broken, rules = validation.check_rows(kind, rows, rows["region"], clock)
@@ -250,8 +257,8 @@ class BatchIntake:
         for place in np.flatnonzero(validation.too_long(rows[TIME[kind]], sizes) & good).tolist():
             good[place] = False
             self._refuse(batches[place][0].vehicle, heads.at(place), validation.TOO_LONG)
-        first = time[list(new.values())].tolist()
-        for place, at in compress(enumerate(first), good.tolist()):
+        newest = _newest(rows[FIRST_TIME[kind]], sizes).tolist()
+        for place, at in compress(enumerate(newest), good.tolist()):
             stream, seq = batches[place]
             if not stream.accept(seq, at):  # no room to remember it: older ones must come first, it is no rejection
                 self._counts["too_many_gaps"] += 1
@@ -270,6 +277,12 @@ class BatchIntake:
     def _count(self, rule: str, times: int = 1) -> None:
         if times:
             self._counts[f"refused.{rule}"] += times
+
+
+def _newest(time: IntArray, sizes: IntArray) -> IntArray:
+    """Newest time of each batch (k,), as the archive keeps it: a restart finds the same."""
+    newest = np.maximum.reduceat(time, np.cumsum(sizes) - sizes)
+    return np.asarray(newest // US_STEP * US_STEP)
 
 
 def _chosen(found: Decoded, indices: list[int]) -> tuple[Rows, Heads, IntArray]:

@@ -1,78 +1,117 @@
 """The service gone for an hour while routers stand and cars drive on; then back, with room for so much a second.
 
-The cars' outboxes are the real ones; network, service and time are made up, so that an hour takes a minute. A service
-takes what its queue holds and drops the rest, and acknowledges twice a second. Each car has its share of what a service
-of a thousand cars takes: 20 batches of a second, and 20 places of the queue.
+The cars' outboxes and the service's engine are the real ones; network and time are made up, so that an hour takes a
+minute. A service takes what its queue holds and drops the rest, and acknowledges what is on disk twice a second. Each
+car has its share of what a service of a thousand cars takes: 20 batches of a second, and 20 places of the queue. Every
+second it comes to a cell where nobody was: all of them must be on the map in the end, the old ones as old news.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
+from contextlib import closing
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from edge_agent.publish.batching import Draft
-from edge_agent.publish.outbox import Outbox, StoredBatch
+from edge_agent.publish.outbox import Outbox, StoredBatch, Stream
+from fleet_service.app.engine import Engine
+from fleet_service.ingest.inbox import Message
+from schemas import grid, keys, wire
+from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind
 from tests.faults.bars import figure
 from tests.faults.frame import Site
+from tests.fleet_service.examples import START, batch
 
 STEP_S: Final = 0.5
-BATCH_BYTES: Final = 200  # of what a car sends in half a second
+NS: Final = 10**9
+PLACE: Final = (57.0, 12.0)
+CELL_DEG: Final = 360.0 / 2**grid.CELL_ZOOM
 TAKEN_PER_S: Final = 20.0  # batches that a service of a thousand cars takes of each
 QUEUED: Final = 20.0  # messages of its queue for each
-REGION: Final = 77
 
 
 @dataclass
 class Made:
-    """The service: batches that wait, those that it holds, and bytes that reached the routers."""
+    """The service: an engine, batches that wait, and bytes that reached the routers."""
 
     cars: int
+    engine: Engine
     up: bool = True
-    queue: deque[tuple[Outbox, StoredBatch]] = field(default_factory=deque)
-    held: set[tuple[str, int, Kind, int, int]] = field(default_factory=set)
+    queue: deque[StoredBatch] = field(default_factory=deque)
     sent: int = 0
     messages: int = 0
 
-    def put(self, outbox: Outbox, batch: StoredBatch) -> None:
+    def put(self, batch: StoredBatch) -> None:
         """A batch on its way: into the queue, or lost."""
         self.sent += len(batch.payload)
         self.messages += 1
         if self.up and len(self.queue) < QUEUED * self.cars:
-            self.queue.append((outbox, batch))
+            self.queue.append(batch)
 
-    def work(self) -> int:
-        """Take as much as a step allows, and acknowledge it; returns how many were new."""
-        new = 0
-        for _ in range(min(len(self.queue), round(TAKEN_PER_S * STEP_S * self.cars)) if self.up else 0):
-            outbox, batch = self.queue.popleft()
-            new += (*batch.stream, batch.seq) not in self.held
-            self.held.add((*batch.stream, batch.seq))
-            outbox.settle(batch.stream, [(batch.seq, batch.seq)])
-        return new
+    def work(self, now: float) -> list[tuple[str, bytes]]:
+        """Take as much as a step allows, and put it on disk; returns acknowledgements."""
+        if not self.up:
+            return []
+        taken = [self.queue.popleft() for _ in range(min(len(self.queue), round(TAKEN_PER_S * STEP_S * self.cars)))]
+        self.engine.ingest([_message(one) for one in taken], START + round(now * NS))
+        return self.engine.flush()
+
+
+def _message(one: StoredBatch) -> Message:
+    key = keys.observation_key(one.stream.region, one.stream.vehicle)
+    return Message(one.stream.kind, key, one.payload, wire.ENCODING[one.stream.kind])
+
+
+def _draft(car: int, now: float) -> tuple[Draft, int]:
+    """What a car sends in half a second, and the cell that it tells of: each has a road of its own."""
+    latitude, longitude = PLACE[0] + 2 * CELL_DEG * car, PLACE[1] + CELL_DEG * int(now)
+    cell = int(grid.cell_of(latitude, longitude))
+    region, time = int(grid.region_of(cell)), START + round(now * NS)
+    told = batch(
+        f"car-{car:03}", 1, time, [0.6], latitude=[latitude], longitude=[longitude], cell=[cell], position_std=[0.1]
+    )  # fmt: skip
+
+    def encoded(seq: int, first_held: int) -> bytes:
+        return wire.encode(replace(told, boot=car + 1, region=region, seq=seq, first_held=first_held))
+
+    return Draft(told.vehicle, Kind.OBSERVATION, region, 1, encoded), cell
 
 
 def run(site: Site) -> list[Figure]:
     """An hour, or ten minutes in a quick run."""
+    with closing(Engine(ServiceConfig(), site.folder / "archive")) as engine:
+        return _run(site, engine)
+
+
+def _run(site: Site, engine: Engine) -> list[Figure]:
     cars, away_s = site.of(20, 2), site.of(3600, 600)
     outboxes = [Outbox(site.folder / f"{n}.sqlite", boot=n + 1) for n in range(cars)]
-    service, made, now = Made(cars), 0, 0.0
-    stored: set[tuple[str, int, Kind, int, int]] = set()
+    service, made, now = Made(cars, engine), 0, 0.0
+    cells, stored = set[int](), 0
 
     def step(driving: bool) -> int:
-        nonlocal made, now
+        nonlocal made, now, stored
         for n, outbox in enumerate(outboxes):
-            drafts = [Draft(f"car-{n:03}", Kind.OBSERVATION, REGION, 4, lambda seq, first: bytes(BATCH_BYTES))]
-            fresh = outbox.store(drafts, now) if driving else []
-            made += BATCH_BYTES * len(fresh)
-            stored.update((*batch.stream, batch.seq) for batch in fresh)
-            for batch in [one for one in fresh if one.fresh] + outbox.due(now, 640):
-                service.put(outbox, batch)
+            fresh = []
+            if driving:
+                draft, cell = _draft(n, now)
+                cells.add(cell)
+                fresh = outbox.store([draft], now)
+            made += sum(len(batch.payload) for batch in fresh)
+            stored += len(fresh)
+            for one in [one for one in fresh if one.fresh] + outbox.due(now, 640):
+                service.put(one)
         now += STEP_S
-        return service.work()
+        before = engine.counts[Kind.OBSERVATION]
+        for vehicle, ack in service.work(now):
+            for stream in wire.decode_ack(ack)[1]:
+                found = Stream(vehicle, stream.boot, stream.kind, stream.region)
+                outboxes[int(vehicle.removeprefix("car-"))].settle(found, stream.durable)
+        return engine.counts[Kind.OBSERVATION] - before
 
     def steps(seconds: float, driving: bool = True) -> list[int]:
         return [step(driving) for _ in range(math.ceil(seconds / STEP_S))]
@@ -88,7 +127,7 @@ def run(site: Site) -> list[Figure]:
     while sum(outbox.batches for outbox in outboxes) > QUEUED * cars and now < 4 * away_s:
         taken.append(step(driving=True))
     steps(30, driving=False)
-    lost = len(stored - service.held)
+    lost = abs(stored - engine.counts[Kind.OBSERVATION])
     left = sum(outbox.batches for outbox in outboxes)
     for outbox in outboxes:
         outbox.close()
@@ -100,6 +139,14 @@ def run(site: Site) -> list[Figure]:
         figure("faults.away.lost", lost + left),
         figure("faults.away.drain_share", drain),
         figure("faults.away.backlog", backlog / cars),
+        figure("faults.away.map_missing", len(cells - _shown(engine))),
+        figure("faults.away.late", engine.counts["late"]),
         Figure("faults.away.messages_while_away", while_away / cars, "messages a car"),
         Figure("faults.away.noticed_s", begun * STEP_S, "s until cars go fast again"),
     ]
+
+
+def _shown(engine: Engine) -> set[int]:
+    """Cells that are on the map, by a visit that counted."""
+    fusion = engine.fusion
+    return set(fusion.cell[fusion.live.visits[: fusion.size] > 0].tolist())

@@ -90,7 +90,8 @@ def _found(root: Path, whole: Path) -> dict[str, Any]:
         counts = engine.counts
         told: list[Path] = []
         rows = {kind: _rows(root, kind, told) for kind in Kind}
-        counted = counts["files_set_aside"] + counts["checkpoints_refused"] + counts["key_failures"] + len(told)
+        counted = counts["files_set_aside"] + counts["checkpoints_refused"] + counts["key_failures"]
+        counted += counts["witnesses_damaged"] + len(told)
         return {"map": map_of(engine, now_of(ROUNDS)), "rows": rows, "counted": counted}
 
 

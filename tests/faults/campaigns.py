@@ -6,6 +6,7 @@ from typing import Final
 
 from tests.faults import (
     age,
+    alerts,
     away,
     bitrot,
     clocks,
@@ -58,7 +59,6 @@ CAMPAIGNS: Final = (
         "bitrot",
         bitrot.run,
         ("faults.bitrot.unnoticed", "faults.bitrot.crash_loops", "faults.bitrot.tried"),
-        in_quick=False,  # unnoticed does not hold (a bit of keys/MONTH.witnesses): it stands in the whole run
     ),
     Campaign(
         "clocks",
@@ -81,8 +81,12 @@ CAMPAIGNS: Final = (
     Campaign(
         "away",
         away.run,
-        ("faults.away.bytes_ratio", "faults.away.lost", "faults.away.drain_share", "faults.away.backlog"),
+        (
+            *("faults.away.bytes_ratio", "faults.away.lost", "faults.away.drain_share", "faults.away.backlog"),
+            *("faults.away.map_missing", "faults.away.late"),
+        ),
     ),
+    Campaign("alerts", alerts.run, ("faults.alerts.missing_after_reconnect", "faults.alerts.standing")),
     Campaign("leaving", outages.leaving, ("faults.leaving.longest_s", "faults.leaving.acknowledged_lost")),
     Campaign("disk-full", outages.disk_full, ("faults.disk_full.false_acks", "faults.disk_full.recovered")),
     Campaign(

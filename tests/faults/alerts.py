@@ -1,0 +1,125 @@
+"""Who watches behind a router that is restarted: every alert that stands is heard soon after the session is back.
+
+Two routers, the service behind the one, a watcher behind the other. That one is killed, alerts are raised, and it comes
+back; what was raised meanwhile the watcher must hear, and it hears nothing while it is away.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import zenoh
+
+from deploy.router import CONFIG
+from schemas import grid, keys, wire
+from schemas.config import ZenohSettings
+from schemas.runtime.figures import Figure
+from schemas.runtime.zenoh_session import open_session
+from schemas.wire import Batch
+from tests.faults.bars import figure
+from tests.faults.frame import Site
+from tests.faults.processes import Part, Stage, stage
+from tests.fleet_service.app.test_service import Fleet
+from tests.fleet_service.examples import LATITUDE, LONGITUDE, REGION, batch
+from tests.waiting import until
+
+SOON_S: Final = 5.0
+WITNESSES: Final = 3
+APART: Final = 4e-4  # degrees, over two cells
+NS: Final = 10**9
+Place = tuple[int, int]  # cell and sector
+
+
+def run(site: Site) -> list[Figure]:
+    """Eight restarts of twenty alerts; one of ten in a quick run."""
+    each, missing, waits = site.of(20, 10), 0, []
+    with stage(site.folder) as there:
+        beside = _beside(there)
+        with _opened(there.endpoint) as driver, _opened(beside.command[-1]) as watcher:
+            fleet, heard = Fleet(driver).meet(), dict[Place, float]()
+            watched = watcher.declare_subscriber(f"{keys.ROOT}/alert/**", lambda sample: _note(heard, sample))
+            for turn in range(site.of(8, 1)):
+                beside.kill()
+                until(lambda: not list(watcher.info.routers_zid()))
+                heard.clear()
+                fleet.settle(*_ice(turn, each))
+                until(partial(_stand, driver, each * (turn + 1)))
+                standing = _standing(driver)
+                assert not heard, "the watcher was not away"
+                beside.start()
+                until(lambda: list(watcher.info.routers_zid()))
+                back = time.monotonic()
+                while standing - heard.keys() and time.monotonic() < back + SOON_S:
+                    time.sleep(0.02)
+                missing += len(standing - heard.keys())
+                waits += [heard[place] - back for place in standing & heard.keys()]
+            watched.undeclare()
+        beside.kill()
+    site.say(f"{len(waits)} alerts heard again, the last after {max(waits, default=0.0):.1f} s; {missing} missing")
+    return [
+        figure("faults.alerts.missing_after_reconnect", missing),
+        figure("faults.alerts.standing", len(waits) + missing),
+        Figure("faults.alerts.longest_s", max(waits, default=float("nan")), "s"),
+    ]
+
+
+def _beside(there: Stage) -> Part:
+    """A second router, which the first one's clients are not connected to; its port stays over restarts."""
+    config = Path(there.folder) / "router-b.json"
+    settings = zenoh.Config.from_file(str(CONFIG))
+    settings.insert_json5("connect/endpoints", json.dumps([there.endpoint]))
+    config.write_text(str(settings))
+    command = [sys.executable, "-m", "deploy.router", "--config", str(config), "--listen"]
+    part = Part("router-b", [*command, "tcp/127.0.0.1:0"], there.folder)
+    part.start()
+    part.command = [*command, part.line_with("router: ").split()[1]]
+    return part
+
+
+def _opened(endpoint: str) -> zenoh.Session:
+    session = open_session(ZenohSettings(connect=[endpoint]))
+    assert session is not None
+    return session
+
+
+def _note(heard: dict[Place, float], sample: zenoh.Sample) -> None:
+    alert = wire.decode_alert(sample.payload.to_bytes())
+    if alert.raised:
+        heard.setdefault((alert.cell, alert.sector), time.monotonic())
+
+
+def _ice(turn: int, places: int) -> list[Batch]:
+    """Ice in so many places that nobody knew, by each of the witnesses."""
+    latitude = LATITUDE + APART * turn
+    longitudes = [LONGITUDE + APART * place for place in range(places)]
+    cells = [int(grid.cell_of(latitude, longitude)) for longitude in longitudes]
+    assert {int(grid.region_of(cell)) for cell in cells} == {REGION}
+    return [
+        batch(
+            f"sim-{number:03}", 1 + turn * places + place, time.time_ns() - NS, [0.2],
+            latitude=[latitude], longitude=[longitudes[place]], cell=[cells[place]],
+        )
+        for place in range(places)
+        for number in range(WITNESSES)
+    ]  # fmt: skip
+
+
+def _stand(session: zenoh.Session, least: int) -> bool:
+    """Whether so many alerts stand."""
+    return len(_standing(session)) >= least
+
+
+def _standing(session: zenoh.Session) -> set[Place]:
+    """What the service says that stands."""
+    replies = [reply.ok for reply in session.get(f"{keys.ROOT}/alert/**")]
+    return {
+        (alert.cell, alert.sector)
+        for reply in replies
+        if reply is not None
+        for alert in wire.decode_standing(reply.payload.to_bytes())
+    }
