@@ -44,6 +44,7 @@ TOPICS: Final = {
         Topic("ack", None, True, "gripmap.v1.Ack", "DATA_HIGH", True),
         Topic("map", grid.TILE_ZOOM, False, "Arrow stream", "DATA_LOW", False),
         Topic("alert", grid.TILE_ZOOM, False, "gripmap.v1.Alert", "REAL_TIME", True),
+        Topic("ahead", None, True, "gripmap.v1.Ahead", "DATA_HIGH", False),
         Topic("weather", grid.REGION_ZOOM, False, "gripmap.v1.Weather", "DATA", True),
         Topic("alive", None, True, None, "DATA", True),
         Topic("shard", None, True, None, "DATA", True),
@@ -84,6 +85,11 @@ def map_key(tile: int) -> str:
 def alert_key(tile: int) -> str:
     """Where the alerts of a tile are put."""
     return f"{ROOT}/alert/{chunks(tile, grid.TILE_ZOOM)}"
+
+
+def ahead_key(vehicle: str) -> str:
+    """Where a vehicle tells what lies ahead of it."""
+    return f"{ROOT}/ahead/{vehicle}"
 
 
 def weather_key(region: int) -> str:

@@ -62,7 +62,7 @@ PURE = (
     "edge_agent/adaptation",
     "edge_agent/estimators",
     "edge_agent/observe",
-    *(f"edge_agent/ahead/{name}.py" for name in ("path", "known", "horizon", "roads", "warnings")),
+    *(f"edge_agent/ahead/{name}.py" for name in ("path", "known", "horizon", "roads", "warnings", "asking")),
     "edge_agent/inputs/block.py",
     "fleet_service/fusion",
     "fleet_service/ingest/dedup.py",
@@ -71,6 +71,7 @@ PURE = (
 # Beside it, what turns one thing in memory into another: tables and messages too, but no input or output either.
 SANS_IO = (
     "edge_agent/publish/batching.py",
+    "edge_agent/ahead/hearing.py",
     *(f"fleet_service/ingest/{name}.py" for name in ("acks", "validation")),
     *(f"fleet_service/serve/{name}.py" for name in ("encode", "query", "tile_cache")),
 )

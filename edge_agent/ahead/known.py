@@ -123,14 +123,13 @@ class HeardMap:
             return before is None or before[0] != alert
         return self._alerts.pop(key, None) is not None
 
-    def standing(self, tile: int, alerts: list[Alert], now: int) -> bool:
-        """All alerts that stand in a tile were heard; whether that is news."""
-        keys = {alert.cell * grid.SECTORS + alert.sector for alert in alerts}
-        gone = [key for key in self._alerts if key not in keys and int(grid.tile_of(key // grid.SECTORS)) == tile]
-        for key in gone:
+    def standing(self, tile: int, alerts: list[Alert], now: int) -> list[int]:
+        """All alerts that stand in a tile were heard; the places of which that is news."""
+        stand = {alert.cell * grid.SECTORS + alert.sector: alert for alert in alerts}
+        news = [key for key in self._alerts if key not in stand and int(grid.tile_of(key // grid.SECTORS)) == tile]
+        for key in news:
             del self._alerts[key]
-        news = [self.alert(alert, now) for alert in alerts]
-        return any(news) or bool(gone)
+        return news + [key for key, alert in stand.items() if self.alert(alert, now)]
 
     def forget(self, now: int) -> None:
         """Drop what is too old to say anything."""

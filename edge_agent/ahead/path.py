@@ -11,15 +11,15 @@ too, and near the edge of a sector in both.
 
 from __future__ import annotations
 
-from typing import Final, Literal, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from schemas import grid
 from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import METRES_PER_DEGREE
+from schemas.wire.ahead import Way
 
-Kind = Literal["route", "road", "corridor"]
 NONE: Final = -1
 BESIDE_M: Final = 4.0  # a lane's width and a receiver's error; no other carriageway of the same direction is as near
 SMOOTH_M: Final = 15  # in which a corner of a given route is driven: 9.5 m of radius at a right angle
@@ -51,7 +51,7 @@ class Path(NamedTuple):
         x, y: (M,) [m] east and north of the car.
     """
 
-    kind: Kind
+    kind: Way
     distance: FloatArray
     places: IntArray
     curvature: FloatArray
@@ -71,7 +71,7 @@ def degrees(x: FloatArray, y: FloatArray, pose: Pose) -> tuple[FloatArray, Float
     return pose.latitude + y / METRES_PER_DEGREE, pose.longitude + x / east
 
 
-def along(kind: Kind, line: FloatArray, pose: Pose, length: float, first: IntArray | None = None) -> Path:
+def along(kind: Way, line: FloatArray, pose: Pose, length: float, first: IntArray | None = None) -> Path:
     """The way along a line (n, 2) [m] that begins at the car, at most `length` [m].
 
     `first` (n,) are keys that are known at the line's points; they come before those that follow from the position.

@@ -8,18 +8,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
 from edge_agent.ahead.horizon import MARGIN_M, REACTION_S, Horizon, braking_from, worth_a_warning
 from edge_agent.ahead.known import HeardMap
-from edge_agent.ahead.path import Kind, Pose
+from edge_agent.ahead.path import Pose
 from schemas import grid
 from schemas.numeric import BoolArray
 from schemas.thresholds import NS
+from schemas.wire.ahead import GripWarning, WarningState
 
-State = Literal["raised", "updated", "ended"]
 UPDATE_S: Final = 1.0  # between two looks: a stretch may come by so much nearer before it is told
 LINK_M: Final = 30.0  # nearer stretches are one
 ABSENT_S: Final = 2.0  # for which a stretch is not seen before it is over: fixes jump
@@ -27,50 +27,6 @@ NEAR_M: Final = 30.0  # who was so near to a stretch that is no longer ahead has
 CHANGED_MU: Final = 0.05
 CHANGED_PLACES: Final = 2
 SLOWEST: Final = 0.5  # [m/s] who stands has no time to a stretch
-
-
-@dataclass(frozen=True)
-class GripWarning:
-    """A warning, as it is told.
-
-    Attributes:
-        id: the same from raised to ended.
-        state: raised; updated: it became longer, or its grip another; ended: passed, cleared or left.
-        time: of this message [ns UTC].
-        distance_m, length_m: to the stretch's beginning, and of what can be seen of it.
-        time_s: until it is reached at the present speed; infinite for who stands.
-        mu, mu_lower, p_slippery: at its worst metre.
-        age_s: of the youngest observation there.
-        safe_speed: at its beginning [m/s].
-        way: by which it is reached: route, road or corridor.
-        sure: whether it lies on every way that is known to go on.
-        reason: why, in words.
-    """
-
-    id: str
-    state: State
-    time: int
-    distance_m: float
-    length_m: float
-    time_s: float
-    mu: float
-    mu_lower: float
-    p_slippery: float
-    age_s: float
-    safe_speed: float
-    way: Kind
-    sure: bool
-    reason: str
-
-    def line(self) -> str:
-        """All of it in a line for people."""
-        if self.state == "ended":
-            return f"warning over: {self.reason}; id {self.id}"
-        where = "here" if self.distance_m <= 0.0 else f"in {self.distance_m:.0f} m"
-        return (
-            f"slippery {where}, for {self.length_m:.0f} m: mu {self.mu:.2f} (at least {self.mu_lower:.2f}), "
-            f"safe {3.6 * self.safe_speed:.0f} km/h, known for {self.age_s:.0f} s; {self.reason}; id {self.id}"
-        )
 
 
 @dataclass(frozen=True)
@@ -169,7 +125,7 @@ def _by_place(stretches: list[_Stretch]) -> list[tuple[frozenset[int], list[_Str
     return groups
 
 
-def _warning(name: str, state: State, stretch: _Stretch, pose: Pose, sure: bool) -> GripWarning:
+def _warning(name: str, state: WarningState, stretch: _Stretch, pose: Pose, sure: bool) -> GripWarning:
     horizon, k = stretch.horizon, stretch.worst
     first, last = int(stretch.start), int(stretch.end)
     age = float(np.nanmin(horizon.age_s[first:last]))

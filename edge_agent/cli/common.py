@@ -18,6 +18,8 @@ from schemas.runtime.process import Line, print_line
 if TYPE_CHECKING:
     from types import FrameType
 
+    import zenoh
+
     from edge_agent.app.live_loop import Progress
     from edge_agent.inputs.signal_log import SignalLog
     from edge_agent.publish.publisher import Publisher
@@ -40,8 +42,13 @@ def checked_name(name: str) -> str:
     return name
 
 
-def publisher_of(names: Sequence[str], config: AgentConfig, estimator: str) -> Publisher:
-    """A started publisher on the configured outbox.
+def publisher_of(
+    names: Sequence[str],
+    config: AgentConfig,
+    estimator: str,
+    on_open: Callable[[str, zenoh.Session], None] = lambda *_: None,
+) -> Publisher:
+    """A started publisher on the configured outbox; `on_open` is told of each vehicle's session.
 
     Raises:
         InputError: Zenoh refuses its settings, or the outbox is in use or unusable.
@@ -55,7 +62,7 @@ def publisher_of(names: Sequence[str], config: AgentConfig, estimator: str) -> P
         configuration(config.zenoh, name)
     spool = writable("spool", config.spool_of(names[0] if len(names) == 1 else FLEET))
     outbox = Outbox(spool, capacity_bytes=round(config.spool_mb * 1e6), first_resend_s=config.resend_s)
-    publisher = Publisher(names, outbox, config, estimator)
+    publisher = Publisher(names, outbox, config, estimator, on_open=on_open)
     publisher.start()
     return publisher
 
@@ -110,8 +117,8 @@ def stop_on_signal() -> Iterator[threading.Event]:
 left_behind = threading.Event()
 
 
-def leave(publisher: Publisher, progress: Progress, drain_s: float) -> None:
-    """Wait for acknowledgements, close, print the counts as one line of JSON on stdout.
+def leave(publisher: Publisher, progress: Progress, drain_s: float, **more: float) -> None:
+    """Wait for acknowledgements, close, print the counts, and what else is given, as one line of JSON on stdout.
 
     What is unsettled stays in the outbox for the next start.
     """
@@ -121,7 +128,7 @@ def leave(publisher: Publisher, progress: Progress, drain_s: float) -> None:
     if not clean:
         print_line("warning: a session did not close; leaving it behind", sys.stderr)
         left_behind.set()
-    print(json.dumps(summary(progress, publisher)), flush=True)
+    print(json.dumps(summary(progress, publisher) | more), flush=True)
 
 
 def status(progress: Progress, publisher: Publisher, log_line: Callable[[str], None]) -> None:

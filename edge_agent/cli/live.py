@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
 
+from edge_agent.ahead.lookout import Lookout
+from edge_agent.ahead.path import Pose
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.app.live_loop import ENDED_DRAIN_S, STOPPED_DRAIN_S, Progress, drive
 from edge_agent.app.metrics import metrics, troubles
 from edge_agent.cli.common import leave, publisher_of, status, stop_on_signal
 from edge_agent.inputs.block import Block
-from edge_agent.observe.pipeline import Pipeline
+from edge_agent.observe.pipeline import Pipeline, Seen
 from edge_agent.publish.publisher import Publisher
 from schemas.config import AgentConfig
 from schemas.runtime.metrics import serving
-from schemas.runtime.process import line_logger, log_as, print_line
+from schemas.runtime.process import Line, line_logger, log_as, print_line
 from schemas.signals import CHANNELS
 from schemas.vehicle import Vehicle
+from schemas.wire.ahead import GripWarning
 
 
 def _warm_up(estimator: str, vehicle: Vehicle, config: AgentConfig) -> None:
@@ -40,10 +44,12 @@ def drive_live(
     *,
     admitted: Callable[[], bool] = lambda: True,
     troubled: Callable[[], list[str]] = list,
+    lookout: Lookout | None = None,
 ) -> int:
     """Drive in real time, do what is due `at_end`, take leave; prints a line of counts and returns 0.
 
-    What is learned while not `admitted` is not published; `troubled` tells what is wrong with the sources.
+    What is learned while not `admitted` is not published; `troubled` tells what is wrong with the sources. A `lookout`
+    hears the map over the vehicles' sessions.
     """
     chosen = estimator or config.estimator
     log_as(config.log, sys.stderr)
@@ -61,12 +67,34 @@ def drive_live(
         if address:
             print_line(f"metrics: {address}/metrics", sys.stderr)
         pipeline = Pipeline(bank_of(chosen, vehicles), len(vehicles), config)
-        publisher = publisher_of(names, config, chosen)
+        publisher = publisher_of(names, config, chosen, lookout.attach if lookout else lambda *_: None)
         running.append(publisher)
         report = partial(status, publisher=publisher, log_line=line_logger(config.log, sys.stderr))
+        if lookout is not None:
+            lookout.start()
         drive(
-            blocks, pipeline, publisher, stop, report, duration_s=duration_s, progress=progress, admitted=admitted
+            blocks, pipeline, publisher, stop, report, duration_s=duration_s, progress=progress, admitted=admitted,
+            seen=(lambda seen: lookout.see(_poses(seen))) if lookout is not None else lambda _: None,
         )  # fmt: skip
+        heard: dict[str, float] = {}
+        if lookout is not None:
+            lookout.close()
+            heard = lookout.counts.values()
         at_end()
-        leave(publisher, progress, STOPPED_DRAIN_S if stop.is_set() else ENDED_DRAIN_S)
+        leave(publisher, progress, STOPPED_DRAIN_S if stop.is_set() else ENDED_DRAIN_S, **heard)
     return 0
+
+
+def _poses(seen: Seen) -> list[Pose]:
+    return [Pose(*row) for row in zip(*(column.tolist() for column in seen), strict=True)]
+
+
+def warning_lines(config: AgentConfig) -> Callable[[str, GripWarning], None]:
+    """Prints warnings on stdout: lines for people, or JSON where the log is JSON; an infinite time is null there."""
+    say = line_logger(config.log, sys.stdout)
+
+    def tell(vehicle: str, warning: GripWarning) -> None:
+        values = {name: None if value == math.inf else value for name, value in vars(warning).items() if name != "time"}
+        say(Line(f"{vehicle}: {warning.line()}", event="warning", vehicle=vehicle, at=warning.time, **values))
+
+    return tell

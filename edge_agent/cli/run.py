@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from edge_agent.ahead.lookout import Lookout
     from edge_agent.inputs.block import Block
     from schemas.config import AgentConfig
     from schemas.vehicle import Vehicle
@@ -28,6 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--profile", help="which live signal is which channel: a file, or a shipped one")
     parser.add_argument("--dbc", type=Path, help="CAN database (default: the profile's)")
     parser.add_argument("--trust", action="store_true", help="publish what the signal doctor did not pass")
+    parser.add_argument("--ahead", action="store_true", help="hear the map, and warn of slippery road ahead")
+    parser.add_argument("--route", type=Path, help="where it drives to, for --ahead (GPX or GeoJSON)")
     parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON); needed but with simulated")
     parser.add_argument("--estimator", help="estimator by name (default: the configuration's)")
     parser.add_argument("--name", help="name to publish under (default: the vehicle's)")
@@ -49,6 +52,8 @@ def run(args: argparse.Namespace) -> int:
     from schemas.vehicle import load_vehicle
 
     config = load(args.config, AgentConfig)
+    if args.route is not None and not args.ahead:
+        raise InputError("route", "is of no use without --ahead", "give both, or neither")
     sources = args.source or [SIMULATED]
     if all(is_live(source) for source in sources):
         return _live(args, sources, config)
@@ -56,12 +61,27 @@ def run(args: argparse.Namespace) -> int:
         vehicle = load_vehicle(_vehicle_file(args))
         blocks = plugins.loaded(plugins.SOURCES, kind)(sources[0].partition(":")[2])
         return drive_live(
-            [vehicle], [checked_name(args.name or vehicle.name)], blocks, config, args.estimator, args.duration
-        )
+            [vehicle], [checked_name(args.name or vehicle.name)], blocks, config, args.estimator, args.duration,
+            lookout=_lookout(args, args.name or vehicle.name, config),
+        )  # fmt: skip
     if len(sources) > 1:
         raise InputError("source", f"{', '.join(sources)} do not go together", "name live ones, or one log")
     vehicle, name, blocks = _simulated(args) if sources[0] == SIMULATED else _logged(args, Path(sources[0]))
-    return drive_live([vehicle], [checked_name(name)], blocks, config, args.estimator, args.duration)
+    return drive_live(
+        [vehicle], [checked_name(name)], blocks, config, args.estimator, args.duration,
+        lookout=_lookout(args, name, config),
+    )  # fmt: skip
+
+
+def _lookout(args: argparse.Namespace, name: str, config: AgentConfig) -> Lookout | None:
+    if not args.ahead:
+        return None
+    from edge_agent.ahead.lookout import Lookout
+    from edge_agent.ahead.route_file import read_route
+    from edge_agent.cli.live import warning_lines
+
+    route = read_route(args.route) if args.route is not None else None
+    return Lookout([name], warning_lines(config), lambda _: route)
 
 
 def _live(args: argparse.Namespace, sources: list[str], config: AgentConfig) -> int:
@@ -82,6 +102,7 @@ def _live(args: argparse.Namespace, sources: list[str], config: AgentConfig) -> 
         return drive_live(
             [trip.vehicle], [name], blocks, config, args.estimator, args.duration, trip.end,
             admitted=trip.admitted, troubled=lambda: [*rows.troubles(), *trip.troubles()],
+            lookout=_lookout(args, name, config),
         )  # fmt: skip
     finally:
         blocks.close()

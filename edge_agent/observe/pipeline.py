@@ -5,7 +5,7 @@ The same for one car and a fleet, live and replayed: a block of samples in, esti
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from edge_agent.inputs.block import Block
 from edge_agent.observe.cell_tracker import locate, new_tracks
 from edge_agent.observe.observation_builder import OpenVisits, RecordBlock, observe
 from edge_agent.observe.trip_privacy import TripEnds
+from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import NS
 
 if TYPE_CHECKING:
@@ -20,6 +21,16 @@ if TYPE_CHECKING:
     from schemas.config import AgentConfig
 
 FINAL_STEP_S = 1e-3  # after the last sample; short, so that the estimate is not propagated
+
+
+class Seen(NamedTuple):
+    """Where the vehicles were at a block's end, each (N,): [deg], yaw [rad from east], [m/s], [ns]; NaN: unknown."""
+
+    latitude: FloatArray
+    longitude: FloatArray
+    yaw: FloatArray
+    speed: FloatArray
+    time: IntArray
 
 
 class Pipeline:
@@ -30,6 +41,7 @@ class Pipeline:
         self._tracks, self._open = new_tracks(vehicles), OpenVisits.start(vehicles)
         self._ends = TripEnds(vehicles, config.trip_end_m, config.trip_end_s)
         self._last: Block | None = None
+        self.seen: Seen | None = None
 
     def step(self, block: Block) -> tuple[Estimates, RecordBlock, RecordBlock]:
         """Estimates, observations and states of a block of at least one sample, the latter two without trip ends."""
@@ -39,6 +51,7 @@ class Pipeline:
             self._open, block.time, located, estimates, self._config, block.signals
         )
         self._last = block
+        self.seen = Seen(located.latitude[-1], located.longitude[-1], located.yaw[-1], estimates.vx[-1], block.time[-1])
         self._ends.drive(block.time, estimates.vx)
         return estimates, self._ends.cut(observations), self._ends.cut(states)
 

@@ -16,6 +16,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
+import zenoh
+
 from edge_agent.observe.observation_builder import RecordBlock
 from edge_agent.publish.batching import Batcher, Draft
 from edge_agent.publish.outbox import Outbox, Stream
@@ -50,7 +52,10 @@ class Counts:
 
 
 class Publisher:
-    """Publishes records of the named vehicles; row `vehicle` of the records is an index into `names`."""
+    """Publishes records of the named vehicles; row `vehicle` of the records is an index into `names`.
+
+    `on_open` is called with each vehicle's session once it is open, for what else the vehicle has to say or to hear.
+    """
 
     def __init__(
         self,
@@ -59,7 +64,9 @@ class Publisher:
         config: AgentConfig,
         estimator: str,
         clock: Callable[[], float] = time.monotonic,
+        on_open: Callable[[str, zenoh.Session], None] = lambda *_: None,
     ) -> None:
+        self._on_open = on_open
         self._names = dict.fromkeys(names)
         self._outbox, self._config, self._clock = outbox, config, clock
         self._batcher = Batcher(names, outbox.boot, estimator, flush_s=config.flush_s, rows=config.batch_rows)
@@ -160,6 +167,7 @@ class Publisher:
             if link is None:
                 return
             self._links[name] = link
+            self._on_open(name, link.session)
 
     def _disconnect(self) -> None:
         self._connector.join()

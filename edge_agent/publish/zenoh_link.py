@@ -29,10 +29,10 @@ _QUALITY: Final = {
 
 
 class Link:
-    """An open session of one vehicle; `on_ack(vehicle, payload)` is called on a thread of Zenoh."""
+    """An open `session` of one vehicle; `on_ack(vehicle, payload)` is called on a thread of Zenoh."""
 
     def __init__(self, session: zenoh.Session, vehicle: str, on_ack: Callable[[str, bytes], None]) -> None:
-        self._session = session
+        self.session = session
 
         def heard(sample: zenoh.Sample) -> None:
             on_ack(vehicle, sample.payload.to_bytes())
@@ -51,7 +51,7 @@ class Link:
     @property
     def connected(self) -> bool:
         """Whether a router is there now."""
-        return bool(self._session.info.routers_zid())
+        return bool(self.session.info.routers_zid())
 
     def put(self, batch: StoredBatch) -> bool:
         """Put a batch; False when the session refuses. Nothing tells whether it arrives but the acknowledgement."""
@@ -59,7 +59,7 @@ class Link:
         encoding, priority, congestion = _QUALITY[stream.kind]
         key = _KEY[stream.kind](stream.region, stream.vehicle)
         try:
-            self._session.put(key, batch.payload, encoding=encoding, priority=priority, congestion_control=congestion)
+            self.session.put(key, batch.payload, encoding=encoding, priority=priority, congestion_control=congestion)
         except zenoh.ZError as error:
             log.warning("%s cannot put: %s", stream.vehicle, error)
             return False
@@ -67,4 +67,4 @@ class Link:
 
     def close(self) -> None:
         """Close the session; an open one would hang the interpreter at its end."""
-        self._session.close()
+        self.session.close()

@@ -2,10 +2,11 @@
 
 | role    | puts                                     | hears and asks                      |
 |---------|------------------------------------------|-------------------------------------|
-| vehicle | obs/*/*/*/NAME, state/*/*/*/NAME, token alive/NAME | map and alert; ack/NAME   |
+| vehicle | obs/*/*/*/NAME, state/*/*/*/NAME, ahead/NAME, token alive/NAME | map and alert; ack/NAME, ahead/NAME |
+| owner   | nothing                                  | map and alert; ahead/NAME of its own |
 | reader  | nothing                                  | map and alert                       |
 | weather | weather/**                               | nothing                             |
-| service | everything under gripmap/                | everything under gripmap/           |
+| service | everything under gripmap/ but ahead/    | likewise                            |
 | router  | what others were let put, between routers | likewise                           |
 
 Zenoh decides by the common name of the certificate and reads the list once, at its start. Denials are silent for the
@@ -76,6 +77,7 @@ def access_control(fleet: Enrolment) -> Section:
     """The access list of all routers."""
     rules = [
         _rule("everything", ("ingress", "egress"), MESSAGES, [EVERYTHING]),
+        _rule("private", ("ingress", "egress"), MESSAGES, [keys.ahead_key("*")]) | {"permission": "deny"},
         _rule("ask", ("ingress",), ("declare_subscriber", "query"), PUBLIC),
         _rule("told", ("egress",), ("put", "reply"), PUBLIC),
         # Declared publishers and queriers send nothing, silently, until they are told that somebody listens.
@@ -88,10 +90,12 @@ def access_control(fleet: Enrolment) -> Section:
         "routers": list(fleet.routers), "services": fleet.services, "readers": fleet.readers, "weather": fleet.weather,
     }  # fmt: skip
     subjects = [{"id": f"role/{role}", "cert_common_names": names} for role, names in roles.items() if names]
-    subjects += [{"id": name, "cert_common_names": [name]} for name in fleet.vehicles]
+    subjects += [{"id": name, "cert_common_names": [name]} for name in (*fleet.vehicles, *fleet.owners)]
     trusted = [f"role/{role}" for role in ("routers", "services") if roles[role]]
     policies = [{"rules": ["everything"], "subjects": trusted}]
-    if public := [*(["role/readers"] if fleet.readers else []), *fleet.vehicles]:
+    if fleet.services:
+        policies.append({"rules": ["private"], "subjects": ["role/services"]})
+    if public := [*(["role/readers"] if fleet.readers else []), *fleet.vehicles, *fleet.owners]:
         policies.append({"rules": ["ask", "told", "answered"], "subjects": public})
     if fleet.weather:
         policies.append({"rules": ["weather", "weathered"], "subjects": ["role/weather"]})
@@ -101,6 +105,11 @@ def access_control(fleet: Enrolment) -> Section:
         own = _own(name)
         rules += own
         policies.append({"rules": [rule["id"] for rule in own], "subjects": [name]})
+    for name, owned in fleet.owners.items():
+        if owned:
+            sees = _sees(name, [keys.ahead_key(vehicle) for vehicle in owned])
+            rules += sees
+            policies.append({"rules": [rule["id"] for rule in sees], "subjects": [name]})
     return {
         "enabled": True,
         "default_permission": "deny",
@@ -112,10 +121,25 @@ def access_control(fleet: Enrolment) -> Section:
 
 def _own(name: str) -> list[Section]:
     return [
-        _rule(f"put/{name}", ("ingress",), ("put",), [f"{keys.ROOT}/{kind}/*/*/*/{name}" for kind in wire.Kind]),
+        _rule(
+            f"put/{name}",
+            ("ingress",),
+            ("put",),
+            [*(f"{keys.ROOT}/{kind}/*/*/*/{name}" for kind in wire.Kind), keys.ahead_key(name)],
+        ),
+        # a declared publisher sends nothing until it is told that its owner listens
+        _rule(f"seen/{name}", ("egress",), ("declare_subscriber",), [keys.ahead_key(name)]),
+        *_sees(name, [keys.ahead_key(name)]),
         _rule(f"alive/{name}", ("ingress",), ("liveliness_token",), [keys.alive_key(name)]),
         _rule(f"hear/{name}", ("ingress",), ("declare_subscriber",), [keys.ack_key(name)]),
         _rule(f"ack/{name}", ("egress",), ("put",), [keys.ack_key(name)]),
+    ]
+
+
+def _sees(name: str, expressions: list[str]) -> list[Section]:
+    return [
+        _rule(f"look/{name}", ("ingress",), ("declare_subscriber",), expressions),
+        _rule(f"ahead/{name}", ("egress",), ("put",), expressions),
     ]
 
 

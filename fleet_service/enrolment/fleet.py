@@ -60,15 +60,21 @@ class Enrolment(Settings):
     readers: list[VehicleName] = Field(default=[], description="map and alerts, nothing else")
     weather: list[VehicleName] = Field(default=[], description="who puts road weather, and does nothing else")
     vehicles: list[VehicleName] = Field(default=[], description="their own keys; map and alerts to read")
+    owners: dict[VehicleName, list[VehicleName]] = Field(
+        default={}, description="who may see what lies ahead of which vehicles, and read as a reader does"
+    )
 
     @property
     def names(self) -> list[str]:
         """Everybody."""
-        return [*self.routers, *self.services, *self.readers, *self.weather, *self.vehicles]
+        return [*self.routers, *self.services, *self.readers, *self.weather, *self.vehicles, *self.owners]
 
     @model_validator(mode="after")
     def _one_role_each(self) -> Enrolment:
         twice = [name for name, times in Counter(self.names).items() if times > 1]
         if twice:
             raise ValueError(f"{twice[0]!r} is there twice, and a name has one role")
+        strange = [name for owned in self.owners.values() for name in owned if name not in self.vehicles]
+        if strange:
+            raise ValueError(f"{strange[0]!r} has an owner and is no vehicle")
         return self

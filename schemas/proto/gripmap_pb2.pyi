@@ -12,9 +12,20 @@ class Kind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     KIND_UNSPECIFIED: _ClassVar[Kind]
     KIND_OBSERVATION: _ClassVar[Kind]
     KIND_STATE: _ClassVar[Kind]
+
+class Basis(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    BASIS_UNKNOWN: _ClassVar[Basis]
+    BASIS_BOUND: _ClassVar[Basis]
+    BASIS_MEASURED: _ClassVar[Basis]
+    BASIS_BORROWED: _ClassVar[Basis]
 KIND_UNSPECIFIED: Kind
 KIND_OBSERVATION: Kind
 KIND_STATE: Kind
+BASIS_UNKNOWN: Basis
+BASIS_BOUND: Basis
+BASIS_MEASURED: Basis
+BASIS_BORROWED: Basis
 
 class ObservationBatch(_message.Message):
     __slots__ = ("vehicle", "boot", "region", "seq", "first_held", "estimator", "enter_time", "leave_time", "cell", "sector", "latitude", "longitude", "position_std", "yaw", "yaw_std", "speed", "mu", "mu_lower", "mu_upper", "mu_utilised", "log_likelihood", "health", "tyre_season", "air_temperature", "abs_active", "used_longitudinal", "used_lateral")
@@ -189,6 +200,72 @@ class StandingAlerts(_message.Message):
     ALERTS_FIELD_NUMBER: _ClassVar[int]
     alerts: _containers.RepeatedCompositeFieldContainer[Alert]
     def __init__(self, alerts: _Optional[_Iterable[_Union[Alert, _Mapping]]] = ...) -> None: ...
+
+class Warning(_message.Message):
+    __slots__ = ("id", "state", "time", "distance_m", "length_m", "time_s", "mu", "mu_lower", "p_slippery", "age_s", "safe_speed", "way", "sure", "reason")
+    ID_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    TIME_FIELD_NUMBER: _ClassVar[int]
+    DISTANCE_M_FIELD_NUMBER: _ClassVar[int]
+    LENGTH_M_FIELD_NUMBER: _ClassVar[int]
+    TIME_S_FIELD_NUMBER: _ClassVar[int]
+    MU_FIELD_NUMBER: _ClassVar[int]
+    MU_LOWER_FIELD_NUMBER: _ClassVar[int]
+    P_SLIPPERY_FIELD_NUMBER: _ClassVar[int]
+    AGE_S_FIELD_NUMBER: _ClassVar[int]
+    SAFE_SPEED_FIELD_NUMBER: _ClassVar[int]
+    WAY_FIELD_NUMBER: _ClassVar[int]
+    SURE_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    id: str
+    state: str
+    time: int
+    distance_m: float
+    length_m: float
+    time_s: float
+    mu: float
+    mu_lower: float
+    p_slippery: float
+    age_s: float
+    safe_speed: float
+    way: str
+    sure: bool
+    reason: str
+    def __init__(self, id: _Optional[str] = ..., state: _Optional[str] = ..., time: _Optional[int] = ..., distance_m: _Optional[float] = ..., length_m: _Optional[float] = ..., time_s: _Optional[float] = ..., mu: _Optional[float] = ..., mu_lower: _Optional[float] = ..., p_slippery: _Optional[float] = ..., age_s: _Optional[float] = ..., safe_speed: _Optional[float] = ..., way: _Optional[str] = ..., sure: _Optional[bool] = ..., reason: _Optional[str] = ...) -> None: ...
+
+class Ahead(_message.Message):
+    __slots__ = ("vehicle", "time", "way", "warnings", "start_m", "end_m", "cell", "sector", "mu", "mu_lower", "mu_upper", "p_slippery", "age_s", "basis", "safe_speed")
+    VEHICLE_FIELD_NUMBER: _ClassVar[int]
+    TIME_FIELD_NUMBER: _ClassVar[int]
+    WAY_FIELD_NUMBER: _ClassVar[int]
+    WARNINGS_FIELD_NUMBER: _ClassVar[int]
+    START_M_FIELD_NUMBER: _ClassVar[int]
+    END_M_FIELD_NUMBER: _ClassVar[int]
+    CELL_FIELD_NUMBER: _ClassVar[int]
+    SECTOR_FIELD_NUMBER: _ClassVar[int]
+    MU_FIELD_NUMBER: _ClassVar[int]
+    MU_LOWER_FIELD_NUMBER: _ClassVar[int]
+    MU_UPPER_FIELD_NUMBER: _ClassVar[int]
+    P_SLIPPERY_FIELD_NUMBER: _ClassVar[int]
+    AGE_S_FIELD_NUMBER: _ClassVar[int]
+    BASIS_FIELD_NUMBER: _ClassVar[int]
+    SAFE_SPEED_FIELD_NUMBER: _ClassVar[int]
+    vehicle: str
+    time: int
+    way: str
+    warnings: _containers.RepeatedCompositeFieldContainer[Warning]
+    start_m: _containers.RepeatedScalarFieldContainer[float]
+    end_m: _containers.RepeatedScalarFieldContainer[float]
+    cell: _containers.RepeatedScalarFieldContainer[int]
+    sector: _containers.RepeatedScalarFieldContainer[int]
+    mu: _containers.RepeatedScalarFieldContainer[float]
+    mu_lower: _containers.RepeatedScalarFieldContainer[float]
+    mu_upper: _containers.RepeatedScalarFieldContainer[float]
+    p_slippery: _containers.RepeatedScalarFieldContainer[float]
+    age_s: _containers.RepeatedScalarFieldContainer[float]
+    basis: _containers.RepeatedScalarFieldContainer[Basis]
+    safe_speed: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, vehicle: _Optional[str] = ..., time: _Optional[int] = ..., way: _Optional[str] = ..., warnings: _Optional[_Iterable[_Union[Warning, _Mapping]]] = ..., start_m: _Optional[_Iterable[float]] = ..., end_m: _Optional[_Iterable[float]] = ..., cell: _Optional[_Iterable[int]] = ..., sector: _Optional[_Iterable[int]] = ..., mu: _Optional[_Iterable[float]] = ..., mu_lower: _Optional[_Iterable[float]] = ..., mu_upper: _Optional[_Iterable[float]] = ..., p_slippery: _Optional[_Iterable[float]] = ..., age_s: _Optional[_Iterable[float]] = ..., basis: _Optional[_Iterable[_Union[Basis, str]]] = ..., safe_speed: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Weather(_message.Message):
     __slots__ = ("time", "air_temperature", "road_temperature", "precipitation", "prior")

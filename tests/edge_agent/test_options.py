@@ -68,6 +68,7 @@ SEEDS = "test_more_seeds_are_driven_and_no_plots_drawn_where_so_asked"
 UNFIT = "test_what_has_not_passed_is_not_published_unless_it_is_trusted"
 LEARNED = "test_a_calibrated_file_is_written_read_and_heeded"
 LIVE = "test_a_live_car_is_driven_by_its_bus_and_its_receiver"
+LISTENS = "test_a_car_that_listens_prints_its_warnings_and_heeds_its_route"
 FIX = "test_a_fix_makes_the_drive_pass"
 ELSEWHERE = {
     "simulate": {"--list": "test_simulate_lists_the_manoeuvres",
@@ -83,7 +84,7 @@ ELSEWHERE = {
                "--memberships": "test_memberships_that_tune_wrote_change_what_replay_says"},
     "check": {"log": FIX, "--vehicle": FIX, "--out": FIX, "--fix": FIX},
     "calibrate": {"log": LEARNED, "--vehicle": LEARNED, "--out": LEARNED, "--trust": LEARNED},
-    "run": {"--trust": UNFIT, "--profile": LIVE, "--dbc": LIVE}, "fleet": {},
+    "run": {"--trust": UNFIT, "--profile": LIVE, "--dbc": LIVE, "--ahead": LISTENS, "--route": LISTENS}, "fleet": {},
     "completion": {"shell": "test_completion_is_a_script_of_the_shell"},
     "tune": {"--quick": "test_quick_tuning_writes_a_valid_file_and_says_what_it_does",
              "--study": "test_the_quick_study_writes_figures_table_plot_and_a_tuned_file"},
@@ -147,7 +148,9 @@ def driven(words: list[str], monkeypatch: pytest.MonkeyPatch, folder: Path) -> o
     def note(
         vehicles: Sequence[Vehicle], names: Sequence[str], source: Iterator[Block], config: AgentConfig,
         estimator: str | None, duration_s: float, at_end: Callable[[], None] = lambda: None,
+        lookout: object | None = None,
     ) -> int:  # fmt: skip
+        assert lookout is None
         first = [next(source) for _ in range(3)]
         at_end()
         signals = [(block.t.tolist(), np.nan_to_num(block.signals).tolist()) for block in first]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from schemas.runtime.zenoh_session import configuration
 from tests.faults.attempts import ATTEMPTS
 from tests.faults.ground import HONEST, Ground, ground
 from tests.fleet_service.examples import key
-from tests.secured import ROUTERS, SERVICE, Network, enrolment, network, registry, settings
+from tests.secured import READER, ROUTERS, SERVICE, VEHICLES, Network, enrolment, network, registry, settings
 from tests.waiting import matched, until
 
 # What does not depend on the routers: clients and service look for themselves.
@@ -66,12 +67,16 @@ def test_a_vehicle_may_exactly_what_the_design_says() -> None:
     public = (f"{keys.ROOT}/map/**", f"{keys.ROOT}/alert/**")
     assert allowed("ingress") == {
         *(("put", f"{keys.ROOT}/{kind}/*/*/*/{HONEST}") for kind in ("obs", "state")),
+        ("put", keys.ahead_key(HONEST)),
+        ("declare_subscriber", keys.ahead_key(HONEST)),
         ("liveliness_token", keys.alive_key(HONEST)),
         ("declare_subscriber", keys.ack_key(HONEST)),
         *((message, place) for message in ("declare_subscriber", "query") for place in public),
     }
     assert allowed("egress") == {
         ("put", keys.ack_key(HONEST)),
+        ("put", keys.ahead_key(HONEST)),
+        ("declare_subscriber", keys.ahead_key(HONEST)),
         *((m, place) for m in ("put", "reply") for place in public),
         *(("declare_subscriber", f"{keys.ROOT}/{kind}/**") for kind in ("obs", "state")),
         ("declare_queryable", f"{keys.ROOT}/map/**"),
@@ -158,3 +163,38 @@ def test_a_declared_publisher_of_a_vehicle_is_told_that_somebody_listens(running
         matched(publisher)
         publisher.put(b"here")
         until(lambda: received)
+
+
+def test_what_lies_ahead_of_a_vehicle_is_seen_by_it_and_its_owner_alone(tmp_path: Path) -> None:
+    other = next(name for name in VEHICLES if name != HONEST)
+    fleet = enrolment(owners={"owner-0": [HONEST], "owner-1": [other]})
+    listeners = (HONEST, other, SERVICE, READER, "owner-0", "owner-1")
+    heard_by: dict[str, list[bytes]] = {name: [] for name in listeners}
+    with network(tmp_path, fleet=fleet) as found, ExitStack() as stack:
+        sessions = {name: stack.enter_context(found.session(name)) for name in listeners}
+        for name, session in sessions.items():
+            for expression in (keys.ahead_key(HONEST), f"{keys.ROOT}/ahead/*", "gripmap/**"):
+                stack.enter_context(session.declare_subscriber(expression, _noting(heard_by[name])))
+        publisher = sessions[HONEST].declare_publisher(keys.ahead_key(HONEST))
+        matched(publisher)
+
+        def arrived() -> bool:
+            publisher.put(b"ice")
+            sessions[other].put(keys.ahead_key(HONEST), b"a lie")
+            return bool(heard_by[HONEST] and heard_by["owner-0"])
+
+        until(arrived)
+        assert set(heard_by[HONEST] + heard_by["owner-0"]) == {b"ice"}
+        # what was put before this has been at the others' routers too
+        for name in (other, SERVICE, READER, "owner-1"):
+            list(sessions[name].get(f"{keys.ROOT}/map/**"))
+            assert b"ice" not in heard_by[name]
+
+
+def test_an_owner_of_what_is_no_vehicle_is_refused() -> None:
+    with pytest.raises(ValueError, match="is no vehicle"):
+        enrolment(owners={"owner-0": ["nobody-1"]})
+
+
+def _noting(received: list[bytes]) -> Callable[[zenoh.Sample], None]:
+    return lambda sample: received.append(sample.payload.to_bytes())

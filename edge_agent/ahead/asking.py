@@ -1,0 +1,126 @@
+"""What to ask the map for, and when: pieces of the way ahead, so that a day costs megabytes and not gigabytes. Pure.
+
+A tile that changes is put whole, each second: some 50 kB in a busy town. A car needs what lies along its way, now and
+then, and hears of ice at once by alerts: it asks for narrow boxes along the way, and hears alerts of the tiles there.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from edge_agent.ahead.path import Path, Pose, degrees
+from schemas import grid
+from schemas.numeric import BoolArray, IntArray
+from schemas.thresholds import NS
+
+BESIDE_M: Final = 12.0  # of a box beside the way: a cell, so that lanes, fixes and coarse routes are in it
+AREA_M2: Final = 7000.0  # of a box: an answer has 3.2 kB of schema, a cell 130 bytes
+LONGEST_M: Final = 300.0
+REFRESH_S: Final = 300.0  # a map is asked anew while it lies ahead; what changes at once comes as an alert
+STEP: Final = 4  # metres between the points that are looked at
+MOST_BOXES: Final = 128
+MOST_TILES: Final = 6  # whose alerts are heard at a time
+LEAVE_S: Final = 20.0  # a tile that is not ahead any more is heard for so long: a car at a border goes to and fro
+
+
+class Box(NamedTuple):
+    """A piece of the map [deg]."""
+
+    west: float
+    south: float
+    east: float
+    north: float
+
+
+class Asked:
+    """Boxes that were asked for, and when; the last MOST_BOXES of them."""
+
+    def __init__(self) -> None:
+        self._boxes: deque[tuple[Box, int]] = deque(maxlen=MOST_BOXES)
+
+    def forget(self) -> None:
+        """Ask for everything anew: a session has come back."""
+        self._boxes.clear()
+
+    def wanting(self, path: Path, pose: Pose) -> list[Box]:
+        """Boxes that are to be asked for now, along a path; they count as asked."""
+        latitude, longitude = degrees(path.x[::STEP], path.y[::STEP], pose)
+        open_ = np.ones(len(latitude), np.bool_)
+        for box, at in self._boxes:
+            if pose.time - at < REFRESH_S * NS:
+                inside = (latitude >= box.south) & (latitude <= box.north)
+                open_ &= ~(inside & (longitude >= box.west) & (longitude <= box.east))
+        found = [_around(path, first, last, pose) for first, last in _pieces(path, open_)]
+        self._boxes.extend((box, pose.time) for box in found)
+        return found
+
+
+class Tiles:
+    """Whose alerts are heard: the tiles ahead, and for a while those that were."""
+
+    def __init__(self) -> None:
+        self._wanted: dict[int, int] = {}  # tile -> when it was wanted last [ns]
+
+    @property
+    def heard(self) -> list[int]:
+        """The tiles."""
+        return list(self._wanted)
+
+    def follow(self, paths: list[Path], pose: Pose) -> tuple[list[int], list[int]]:
+        """Tiles to begin and to cease hearing."""
+        here = int(grid.tile_of(grid.cell_of(pose.latitude, pose.longitude)))
+        ahead: list[int] = [here]
+        for path in paths:
+            ahead += _in_order(grid.tile_of(grid.cell_of(*degrees(path.x[::STEP], path.y[::STEP], pose))))
+        wanted = list(dict.fromkeys(ahead))[:MOST_TILES]
+        fresh = [tile for tile in wanted if tile not in self._wanted]
+        self._wanted |= dict.fromkeys(wanted, pose.time)
+        late = [tile for tile, at in self._wanted.items() if pose.time - at > LEAVE_S * NS]
+        by_age = sorted((at, tile) for tile, at in self._wanted.items() if tile not in late and tile not in wanted)
+        surplus = len(self._wanted) - len(late) - MOST_TILES
+        gone = late + [tile for _, tile in by_age[: max(surplus, 0)]]
+        for tile in gone:
+            del self._wanted[tile]
+        return fresh, gone
+
+
+def keys_of(box: Box) -> list[int]:
+    """Regions (z10) that a box touches, each once."""
+    corners = grid.cell_of(
+        np.array([box.south, box.south, box.north, box.north]), np.array([box.west, box.east, box.west, box.east])
+    )
+    return _in_order(grid.region_of(corners))
+
+
+def _in_order(tiles: IntArray) -> list[int]:
+    return list(dict.fromkeys(tiles.tolist()))
+
+
+def _pieces(path: Path, wanted: BoolArray) -> list[tuple[int, int]]:
+    """Runs of the path, first and last metre, whose boxes are small, and which hold every wanted point."""
+    found: list[tuple[int, int]] = []
+    first = last = -1
+    for k in (np.flatnonzero(wanted) * STEP).tolist():
+        if first >= 0 and _fits(path, first, k):
+            last = k
+            continue
+        if first >= 0:
+            found.append((first, last))
+        first = last = k
+    return [*found, (first, last)] if first >= 0 else found
+
+
+def _fits(path: Path, first: int, last: int) -> bool:
+    wide, high = (float(np.ptp(side[first : last + 1])) + 2.0 * BESIDE_M for side in (path.x, path.y))
+    return last - first <= LONGEST_M and wide * high <= AREA_M2
+
+
+def _around(path: Path, first: int, last: int, pose: Pose) -> Box:
+    x, y = path.x[first : last + 1], path.y[first : last + 1]
+    east = np.array([x.min() - BESIDE_M, x.max() + BESIDE_M])
+    north = np.array([y.min() - BESIDE_M, y.max() + BESIDE_M])
+    latitude, longitude = degrees(east, north, pose)
+    return Box(float(longitude[0]), float(latitude[0]), float(longitude[1]), float(latitude[1]))

@@ -1,0 +1,161 @@
+"""One vehicle's ears: alerts of the tiles ahead, the map asked for along the way, over the vehicle's own session.
+
+Zenoh's threads call back; what was heard lies behind one lock. What is not possible is refused and counted.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import Any, Final
+
+import zenoh
+
+from edge_agent.ahead.asking import Asked, Box, Tiles, keys_of
+from edge_agent.ahead.hearing import heard_alert, heard_cells, heard_standing
+from edge_agent.ahead.known import HeardMap
+from edge_agent.ahead.path import Path, Pose
+from schemas import grid, keys
+from schemas.errors import WireError
+from schemas.wire.ahead import AHEAD_ENCODING
+
+log = logging.getLogger(__name__)
+ANSWER_S: Final = 5.0  # for an answer; the next look asks again
+_TOPIC: Final = keys.TOPICS["ahead"]
+
+
+class Ears:
+    """What one vehicle hears.
+
+    Args:
+        vehicle: its name.
+        session: its open session; stays the caller's.
+        urgent: called with the places whose alerts have changed.
+        clock: [ns UTC].
+    """
+
+    def __init__(
+        self, vehicle: str, session: zenoh.Session, urgent: Callable[[list[int]], None],
+        clock: Callable[[], int] = time.time_ns,
+    ) -> None:  # fmt: skip
+        self._session, self._urgent, self._clock = session, urgent, clock
+        self._lock = threading.Lock()
+        self._map, self._asked, self._tiles = HeardMap(), Asked(), Tiles()
+        self._subscribers: dict[int, Any] = {}
+        self._routers: frozenset[str] = frozenset()
+        self._told = session.declare_publisher(
+            keys.ahead_key(vehicle), encoding=AHEAD_ENCODING, priority=getattr(zenoh.Priority, _TOPIC.priority),
+            congestion_control=zenoh.CongestionControl.DROP,
+        )  # fmt: skip
+        self.counts: Counter[str] = Counter()
+
+    def looking(self) -> threading.Lock:
+        """The lock under which `known` is read."""
+        return self._lock
+
+    @property
+    def known(self) -> HeardMap:
+        """What was heard; hold the lock."""
+        return self._map
+
+    @property
+    def tiles(self) -> list[int]:
+        """Tiles whose alerts are heard."""
+        return self._tiles.heard
+
+    @property
+    def connected(self) -> bool:
+        """Whether a router was there at the last look."""
+        return bool(self._routers)
+
+    def follow(self, paths: list[Path], pose: Pose) -> None:
+        """Hear and ask for what lies along the ways on, the likeliest first; never waits for an answer."""
+        routers = frozenset(str(zid) for zid in self._session.info.routers_zid())
+        back, self._routers = bool(routers - self._routers), routers
+        fresh, gone = self._tiles.follow(paths, pose)
+        for tile in gone:
+            self._subscribers.pop(tile).undeclare()
+        for tile in fresh:
+            self._subscribers[tile] = self._session.declare_subscriber(keys.alert_key(tile), self._on_alert)
+        if not routers:
+            return
+        if back:
+            self._asked.forget()
+        for tile in self._tiles.heard if back else fresh:  # after the subscription: none is missed in between
+            self._get(keys.alert_key(tile), self._on_standing)
+        for path in paths:
+            for box in self._asked.wanting(path, pose):
+                self._ask(box)
+        with self._lock:
+            self._map.forget(pose.time)
+
+    def tell(self, payload: Callable[[], bytes]) -> None:
+        """Put what lies ahead on the vehicle's own key, if anybody listens."""
+        if self._told.matching_status.matching:  # type: ignore[attr-defined] # stub: bool
+            self._told.put(payload())
+            self.counts["told"] += 1
+
+    def close(self) -> None:
+        """Hear no more; the session stays open."""
+        for subscriber in self._subscribers.values():
+            subscriber.undeclare()
+        self._subscribers.clear()
+        self._told.undeclare()
+
+    def _ask(self, box: Box) -> None:
+        text = ",".join(f"{side:.6f}" for side in box)
+        for region in keys_of(box):
+            key = f"{keys.ROOT}/map/{keys.chunks(region, grid.REGION_ZOOM)}/*?bbox={text}"
+            self._get(key, self._on_cells)
+            self.counts["questions"] += 1
+
+    def _get(self, selector: str, take: Callable[[str, bytes], None]) -> None:
+        def answered(reply: zenoh.Reply) -> None:
+            if reply.ok is None:
+                self.counts["unanswered"] += 1
+                return
+            self._take(take, str(reply.ok.key_expr), reply.ok.payload.to_bytes())
+
+        try:
+            self._session.get(selector, answered, timeout=ANSWER_S)
+        except zenoh.ZError as error:
+            self.counts["unanswered"] += 1
+            log.warning("the map cannot be asked: %s", error)
+
+    def _on_alert(self, sample: zenoh.Sample) -> None:
+        self._take(self._hear_alert, str(sample.key_expr), sample.payload.to_bytes())
+
+    def _take(self, take: Callable[[str, bytes], None], key: str, payload: bytes) -> None:
+        self.counts["bytes"] += len(key) + len(payload)
+        try:
+            take(key, payload)
+        except WireError as error:
+            self.counts[f"refused.{error.field}"] += 1
+            log.warning("what was said on %s is not believed: %s", key, error)
+
+    def _hear_alert(self, key: str, payload: bytes) -> None:
+        now = self._clock()
+        alert = heard_alert(key, payload, now)
+        self.counts["alerts"] += 1
+        with self._lock:
+            news = self._map.alert(alert, now)
+        if news:
+            self._urgent([alert.cell * grid.SECTORS + alert.sector])
+
+    def _on_standing(self, key: str, payload: bytes) -> None:
+        now = self._clock()
+        tile, alerts = heard_standing(key, payload, now)
+        with self._lock:
+            news = self._map.standing(tile, alerts, now)
+        if news:
+            self._urgent(news)
+
+    def _on_cells(self, key: str, payload: bytes) -> None:
+        now = self._clock()
+        tile, cells = heard_cells(key, payload, now)
+        self.counts["cells"] += len(cells.key)
+        with self._lock:
+            self._map.take(tile, cells, now)

@@ -1,0 +1,119 @@
+"""What the network says, looked at before it is believed: tiles and alerts as bytes → cells and alerts, or refused."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import pyarrow as pa
+
+from edge_agent.ahead.known import BASES, BOUND, HeardCells, belief_of
+from schemas import grid, keys, mugrid, wire
+from schemas.errors import InputError, WireError
+from schemas.numeric import BoolArray, FloatArray, IntArray
+from schemas.thresholds import NS
+from schemas.wire import Alert
+from schemas.wire.tile import decode_tile
+
+AHEAD_OF_TIME_S: Final = 60.0  # by which the service's clock may be ahead of the car's
+MOST_TILE_BYTES: Final = 4 << 20  # a tile with every cell and sector of a dense city is 3 MB
+SLACK: Final = 1e-3  # single precision, and quantiles to the ends of their bins
+_BASIS: Final = {name: number for number, name in enumerate(BASES)}
+
+
+def heard_cells(key: str, payload: bytes, now: int) -> tuple[int, HeardCells]:
+    """Tile and cells of a message about the map.
+
+    Raises:
+        WireError: it is not what a service sends; nothing of it is believed.
+    """
+    tile = _tile(key, "map")
+    if len(payload) > MOST_TILE_BYTES:
+        raise WireError("tile", f"{len(payload)} bytes", f"ask for less than {MOST_TILE_BYTES}")
+    table = decode_tile(payload)
+    names = ("cell", "sector", "vehicles", "last_time")
+    if any(table[name].null_count for name in (*names, "mu_lower", "mu_upper", "p_slippery", "basis")):
+        raise WireError("tile", "has holes", "send every needed column whole")
+    cell, sector, vehicles, last = (_whole(table, name) for name in names)
+    lower, mu, upper, p = (_real(table, name) for name in ("mu_lower", "mu", "mu_upper", "p_slippery"))
+    basis = np.array([_BASIS.get(str(name), -1) for name in table["basis"].to_pylist()], np.int64)
+    said = np.isfinite(mu)
+    wrong = {
+        "cell": grid.tile_of(cell) != tile,
+        "sector": (sector < 0) | (sector >= grid.SECTORS),
+        "vehicles": vehicles < 1,
+        "last_time": (last <= 0) | (last > now + AHEAD_OF_TIME_S * NS),
+        "basis": (basis < BOUND) | (said == (basis == BOUND)),
+        "mu_lower": ~_ordered(mugrid.LOWER, lower, np.where(said, mu, lower)),
+        "mu_upper": ~_ordered(np.where(said, mu, lower), upper, mugrid.UPPER),
+        "p_slippery": ~_ordered(0.0, p, 1.0),
+    }
+    for name, rows in wrong.items():
+        if rows.any():
+            raise WireError(name, f"is not possible in row {int(rows.argmax())}", "send what the map's table says")
+    place = cell * grid.SECTORS + sector
+    if len(np.unique(place)) < len(place):
+        raise WireError("cell", "is there twice", "send each place once")
+    heard = np.full(len(place), now)
+    return tile, HeardCells(place, belief_of(lower, mu, upper, p), basis, vehicles, np.minimum(last, now), heard)
+
+
+def heard_alert(key: str, payload: bytes, now: int) -> Alert:
+    """An alert that was put.
+
+    Raises:
+        WireError: it is not what a service sends.
+    """
+    if len(payload) > wire.MAX_BYTES:
+        raise WireError("alert", f"{len(payload)} bytes", f"send at most {wire.MAX_BYTES}")
+    return _checked(wire.decode_alert(payload), _tile(key, "alert"), now)
+
+
+def heard_standing(key: str, payload: bytes, now: int) -> tuple[int, list[Alert]]:
+    """Tile, and the alerts that stand in it.
+
+    Raises:
+        WireError: it is not what a service sends.
+    """
+    tile = _tile(key, "alert")
+    return tile, [_checked(alert, tile, now) for alert in wire.decode_standing(payload)]
+
+
+def _checked(alert: Alert, tile: int, now: int) -> Alert:
+    numbers = np.array([alert.mu_lower, alert.mu, alert.mu_upper, alert.p_slippery])
+    possible = (
+        alert.cell >= 0
+        and int(grid.tile_of(alert.cell)) == tile
+        and 0 <= alert.sector < grid.SECTORS
+        and 0 < alert.time <= now + AHEAD_OF_TIME_S * NS
+        and bool(np.isfinite(numbers).all())
+        and bool(_ordered(mugrid.LOWER, numbers[:1], numbers[1:2])[0])
+        and bool(_ordered(numbers[1:2], numbers[2:3], mugrid.UPPER)[0])
+        and 0.0 <= alert.p_slippery <= 1.0
+    )
+    if not possible:
+        raise WireError("alert", "is not possible", "send what the message's description says")
+    return alert
+
+
+def _tile(key: str, topic: str) -> int:
+    try:
+        parsed = keys.parse(key)
+    except InputError as error:
+        raise WireError("key", f"{key[:80]!r} is no tile's", "put on the key of the topic") from error
+    if parsed.topic.name != topic or parsed.quadint is None:
+        raise WireError("key", f"{key[:80]!r} is no tile's", "put on the key of the topic")
+    return parsed.quadint
+
+
+def _ordered(low: FloatArray | float, middle: FloatArray, high: FloatArray | float) -> BoolArray:
+    with np.errstate(invalid="ignore"):
+        return np.asarray((middle >= np.asarray(low) - SLACK) & (middle <= np.asarray(high) + SLACK))
+
+
+def _whole(table: pa.Table, name: str) -> IntArray:
+    return np.asarray(table[name].cast(pa.int64()).to_numpy(), np.int64)
+
+
+def _real(table: pa.Table, name: str) -> FloatArray:
+    return np.asarray(table[name].to_numpy(), np.float64)

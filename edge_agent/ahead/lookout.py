@@ -1,0 +1,201 @@
+"""The lookout: vehicles' ears and eyes ahead, once a second in a thread of its own, and at once when alerts change.
+
+The estimation loop only says where it is (`see`), which cannot block.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+import zenoh
+
+from edge_agent.ahead.ears import Ears
+from edge_agent.ahead.horizon import Horizon, horizon_length, look_ahead
+from edge_agent.ahead.path import GivenRoute, Path, Pose, corridor
+from edge_agent.ahead.roads import ways_on
+from edge_agent.ahead.warnings import Active, warn
+from schemas import grid
+from schemas.thresholds import NS
+from schemas.wire.ahead import GripWarning, Outlook, Runs, encode_ahead
+
+log = logging.getLogger(__name__)
+LOOK_S: Final = 1.0
+STALE_S: Final = 3.0  # a car that has not said for so long where it is, is nowhere
+AGAIN_S: Final = 0.1  # at the soonest after a look: a burst of alerts is one look
+
+Hear = Callable[[str, GripWarning], None]
+RouteOf = Callable[[int], GivenRoute | None]
+
+
+@dataclass
+class _Watcher:
+    name: str
+    ears: Ears | None = None
+    active: tuple[Active, ...] = ()
+    due: float = 0.0
+    looked: float = -1.0
+    urgent: bool = False
+    places: frozenset[int] = frozenset()  # of the ways on
+    outlook: Outlook | None = None
+
+
+@dataclass
+class LookoutCounts:
+    """What the lookouts did."""
+
+    looks: int = 0
+    warnings: int = 0
+    failures: int = 0
+    busy_s: float = 0.0  # of the processor, by the thread that looks
+    ears: dict[str, Ears] = field(default_factory=dict)
+
+    def heard(self, what: str) -> int:
+        """Sum of a count of all ears."""
+        return sum(ears.counts[what] for ears in self.ears.values())
+
+    def values(self) -> dict[str, float]:
+        """For the last line of a drive."""
+        refused = sum(n for ears in self.ears.values() for name, n in ears.counts.items() if name.startswith("refused"))
+        return {
+            "warnings": self.warnings, "looks": self.looks, "look_s": round(self.busy_s, 3),
+            "heard_bytes": self.heard("bytes"), "heard_alerts": self.heard("alerts"), "heard_refused": refused,
+        }  # fmt: skip
+
+
+class Lookout:
+    """Looks ahead for vehicles by name.
+
+    Args:
+        names: the vehicles; row k of the poses is vehicle k.
+        hear: takes each warning with the vehicle's name, on the lookout's thread.
+        route_of: the given route of vehicle k; None: the road as the map shows it.
+        listening: which of them look ahead; all of them by default.
+    """
+
+    def __init__(
+        self, names: Sequence[str], hear: Hear, route_of: RouteOf = lambda _: None,
+        listening: Callable[[int], bool] = lambda _: True,
+    ) -> None:  # fmt: skip
+        self._hear, self._route_of = hear, route_of
+        self._watchers = {k: _Watcher(name) for k, name in enumerate(names) if listening(k)}
+        self._number = {watcher.name: k for k, watcher in self._watchers.items()}
+        self._poses: Sequence[Pose] = ()
+        self._wake, self._stop = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="lookout", daemon=True)
+        self.counts = LookoutCounts()
+
+    def start(self) -> None:
+        """Begin to look."""
+        self._thread.start()
+
+    def attach(self, name: str, session: zenoh.Session) -> None:
+        """A vehicle's session is open: it can hear from now on."""
+        k = self._number.get(name)
+        if k is not None:
+            watcher = self._watchers[k]
+            watcher.ears = self.counts.ears[name] = Ears(name, session, lambda places: self._urge(watcher, places))
+
+    def see(self, poses: Sequence[Pose]) -> None:
+        """Where the vehicles are now; row k is vehicle k."""
+        self._poses = poses
+
+    def outlook(self, name: str) -> Outlook | None:
+        """What a vehicle saw last."""
+        return self._watchers[self._number[name]].outlook
+
+    def close(self, within_s: float = 1.0) -> None:
+        """Look no more; the sessions stay open."""
+        self._stop.set()
+        self._wake.set()
+        if self._thread.ident is not None:
+            self._thread.join(within_s)
+
+    def _urge(self, watcher: _Watcher, places: list[int]) -> None:
+        if not watcher.places.isdisjoint(places) or any(not one.places.isdisjoint(places) for one in watcher.active):
+            watcher.urgent = True
+            self._wake.set()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            self._wake.clear()
+            now, began = time.monotonic(), time.thread_time()
+            ready = [
+                k
+                for k, watcher in self._watchers.items()
+                if watcher.due <= now or (watcher.urgent and now - watcher.looked >= AGAIN_S)
+            ]
+            for k in sorted(ready, key=lambda k: not self._watchers[k].urgent):
+                self._watch(k, now)
+                if any(watcher.urgent for watcher in self._watchers.values()):
+                    break  # who heard an alert goes first
+            self.counts.busy_s += time.thread_time() - began
+            if not ready:
+                urgent = any(watcher.urgent for watcher in self._watchers.values())
+                next_due = min((watcher.due for watcher in self._watchers.values()), default=now + LOOK_S)
+                self._wake.wait(AGAIN_S / 2.0 if urgent else max(next_due - time.monotonic(), 0.0))
+
+    def _watch(self, k: int, now: float) -> None:
+        watcher = self._watchers[k]
+        # in turns, so that a thousand cars of one process do not look in the same moment
+        first = watcher.looked < 0.0
+        watcher.due = now + LOOK_S * ((k * 0.618034) % 1.0 if first else 1.0)
+        watcher.looked, watcher.urgent = now, False
+        poses = self._poses
+        if watcher.ears is None or k >= len(poses):
+            return
+        pose = poses[k]
+        if not np.isfinite([pose.latitude, pose.longitude, pose.yaw, pose.speed]).all():
+            return
+        if time.time_ns() - pose.time > STALE_S * NS:
+            return
+        try:
+            self._look(k, watcher, watcher.ears, pose)
+        except Exception:  # whatever it is: the car drives on, and so must this thread
+            self.counts.failures += 1
+            log.exception("a look ahead of %s failed; going on", watcher.name)
+
+    def _look(self, k: int, watcher: _Watcher, ears: Ears, pose: Pose) -> None:
+        length = horizon_length(pose.speed)
+        with ears.looking():
+            paths = paths_ahead(pose, self._route_of(k), ears, length)
+            horizons = [look_ahead(path, ears.known, pose.time) for path in paths]
+            watcher.active, told = warn(watcher.active, horizons, pose, ears.known)
+        watcher.places = frozenset(np.concatenate([path.places.ravel() for path in paths]).tolist())
+        self.counts.looks += 1
+        for warning in told:
+            self.counts.warnings += 1
+            self._hear(watcher.name, warning)
+        ended = tuple(warning for warning in told if warning.state == "ended")
+        watcher.outlook = Outlook(
+            watcher.name, pose.time, paths[0].kind, (*(one.told for one in watcher.active), *ended), runs(horizons[0])
+        )
+        ears.follow(paths, pose)
+        outlook = watcher.outlook
+        ears.tell(lambda: encode_ahead(outlook))
+
+
+def paths_ahead(pose: Pose, route: GivenRoute | None, ears: Ears, length: float) -> list[Path]:
+    """The ways on: the given route, else the roads that the map shows, else straight on; hold the ears' lock."""
+    given = route.ahead(pose, length) if route is not None else None
+    if given is not None:
+        return [given]
+    return ways_on(pose, ears.known.keys(), length) or [corridor(pose, length)]
+
+
+def runs(horizon: Horizon) -> Runs:
+    """A horizon as runs of metres in the same place."""
+    key = horizon.key
+    starts = np.append(0, np.flatnonzero((key[1:] != key[:-1]) | (horizon.basis[1:] != horizon.basis[:-1])) + 1)
+    ends = np.append(starts[1:], len(key))
+    place = np.maximum(key[starts], 0)
+    return Runs(
+        starts.astype(np.float64), ends.astype(np.float64), place // grid.SECTORS, place % grid.SECTORS,
+        horizon.mu[starts], horizon.mu_lower[starts], horizon.mu_upper[starts], horizon.p_slippery[starts],
+        horizon.age_s[starts], horizon.basis[starts], np.minimum.reduceat(horizon.safe_speed, starts),
+    )  # fmt: skip

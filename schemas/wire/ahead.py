@@ -1,0 +1,101 @@
+"""What lies ahead of a vehicle as bytes: its warnings, and its horizon as runs of metres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final, Literal, NamedTuple
+
+import numpy as np
+
+from schemas.errors import WireError
+from schemas.numeric import FloatArray, IntArray
+from schemas.proto import gripmap_pb2 as pb
+from schemas.wire.codec import encoding_of, parse
+
+AHEAD_ENCODING: Final = encoding_of(pb.Ahead)
+Way = Literal["route", "road", "corridor"]
+WarningState = Literal["raised", "updated", "ended"]
+
+
+@dataclass(frozen=True)
+class GripWarning:
+    """A slippery stretch within reach, as it is told; see the message `Warning`."""
+
+    id: str
+    state: WarningState
+    time: int
+    distance_m: float
+    length_m: float
+    time_s: float
+    mu: float
+    mu_lower: float
+    p_slippery: float
+    age_s: float
+    safe_speed: float
+    way: Way
+    sure: bool
+    reason: str
+
+    def line(self) -> str:
+        """All of it in a line for people."""
+        if self.state == "ended":
+            return f"warning over: {self.reason}; id {self.id}"
+        where = "here" if self.distance_m <= 0.0 else f"in {self.distance_m:.0f} m"
+        return (
+            f"slippery {where}, for {self.length_m:.0f} m: mu {self.mu:.2f} (at least {self.mu_lower:.2f}), "
+            f"safe {3.6 * self.safe_speed:.0f} km/h, known for {self.age_s:.0f} s; {self.reason}; id {self.id}"
+        )
+
+
+class Runs(NamedTuple):
+    """A horizon as runs of metres in the same place, each (n,); see the message `Ahead`."""
+
+    start_m: FloatArray
+    end_m: FloatArray
+    cell: IntArray
+    sector: IntArray
+    mu: FloatArray
+    mu_lower: FloatArray
+    mu_upper: FloatArray
+    p_slippery: FloatArray
+    age_s: FloatArray
+    basis: IntArray
+    safe_speed: FloatArray
+
+
+class Outlook(NamedTuple):
+    """What lies ahead of one vehicle: the warnings that stand, and the horizon on the likeliest way on."""
+
+    vehicle: str
+    time: int
+    way: Way
+    warnings: tuple[GripWarning, ...]
+    runs: Runs
+
+
+def encode_ahead(outlook: Outlook) -> bytes:
+    """Protobuf bytes of what lies ahead."""
+    columns: dict[str, Any] = {name: column.tolist() for name, column in outlook.runs._asdict().items()}
+    message = pb.Ahead(vehicle=outlook.vehicle, time=outlook.time, way=outlook.way, **columns)
+    message.warnings.extend(pb.Warning(**vars(warning)) for warning in outlook.warnings)
+    return message.SerializeToString()
+
+
+def decode_ahead(payload: bytes) -> Outlook:
+    """Read what lies ahead.
+
+    Raises:
+        WireError: not an Ahead, or columns of different lengths.
+    """
+    message = parse(payload, AHEAD_ENCODING, pb.Ahead, AHEAD_ENCODING)
+    whole = ("cell", "sector", "basis")
+    runs = Runs._make(
+        np.array(getattr(message, name), np.int64 if name in whole else np.float64) for name in Runs._fields
+    )
+    if len({len(column) for column in runs}) > 1:
+        raise WireError("ahead", "has columns of different lengths", "send all of a run")
+    warnings = tuple(
+        GripWarning(**{name: getattr(one, name) for name in GripWarning.__dataclass_fields__})
+        for one in message.warnings
+    )
+    return Outlook(message.vehicle, message.time, message.way, warnings, runs)

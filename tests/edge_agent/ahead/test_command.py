@@ -1,0 +1,63 @@
+"""`edge-agent run --ahead` from the outside: warnings as JSON lines, the route heeded, the counts at the end."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edge_agent.cli import main
+from edge_agent.lab.simulation.scenarios import scenario_named
+from schemas import grid
+from schemas.wire import Alert
+from tests.edge_agent.ahead.roads import alert
+from tests.edge_agent.ahead.town import Town
+from tests.edge_agent.service import Router
+
+WORDS = ["run", "--scenario", "test", "--estimator", "ckf", "--name", "car-one", "--duration", "6"]
+
+
+def everywhere_slippery(now: int) -> list[Alert]:
+    """Alerts on every place of the triangle that the simulated car drives round."""
+    scenario = scenario_named("test")
+    x, y = np.meshgrid(np.arange(-15.0, 130.0, 5.0), np.arange(-15.0, 105.0, 5.0))
+    cells = np.unique(grid.cell_of(*scenario.to_latlon(x.ravel(), y.ravel())))
+    return [alert(int(cell) * grid.SECTORS + k, time=now) for cell in cells for k in range(grid.SECTORS)]
+
+
+def settings(folder: Path, router: Router) -> list[str]:
+    path = folder / "agent.json"
+    path.write_text(
+        json.dumps({"zenoh": router.settings.model_dump(), "spool": str(folder / "spool.sqlite"), "log": "json"})
+    )
+    return ["--config", str(path)]
+
+
+def test_a_car_that_listens_prints_its_warnings_and_heeds_its_route(
+    router: Router, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now = time.time_ns()
+    scenario = scenario_named("test")
+    corners = np.array([scenario.junctions[name] for name in ("a", "b", "c", "a", "c", "b", "a")])
+    latitude, longitude = scenario.to_latlon(corners[:, 0], corners[:, 1])
+    route = tmp_path / "way.geojson"
+    route.write_text(json.dumps({"type": "LineString", "coordinates": np.column_stack([longitude, latitude]).tolist()}))
+    with Town(router.settings, now, standing=everywhere_slippery(now)):
+        assert main([*WORDS, *settings(tmp_path, router), "--ahead", "--route", str(route)]) == 0
+    *lines, last = capsys.readouterr().out.splitlines()
+    warnings = [one for line in lines if (one := json.loads(line)).get("event") == "warning"]
+    assert warnings[0]["state"] == "raised"
+    assert warnings[0]["vehicle"] == "car-one"
+    assert {one["way"] for one in warnings} == {"route"}
+    counts = json.loads(last)
+    assert counts["warnings"] == len(warnings)
+    assert counts["heard_bytes"] > 0
+    assert counts["looks"] >= 3
+
+
+def test_a_route_without_listening_is_a_mistake(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*WORDS, "--route", str(tmp_path / "way.gpx")]) == 2
+    assert "route: is of no use without --ahead" in capsys.readouterr().err

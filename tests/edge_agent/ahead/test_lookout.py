@@ -1,0 +1,291 @@
+"""Listening cars over real sessions: warned by alerts and by the map, through a lost router, by nobody's lies."""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import zenoh
+
+from edge_agent.ahead import known
+from edge_agent.ahead.asking import LEAVE_S, MOST_TILES, REFRESH_S, Asked, Tiles
+from edge_agent.ahead.hearing import heard_alert, heard_cells, heard_standing
+from edge_agent.ahead.lookout import Lookout
+from edge_agent.ahead.path import GivenRoute, Path, Pose, corridor
+from schemas import grid, keys, wire
+from schemas.errors import WireError
+from schemas.runtime.zenoh_session import open_session
+from schemas.thresholds import NS
+from schemas.wire.ahead import AHEAD_ENCODING, GripWarning, Outlook, decode_ahead, encode_ahead
+from tests.edge_agent.ahead.roads import HOME, alert, keys_on, line
+from tests.edge_agent.ahead.town import Town, tile_payload
+from tests.edge_agent.service import Router
+from tests.waiting import until
+
+CAR = "car-one"
+ICE = keys_on(110.0, start=70.0)
+NOW = time.time_ns()
+
+
+class Driving:
+    """A car at the beginning of a road, at 14 m/s by what it says, that looks ahead along it."""
+
+    def __init__(self, router: Router) -> None:
+        session = open_session(router.settings)
+        assert session is not None
+        self.session = session
+        self.told: queue.Queue[GripWarning] = queue.Queue()
+        route = GivenRoute(*line())
+        self.lookout = Lookout([CAR], lambda _, warning: self.told.put(warning), lambda _: route)
+        self.lookout.attach(CAR, session)
+        self.be()
+        self.lookout.start()
+
+    def be(self, metre: int = 0, *, later_s: float = 0.0) -> None:
+        """Say where it is."""
+        latitude, longitude = line()
+        now = time.time_ns() + round(later_s * NS)
+        self.lookout.see([Pose(float(latitude[metre]), float(longitude[metre]), HOME.yaw, 14.0, now)])
+
+    def until(self, condition: Callable[[Outlook], object]) -> Outlook:
+        """Keep saying where it is until what lies ahead is as wanted."""
+
+        def there() -> bool:
+            self.be()
+            seen = self.lookout.outlook(CAR)
+            return seen is not None and bool(condition(seen))
+
+        until(there)
+        seen = self.lookout.outlook(CAR)
+        assert seen is not None
+        return seen
+
+    def next(self) -> GripWarning:
+        for _ in range(600):
+            self.be()
+            try:
+                return self.told.get(timeout=0.05)
+            except queue.Empty:
+                continue
+        raise TimeoutError("no warning")
+
+
+@contextmanager
+def driving(router: Router) -> Iterator[Driving]:
+    car = Driving(router)
+    try:
+        yield car
+    finally:
+        car.lookout.close(5.0)
+        car.session.close()
+
+
+@pytest.fixture
+def town(router: Router) -> Iterator[Town]:
+    """A service's side without any ice yet."""
+    with Town(router.settings, NOW) as town:
+        yield town
+
+
+def test_an_alert_ahead_is_a_warning_at_once_and_its_end_too(router: Router, town: Town) -> None:
+    with driving(router) as car:
+        until(lambda: any("alert" in asked for asked in town.asked))
+        town.put(alert(int(ICE[0]), time=NOW))
+        raised = car.next()
+        assert raised.state == "raised"
+        assert raised.reason == "an alert stands"
+        assert 50.0 < raised.distance_m < 75.0
+        town.put(alert(int(ICE[0]), raised=False, time=NOW + NS))
+        assert car.next().state == "ended"
+
+
+def test_ice_that_was_found_before_the_car_came_is_asked_for(router: Router, town: Town) -> None:
+    town.standing = [alert(int(key), time=NOW) for key in ICE]
+    with driving(router) as car:
+        assert car.next().mu == pytest.approx(0.15, abs=0.03)
+
+
+def test_the_map_alone_warns_and_what_it_says_lies_on_the_horizon(router: Router, town: Town) -> None:
+    town.mu = {int(key): 0.85 for key in keys_on()} | {int(key): 0.15 for key in ICE}
+    with driving(router) as car:
+        warning = car.next()
+        assert warning.reason == "the map says so"
+        seen = car.until(lambda seen: (seen.runs.basis == known.MEASURED).sum() > 10)
+        assert seen.way == "route"
+        dry = seen.runs.start_m < 60.0
+        assert seen.runs.mu[dry & (seen.runs.basis == known.MEASURED)].min() > 0.7
+        assert np.isfinite(seen.runs.safe_speed).any()
+        assert all("bbox=" in asked for asked in town.asked if "/map/" in asked), "pieces, never the whole map"
+
+
+def test_what_lies_ahead_is_put_on_the_vehicles_own_key(router: Router, town: Town) -> None:
+    town.standing = [alert(int(ICE[0]), time=NOW)]
+    owner = open_session(router.settings)
+    assert owner is not None
+    heard: queue.Queue[zenoh.Sample] = queue.Queue()
+    with owner:
+        owner.declare_subscriber(keys.ahead_key(CAR), heard.put)
+        with driving(router) as car:
+            assert car.next().state == "raised"
+            car.until(lambda seen: seen.warnings)
+            sample = heard.get(timeout=10.0)
+            while not decode_ahead(sample.payload.to_bytes()).warnings:
+                car.be()
+                sample = heard.get(timeout=10.0)
+    assert str(sample.encoding) == AHEAD_ENCODING
+    told = decode_ahead(sample.payload.to_bytes())
+    assert told.vehicle == CAR
+    assert told.warnings[0].state == "raised"
+    assert encode_ahead(told) == sample.payload.to_bytes()
+
+
+def test_ice_that_came_while_the_router_was_away_is_heard_when_the_session_is_back(router: Router, town: Town) -> None:
+    with driving(router) as car:
+        until(lambda: any("alert" in asked for asked in town.asked))
+        router.stop()
+        with town.lock:
+            town.standing = [alert(int(key), time=NOW) for key in ICE]
+        before = len(town.asked)
+        router.start()
+        assert car.next().state == "raised"
+        assert any("alert" in asked for asked in town.asked[before:])
+
+
+def test_without_a_link_the_horizon_fades_to_unknown_and_the_car_looks_on(router: Router, town: Town) -> None:
+    town.mu = {int(key): 0.85 for key in keys_on()}
+    with driving(router) as car:
+        car.until(lambda seen: (seen.runs.basis == known.MEASURED).sum() > 10)
+        router.stop()
+        car.lookout.see([HOME._replace(time=time.time_ns() + round((known.HELD_S + 60.0) * NS))])
+        looks = car.lookout.counts.looks
+        until(lambda: car.lookout.counts.looks > looks + 1)
+        seen = car.lookout.outlook(CAR)
+        assert seen is not None
+        assert not seen.runs.basis.any()
+        assert np.isnan(seen.runs.mu_lower).all()
+        assert np.isinf(seen.runs.safe_speed).all()
+        assert not car.lookout.counts.failures
+        router.start()
+
+
+def test_a_map_of_yesterday_says_how_old_it_is(router: Router) -> None:
+    day = 86_400 * NS
+    with Town(router.settings, NOW - day) as town:
+        town.mu = {int(key): 0.85 for key in keys_on()}
+        with driving(router) as car:
+            seen = car.until(lambda seen: (seen.runs.basis == known.MEASURED).any())
+            assert np.nanmin(seen.runs.age_s) == pytest.approx(86_400.0, rel=0.01)
+
+
+def test_a_hostile_tile_is_refused_counted_and_changes_nothing(router: Router, town: Town) -> None:
+    town.mu = {int(key): 0.15 for key in ICE}
+    with driving(router) as car:
+        assert car.next().state == "raised"
+        tile = int(grid.tile_of(ICE[0] // grid.SECTORS))
+        until(lambda: town.session.get(keys.alert_key(tile)) is not None)
+        town.session.put(keys.alert_key(tile), b"\xff" * 300)
+        far = alert(int(ICE[0]) + (1 << 30), time=NOW)
+        town.session.put(keys.alert_key(tile), wire.encode_alert(far))
+        until(lambda: sum(n for name, n in car.lookout.counts.ears[CAR].counts.items() if "refused" in name) >= 2)
+        assert car.lookout.counts.values()["heard_refused"] >= 2
+        assert car.until(lambda seen: seen.warnings).warnings[0].state == "raised"
+
+
+TILE = int(grid.tile_of(ICE[0] // grid.SECTORS))
+HERE = ICE[grid.tile_of(ICE // grid.SECTORS) == TILE]
+ONE = np.ones(len(HERE))
+LIES = {
+    "a cell elsewhere": {"cell": HERE // grid.SECTORS + (1 << 20)},
+    "a sector that is none": {"sector": ONE * 9},
+    "grip without end": {"mu_upper": ONE * np.inf},
+    "no number": {"mu_lower": ONE * np.nan},
+    "ends crossed": {"mu_lower": ONE * 0.9, "mu": ONE * 0.5},
+    "more than certain": {"p_slippery": ONE * 2.0},
+    "nobody": {"vehicles": ONE * 0},
+    "tomorrow": {"last_time": np.full(len(HERE), NOW + 86_400 * NS)},
+    "another basis": {"basis": ["surely"] * len(HERE)},
+    "a bound with a value": {"basis": ["bound"] * len(HERE)},
+    "the same place twice": {"cell": np.repeat(HERE[:1] // grid.SECTORS, len(HERE))},
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_a_tile_that_is_not_possible_is_not_believed(lie: str) -> None:
+    key = keys.map_key(TILE)
+    assert heard_cells(key, tile_payload(HERE, 0.2, NOW), NOW)[0] == TILE
+    with pytest.raises(WireError):
+        heard_cells(key, tile_payload(HERE, 0.2, NOW, **LIES[lie]), NOW)
+
+
+@pytest.mark.parametrize("payload", [b"", b"\x00" * 100, b"\xff" * 10_000, tile_payload(HERE, 0.2, NOW)[:-40]])
+def test_bytes_that_are_no_tile_are_refused(payload: bytes) -> None:
+    with pytest.raises(WireError):
+        heard_cells(keys.map_key(TILE), payload, NOW)
+    with pytest.raises(WireError):
+        heard_cells(keys.alert_key(TILE), tile_payload(HERE, 0.2, NOW), NOW)
+
+
+def test_alerts_that_are_not_possible_are_refused() -> None:
+    good, key = alert(int(HERE[0]), time=NOW), keys.alert_key(TILE)
+    assert (
+        heard_alert(key, wire.encode_alert(good), NOW) == heard_standing(key, wire.encode_standing([good]), NOW)[1][0]
+    )
+    for name, value in (
+        ("mu", float("nan")),
+        ("p_slippery", 3.0),
+        ("sector", 7),
+        ("time", NOW + 3600 * NS),
+        ("cell", 5),
+    ):
+        lie = wire.Alert(**(vars(good) | {name: value}))
+        with pytest.raises(WireError):
+            heard_alert(key, wire.encode_alert(lie), NOW)
+        with pytest.raises(WireError):
+            heard_standing(key, wire.encode_standing([good, lie]), NOW)
+
+
+def _at(metre: float, seconds: float) -> Pose:
+    latitude, longitude = line(max(metre + 1.0, 2.0))
+    return HOME._replace(
+        latitude=float(latitude[int(metre)]), longitude=float(longitude[int(metre)]), time=NOW + round(seconds * NS)
+    )
+
+
+def test_pieces_of_the_way_are_asked_for_once_and_again_when_they_are_old() -> None:
+    asked, pose = Asked(), _at(0, 0)
+    path = corridor(pose, 150.0)
+    boxes = asked.wanting(path, pose)
+    assert 1 <= len(boxes) <= 6
+    latitude, longitude = line(150.0)
+    covered = np.zeros(150, bool)
+    for box in boxes:
+        covered |= (latitude >= box.south) & (latitude <= box.north) & (longitude >= box.west) & (longitude <= box.east)
+    assert covered.all()
+    assert asked.wanting(path, pose) == []
+    assert asked.wanting(path, pose._replace(time=pose.time + round((REFRESH_S + 1) * NS)))
+    asked.forget()
+    assert asked.wanting(path, pose), "the session has come back"
+
+
+def test_a_handful_of_tiles_is_heard_and_a_car_at_a_border_does_not_flicker() -> None:
+    tiles, begun, ceased = Tiles(), 0, 0
+    for second in range(600):
+        metre = 40.0 * second
+        pose = _at(metre, second)
+        here: list[Path] = [corridor(pose, 150.0)]
+        fresh, gone = tiles.follow(here, pose)
+        begun, ceased = begun + len(fresh), ceased + len(gone)
+        assert len(tiles.heard) <= MOST_TILES
+        assert len(tiles.heard) == begun - ceased
+    assert 15 < begun < 60, "24 km over tiles of 1.3 km"
+    border, flickers = Tiles(), 0
+    west, _, _, _ = (float(side) for side in grid.bounds(TILE, grid.TILE_ZOOM))
+    for second in range(100):
+        pose = HOME._replace(longitude=west + 2e-6 * (-1) ** second, yaw=np.pi / 2, time=NOW + second * NS)
+        flickers += sum(map(len, border.follow([corridor(pose, 150.0)], pose)))
+    assert flickers <= 4
+    assert LEAVE_S > 2.0

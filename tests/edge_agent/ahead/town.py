@@ -1,0 +1,94 @@
+"""A service's side for the tests of listening cars: answers for the map and for standing alerts, puts alerts."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+import numpy as np
+import pyarrow as pa
+import zenoh
+
+from schemas import grid, keys, query, tables, wire
+from schemas.config import ZenohSettings
+from schemas.numeric import FloatArray, IntArray
+from schemas.runtime.zenoh_session import open_session
+from schemas.thresholds import GRAVITY, NS
+from schemas.wire import Alert
+
+
+def tile_payload(key: IntArray, friction: float | FloatArray, now: int, **changes: object) -> bytes:
+    """A tile as a service sends it; `changes` replace columns."""
+    n, mu = len(key), np.broadcast_to(friction, len(key))
+    lower = np.maximum(mu - 0.1, 0.06)
+    cell, sector = key // grid.SECTORS, (key % grid.SECTORS).astype(np.int8)
+    latitude, longitude = grid.centre(cell)
+    west, south, east, north = grid.bounds(cell)
+    columns: dict[str, Any] = {
+        "cell": cell, "sector": sector, "mu": mu, "mu_lower": lower,
+        "mu_upper": np.minimum(mu + 0.1, 1.19), "p_slippery": (mu < 0.4).astype(float),
+        "basis": ["measured"] * n, "vehicles": np.full(n, 4), "observations": np.full(n, 9),
+        "first_time": np.full(n, now - 60 * NS), "last_time": np.full(n, now - NS), "age_s": np.full(n, 1.0),
+        "latitude": latitude, "longitude": longitude, "west": west, "south": south, "east": east, "north": north,
+        "safe_deceleration": GRAVITY * lower,
+    } | changes  # fmt: skip
+    table = pa.table({f.name: pa.array(columns[f.name]).cast(f.type, safe=False) for f in tables.MAP_SCHEMA}).cast(
+        tables.MAP_SCHEMA
+    )
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, tables.MAP_SCHEMA) as writer:
+        writer.write_table(table)
+    return bytes(sink.getvalue().to_pybytes())
+
+
+@dataclass
+class Town:
+    """Serves places of known friction, and alerts."""
+
+    settings: ZenohSettings
+    now: int
+    mu: dict[int, float] = field(default_factory=dict)
+    standing: list[Alert] = field(default_factory=list)
+    asked: list[str] = field(default_factory=list)
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def __enter__(self) -> Self:
+        session = open_session(self.settings)
+        assert session is not None
+        self.session = session
+        self._map = session.declare_queryable(f"{keys.ROOT}/map/*/*/*/*", self._answer, complete=True)
+        self._alerts = session.declare_queryable(f"{keys.ROOT}/alert/*/*/*/*", self._stand, complete=True)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.session.close()
+
+    def put(self, alert: Alert) -> None:
+        tile = int(grid.tile_of(alert.cell))
+        self.session.put(keys.alert_key(tile), wire.encode_alert(alert), encoding=wire.ALERT_ENCODING)
+
+    def _answer(self, asked: zenoh.Query) -> None:
+        with asked:
+            self.asked.append(str(asked.selector))
+            box = query.parse(dict(asked.parameters)).bbox  # type: ignore[call-overload]
+            for tile, key in _by_tile(np.array(sorted(self.mu), np.int64)).items():
+                inside = key if box is None else key[grid.touches(box, grid.bounds(key // grid.SECTORS))]
+                if len(inside) and asked.key_expr.intersects(zenoh.KeyExpr(keys.map_key(tile))):
+                    mu = np.array([self.mu[k] for k in inside.tolist()])
+                    asked.reply(keys.map_key(tile), tile_payload(inside, mu, self.now), encoding=wire.ARROW)
+
+    def _stand(self, asked: zenoh.Query) -> None:
+        with asked:
+            with self.lock:
+                standing = list(self.standing)
+            self.asked.append(str(asked.selector))
+            for tile in {int(grid.tile_of(alert.cell)) for alert in standing}:
+                if asked.key_expr.intersects(zenoh.KeyExpr(keys.alert_key(tile))):
+                    there = [alert for alert in standing if int(grid.tile_of(alert.cell)) == tile]
+                    asked.reply(keys.alert_key(tile), wire.encode_standing(there), encoding=wire.STANDING_ENCODING)
+
+
+def _by_tile(key: IntArray) -> dict[int, IntArray]:
+    tiles = grid.tile_of(key // grid.SECTORS)
+    return {int(tile): key[tiles == tile] for tile in np.unique(tiles)}
