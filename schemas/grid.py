@@ -111,6 +111,23 @@ def bounds(cell: ArrayLike, zoom: int = CELL_ZOOM) -> tuple[FloatArray, FloatArr
     return _longitude(x, zoom), _latitude(y + 1, zoom), _longitude(x + 1, zoom), _latitude(y, zoom)
 
 
+def outline(cell: ArrayLike, sector: ArrayLike | None = None) -> tuple[FloatArray, FloatArray]:
+    """Longitudes and latitudes [deg] of corners, counter-clockwise: (n, 4) of cells (n,), from the south-west on.
+
+    With heading sectors (n,): (n, 3) of the quarter of the cell on the side that is headed for, from the middle on, so
+    that the sectors of a cell lie side by side.
+    """
+    west, south, east, north = bounds(cell)
+    x, y = np.stack([west, east, east, west], axis=-1), np.stack([south, south, north, north], axis=-1)
+    if sector is None:
+        return x, y
+    latitude, longitude = centre(cell)
+    first = np.mod(np.asarray(sector, dtype=np.int64) + 1, SECTORS)  # east: from the south-east to the north-east
+    row = np.arange(len(first))
+    sides = [(side[row, first], side[row, (first + 1) % SECTORS]) for side in (x, y)]
+    return np.stack([longitude, *sides[0]], axis=-1), np.stack([latitude, *sides[1]], axis=-1)
+
+
 def touches(
     box: tuple[float, float, float, float], area: tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]
 ) -> NDArray[np.bool_]:

@@ -42,16 +42,10 @@ def draw(table: pa.Table, name: str, about: str, path: Path) -> None:
 
 def cell_shapes(cell: IntArray, sector: IntArray | None = None) -> FloatArray:
     """Squares of cells, (n, 4, 2), or the quarters of their heading sectors, (n, 3, 2) [m from the south-west]."""
-    west, south, east, north = grid.bounds(cell)
+    west, south, *_ = grid.bounds(cell)
     scale = METRES_PER_DEGREE * np.cos(np.radians(south.mean())) if len(cell) else 1.0
-    x0, x1 = (west - west.min(initial=180.0)) * scale, (east - west.min(initial=180.0)) * scale
-    y0, y1 = ((side - south.min(initial=90.0)) * METRES_PER_DEGREE for side in (south, north))
-    corners = np.stack([np.stack(pair, -1) for pair in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], 1)
-    if sector is None:
-        return corners
-    first, second = np.array([1, 2, 3, 0])[sector], np.array([2, 3, 0, 1])[sector]  # east, north, west, south
-    row = np.arange(len(sector))
-    return np.stack([corners.mean(axis=1), corners[row, first], corners[row, second]], axis=1)
+    x, y = grid.outline(cell, sector)
+    return np.stack([(x - west.min(initial=180.0)) * scale, (y - south.min(initial=90.0)) * METRES_PER_DEGREE], axis=-1)
 
 
 def paint(

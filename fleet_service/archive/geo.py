@@ -22,23 +22,28 @@ GEOMETRY, BBOX = "geometry", "bbox"
 SIDES: Final = ("xmin", "ymin", "xmax", "ymax")
 _POINT: Final = np.dtype([("order", "u1"), ("type", "<u4"), ("xy", "<f8", 2)])
 _RING: Final = np.dtype([("order", "u1"), ("type", "<u4"), ("rings", "<u4"), ("points", "<u4")])
-_BOX: Final = np.dtype([*_RING.descr, ("xy", "<f8", (5, 2))])
 _LITTLE_ENDIAN, _TYPE_POINT, _TYPE_POLYGON, _TYPE_MULTIPOLYGON = 1, 1, 3, 6
 Pieces = Sequence[Sequence[int]]
 
 
 def with_cells(table: pa.Table) -> pa.Table:
-    """A table with a column `cell`, and the cells' polygons beside it, as a GeoParquet table."""
-    west, south, east, north = grid.bounds(table["cell"].to_numpy())
-    return with_boxes(table, west, south, east, north)
+    """A table with a column `cell`, and the cells' polygons beside it, as a GeoParquet table.
+
+    Where it has a `sector` too, a row's polygon is its quarter of the cell (grid.outline): no row hides another.
+    """
+    x, y = _outlines(table, table["cell"].to_numpy())
+    return _marked(table, _binary(_polygons(x, y)), "Polygon", _extremes(x, y))
 
 
 def with_stretches(table: pa.Table, cells: Pieces) -> pa.Table:
-    """A table of which each row is made of several cells, with these as one multi-polygon, as a GeoParquet table."""
+    """A table of which each row is made of several cells, with these as one multi-polygon, as a GeoParquet table.
+
+    Of a table with a column `sector`, the quarters of that sector.
+    """
     count = np.array([len(own) for own in cells], np.int64)
     first = np.concatenate([[0], np.cumsum(count)])
-    sides = grid.bounds(np.array([cell for own in cells for cell in own], np.int64))
-    boxes = _boxes(*sides)
+    x, y = _outlines(table, np.array([cell for own in cells for cell in own], np.int64), count)
+    boxes, sides = _polygons(x, y), _extremes(x, y)
     head = struct.Struct("<BII")
     wkb = [
         head.pack(_LITTLE_ENDIAN, _TYPE_MULTIPOLYGON, n) + boxes[begin : begin + n].tobytes()
@@ -47,11 +52,6 @@ def with_stretches(table: pa.Table, cells: Pieces) -> pa.Table:
     extreme = (np.minimum, np.minimum, np.maximum, np.maximum)
     whole = tuple(f.reduceat(side, first[:-1]) if len(count) else side for f, side in zip(extreme, sides, strict=True))
     return _marked(table, pa.array(wkb, pa.binary()), "MultiPolygon", whole)
-
-
-def with_boxes(table: pa.Table, west: FloatArray, south: FloatArray, east: FloatArray, north: FloatArray) -> pa.Table:
-    """A table with the polygons of boxes [deg], (n,) each, as a GeoParquet table."""
-    return _marked(table, _binary(_boxes(west, south, east, north)), "Polygon", (west, south, east, north))
 
 
 def with_points(table: pa.Table, longitude: FloatArray, latitude: FloatArray) -> pa.Table:
@@ -70,21 +70,40 @@ def shapes(table: pa.Table) -> Iterator[dict[str, Any]]:
         if kind == _TYPE_POINT:
             yield {"type": "Point", "coordinates": np.frombuffer(wkb, "<f8", 2, 5).tolist()}
         elif kind == _TYPE_POLYGON:
-            yield {"type": "Polygon", "coordinates": _rings(np.frombuffer(wkb, _BOX))[0]}
+            yield {"type": "Polygon", "coordinates": _rings(wkb, 1, 0)[0]}
         else:
-            yield {"type": "MultiPolygon", "coordinates": _rings(np.frombuffer(wkb, _BOX, count, 9))}
+            yield {"type": "MultiPolygon", "coordinates": _rings(wkb, count, 9)}
 
 
-def _rings(boxes: np.ndarray[Any, Any]) -> list[Any]:
-    rings: list[Any] = boxes["xy"][:, None].tolist()
+def _rings(wkb: bytes, count: int, begin: int) -> list[Any]:
+    """The rings of `count` polygons of one ring and as many corners each, from a byte on."""
+    corners = struct.unpack_from("<I", wkb, begin + _RING.itemsize - 4)[0] if count else 0
+    rings: list[Any] = np.frombuffer(wkb, _ring(corners), count, begin)["xy"][:, None].tolist()
     return rings
 
 
-def _boxes(west: FloatArray, south: FloatArray, east: FloatArray, north: FloatArray) -> np.ndarray[Any, Any]:
-    wkb = np.zeros(len(west), _BOX)
-    wkb["order"], wkb["type"], wkb["rings"], wkb["points"] = _LITTLE_ENDIAN, _TYPE_POLYGON, 1, 5
-    x, y = np.stack([west, east, east, west, west], axis=1), np.stack([south, south, north, north, south], axis=1)
-    wkb["xy"] = np.stack([x, y], axis=2)
+def _ring(corners: int) -> np.dtype[Any]:
+    return np.dtype([*_RING.descr, ("xy", "<f8", (corners, 2))])
+
+
+def _outlines(table: pa.Table, cells: IntArray, count: IntArray | None = None) -> tuple[FloatArray, FloatArray]:
+    """Corners (n, k) of cells, of the sector of their row where it has one; `count`: cells of each row."""
+    if "sector" not in table.schema.names:
+        return grid.outline(cells)
+    sector = table["sector"].to_numpy()
+    return grid.outline(cells, sector if count is None else np.repeat(sector, count))
+
+
+def _extremes(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    return x.min(axis=1), y.min(axis=1), x.max(axis=1), y.max(axis=1)
+
+
+def _polygons(x: FloatArray, y: FloatArray) -> np.ndarray[Any, Any]:
+    """Polygons of the corners x, y (n, k), each a ring that ends where it began."""
+    wkb = np.zeros(len(x), _ring(x.shape[1] + 1))
+    wkb["order"], wkb["type"], wkb["rings"], wkb["points"] = _LITTLE_ENDIAN, _TYPE_POLYGON, 1, x.shape[1] + 1
+    corners = np.stack([x, y], axis=2)
+    wkb["xy"] = np.concatenate([corners, corners[:, :1]], axis=1)
     return wkb
 
 

@@ -54,7 +54,11 @@ def encode(cells: pa.RecordBatch, form: Format, tile: int) -> bytes:
     rows = _plain(cells)
     if form is Format.JSON:
         return f'{{"tile": "{grid.quadkey(tile, grid.TILE_ZOOM)}", "cells": [{_joined(rows)}]}}'.encode()
-    features = ({"type": "Feature", "geometry": _polygon(cell), "properties": cell} for cell in rows)
+    outlines = np.stack(grid.outline(cells["cell"].to_numpy(), cells["sector"].to_numpy()), axis=-1).tolist()
+    features = (
+        {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [[*ring, ring[0]]]}, "properties": cell}
+        for ring, cell in zip(outlines, rows, strict=True)
+    )
     return f'{{"type": "FeatureCollection", "features": [{_joined(features)}]}}'.encode()
 
 
@@ -81,11 +85,3 @@ def _plain(table: pa.RecordBatch) -> list[dict[str, Any]]:
         else:
             columns[f.name] = table[f.name].to_pylist()
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-
-
-def _polygon(cell: dict[str, Any]) -> dict[str, Any]:
-    west, south, east, north = (cell[side] for side in ("west", "south", "east", "north"))
-    return {
-        "type": "Polygon",
-        "coordinates": [[[west, south], [east, south], [east, north], [west, north], [west, south]]],
-    }

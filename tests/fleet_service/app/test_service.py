@@ -282,7 +282,7 @@ def test_three_formats_say_the_same(fleet: Fleet) -> None:
     geo, plain = json.loads(geo_text), json.loads(text)
     assert geo["type"] == "FeatureCollection"
     (feature,) = geo["features"]
-    assert feature["geometry"]["coordinates"][0][0] == [arrow["west"], arrow["south"]]
+    assert feature["geometry"]["coordinates"][0][0] == [arrow["longitude"], arrow["latitude"]]
     for cell in (feature["properties"], plain["cells"][0]):
         assert cell["mu"] == pytest.approx(arrow["mu"], abs=0.01)
         assert cell["cell"] == CELL

@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from shapely.geometry import box
 
 from fleet_service.archive import export, geo, snapshots
 from fleet_service.archive.files import MAP, write_table
@@ -57,11 +58,28 @@ def test_geopandas_reads_the_polygons_of_the_cells_and_a_box_of_them(tmp_path: P
     frame = geopandas.read_parquet(path)
     assert frame.crs == "OGC:CRS84"
     assert frame.geometry.is_valid.all()
-    west, south, east, north = grid.bounds(frame["cell"].to_numpy())
-    np.testing.assert_array_equal(frame.geometry.bounds.to_numpy(), np.stack([west, south, east, north], axis=1))
+    x, y = grid.outline(frame["cell"].to_numpy(), frame["sector"].to_numpy())
+    extremes = np.stack([x.min(axis=1), y.min(axis=1), x.max(axis=1), y.max(axis=1)], axis=1)
+    np.testing.assert_array_equal(frame.geometry.bounds.to_numpy(), extremes)
+    assert frame.geometry.exterior.is_ccw.all()
     middle = frame.geometry.iloc[7].centroid
-    box = (middle.x - 1e-7, middle.y - 1e-7, middle.x + 1e-7, middle.y + 1e-7)
-    assert geopandas.read_parquet(path, bbox=box)["cell"].tolist() == [frame["cell"].iloc[7]]
+    near = (middle.x - 1e-7, middle.y - 1e-7, middle.x + 1e-7, middle.y + 1e-7)
+    assert geopandas.read_parquet(path, bbox=near)["cell"].tolist() == [frame["cell"].iloc[7]]
+
+
+def test_the_sectors_of_a_cell_lie_side_by_side_and_fill_it(tmp_path: Path) -> None:
+    table = geo.with_cells(pa.table({"cell": [CELL] * 4, "sector": pa.array(range(4), pa.int8())}))
+    export.write(table, tmp_path / "a.geojson")
+    quarters = geopandas.read_file(tmp_path / "a.geojson").geometry.set_crs(None, allow_override=True)
+    west, south, east, north = (float(side) for side in grid.bounds(CELL))
+    whole = box(west, south, east, north)
+    assert quarters.union_all().symmetric_difference(whole).area < 1e-9 * whole.area
+    assert quarters.area.sum() == pytest.approx(whole.area)
+    for sector, (x, y) in enumerate(((1, 0), (0, 1), (-1, 0), (0, -1))):  # east, north, west, south of the middle
+        off = quarters.iloc[sector].centroid
+        assert (off.x - whole.centroid.x) * x + (off.y - whole.centroid.y) * y > 0.0
+    (square,) = geo.shapes(geo.with_cells(pa.table({"cell": [CELL]})))
+    assert square["coordinates"][0][:3:2] == [[west, south], [east, north]]
 
 
 @pytest.mark.parametrize("rows", [0, 1, 5])
@@ -91,7 +109,7 @@ def test_geojson_and_csv_say_what_the_map_says(tmp_path: Path) -> None:
     frame = geopandas.read_file(tmp_path / "map.geojson")
     assert frame["cell"].tolist() == table["cell"].to_pylist()
     np.testing.assert_allclose(frame["mu"], table["mu"].to_numpy(), atol=1e-6)
-    np.testing.assert_allclose(frame.geometry.bounds["minx"], grid.bounds(table["cell"].to_numpy())[0])
+    np.testing.assert_allclose(frame.geometry.bounds["maxx"], grid.bounds(table["cell"].to_numpy())[2])
     header, *lines = (tmp_path / "map.csv").read_text().splitlines()
     assert header.startswith('"cell","sector","mu"')
     assert len(lines) == 3
