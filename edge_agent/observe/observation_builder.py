@@ -20,7 +20,7 @@ from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.jit import compiled
 from schemas.runtime.records import RecordArray, Records, records
 from schemas.signals import S
-from schemas.thresholds import EXCITED_SHARE, NS, UTILISED_WINDOW_S
+from schemas.thresholds import EXCITED_SHARE, GRAVITY, NS, UTILISED_WINDOW_S
 from schemas.wire import Columns, Kind, column_types
 
 if TYPE_CHECKING:
@@ -28,6 +28,11 @@ if TYPE_CHECKING:
 
 ABS_UNKNOWN: Final = -1  # no slip controller is read yet
 WINDOW_NS: Final = int(UTILISED_WINDOW_S * NS)
+# No wheel uses more than this over what the vehicle feels: load moves to wheels that then bear more, and the wheels of
+# one driven axle, with half of the load or more, drive all of it. A reading of g is right to FELT_STD.
+WHEEL_SHARE: Final = 1.3
+DRIVEN_SHARE: Final = 1.5
+FELT_STD: Final = 0.03
 
 
 class RecordBlock(NamedTuple):
@@ -52,6 +57,7 @@ class Visit:
     health: int  # flags of all samples
     speed_sum: float  # [m/s] over the samples
     mu_utilised: float  # largest, once the window holds nothing of the cell before
+    felt: float  # most that a wheel may have used, by the accelerometers in the cell alone
     driving: float  # squared accelerations of all samples, by direction [m²/s⁴]
     braking: float
     left: float
@@ -70,6 +76,7 @@ class Sample:
     health: int
     speed: float  # [m/s]
     mu_utilised: float
+    felt: float
     ax: float  # as measured; 0 where it is not [m/s²]
     ay: float
     mu: float
@@ -112,8 +119,12 @@ def _samples(estimates: Estimates, signals: FloatArray | None) -> RecordArray:
     samples["speed"] = np.hypot(estimates.vx, estimates.vy)
     for name in ("health", "mu_utilised", "mu", "mu_lower", "mu_upper"):
         samples[name] = getattr(estimates, name)
+    samples["felt"] = np.inf
     if signals is not None:
-        samples["ax"], samples["ay"] = np.nan_to_num(signals[..., S.AX]), np.nan_to_num(signals[..., S.AY])
+        ax, ay = signals[..., S.AX], signals[..., S.AY]
+        felt = WHEEL_SHARE * np.hypot(np.where(ax > 0.0, DRIVEN_SHARE, 1.0) * ax, ay) / GRAVITY + FELT_STD
+        samples["felt"] = np.where(np.isnan(felt), np.inf, felt)
+        samples["ax"], samples["ay"] = np.nan_to_num(ax), np.nan_to_num(ay)
     return samples
 
 
@@ -144,7 +155,7 @@ def _visit(
 def _begin(visit: Visit, time: int, cell: int, sector: int) -> None:
     """A record becomes a visit without a sample."""
     visit.enter_time, visit.cell, visit.sector, visit.samples, visit.health = time, cell, sector, 0, 0
-    visit.driving, visit.braking, visit.left, visit.right = 0.0, 0.0, 0.0, 0.0
+    visit.driving, visit.braking, visit.left, visit.right, visit.felt = 0.0, 0.0, 0.0, 0.0, 0.0
     visit.speed_sum, visit.latitude, visit.longitude, visit.yaw = 0.0, 0.0, 0.0, 0.0
 
 
@@ -159,6 +170,7 @@ def _add(visit: Visit, time: int, sample: Sample) -> None:
     visit.braking += max(-sample.ax, 0.0) ** 2
     visit.left += max(sample.ay, 0.0) ** 2
     visit.right += max(-sample.ay, 0.0) ** 2
+    visit.felt = max(visit.felt, sample.felt)
     grown = visit.leave_time - visit.enter_time > WINDOW_NS
     visit.mu_utilised = max(visit.mu_utilised, sample.mu_utilised) if grown else sample.mu_utilised
     visit.mu, visit.mu_lower, visit.mu_upper = sample.mu, sample.mu_lower, sample.mu_upper
@@ -175,7 +187,7 @@ def _directions(ended: RecordArray) -> dict[str, FloatArray]:
     """
     along, across = ended["driving"] + ended["braking"], ended["left"] + ended["right"]
     whole = np.where(along + across > 0.0, along + across, np.nan)
-    used = ended["mu_utilised"]
+    used = np.minimum(ended["mu_utilised"], ended["felt"])
     return {
         "used_longitudinal": used * np.sqrt(along / whole) * np.where(ended["driving"] >= ended["braking"], 1.0, -1.0),
         "used_lateral": used * np.sqrt(across / whole) * np.where(ended["left"] >= ended["right"], 1.0, -1.0),
@@ -184,10 +196,11 @@ def _directions(ended: RecordArray) -> dict[str, FloatArray]:
 
 def _observations(ended: RecordArray, evidence: FloatArray | None, config: AgentConfig) -> RecordBlock:
     n = len(ended)
-    mu, upper, used = ended["mu"], ended["mu_upper"], ended["mu_utilised"]
+    mu, upper = ended["mu"], ended["mu_upper"]
     carried = ("enter_time", "leave_time", "cell", "sector", "latitude", "longitude", "yaw", "health")
     columns: dict[str, NDArray[np.generic]] = {
-        **{name: ended[name] for name in (*carried, "mu", "mu_lower", "mu_upper", "mu_utilised")},
+        **{name: ended[name] for name in (*carried, "mu", "mu_lower", "mu_upper")},
+        "mu_utilised": np.minimum(ended["mu_utilised"], ended["felt"]),  # the window may hold the cell before
         "position_std": np.full(n, config.position_std),
         "yaw_std": np.full(n, config.yaw_std),
         "speed": ended["speed_sum"] / np.maximum(ended["samples"], 1),
@@ -197,7 +210,7 @@ def _observations(ended: RecordArray, evidence: FloatArray | None, config: Agent
         "abs_active": np.full(n, ABS_UNKNOWN),
         **_directions(ended),
     }
-    limit = config.slippery_mu
+    used, limit = columns["mu_utilised"], config.slippery_mu
     urgent = (upper < limit) | ((mu < limit) & (used >= EXCITED_SHARE * mu))
     return RecordBlock(Kind.OBSERVATION, _typed(Kind.OBSERVATION, columns), ended["vehicle"].copy(), urgent)
 

@@ -93,7 +93,12 @@ HERE_SHARE: Final = 0.5  # more probably here than elsewhere: counts as a visit,
 
 # A posterior (μ, interval) is a value only where this share of μ was used (contract), else a lower bound.
 VALUE_UTILISATION: Final = EXCITED_SHARE
-UTILISED_STD: Final = 0.05  # error of the grip used: accelerometer and load transfer, about 5 % of g
+UTILISED_STD: Final = 0.05  # error of the grip used: accelerometer and load transfer, about 5 % of g ...
+UTILISED_RELATIVE: Final = 0.05  # ... and 5 % of itself: mass over the wheels, roll, gain
+UTILISED_MOST: Final = 0.9  # ... and is not believed beyond: of what was above, 29 % was too much by more than .05
+# Share of bounds that are of another road, or are no bound: on two rough ways 2 to 6 % were too high by more than .1,
+# and where the surface changes within a cell all of them.
+BOUND_CONTAMINATION: Final = 0.3
 POSTERIOR_STD: Final = 0.15  # of a posterior without an interval: as wide as wet is from dry
 POSTERIOR_STD_LEAST: Final = 0.02  # half a bin: the grid cannot hold less
 

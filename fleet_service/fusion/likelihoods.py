@@ -40,7 +40,7 @@ def evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) ->
     """
     sent = columns["log_likelihood"]
     steps, reported = as_reported(sent)
-    out = levelled(steps, columns["mu_utilised"])
+    out = supported(levelled(steps, columns["mu_utilised"]), columns["mu_utilised"])
     rest = np.flatnonzero(~with_likelihood)
     if len(rest):
         mu, lower, upper, used = (
@@ -49,8 +49,19 @@ def evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) ->
         value = used >= c.VALUE_UTILISATION * mu  # False where either is NaN
         log_likelihood = np.where(value[:, None], posterior(mu, lower, upper), at_least(used))
         steps, reported[rest] = as_reported(mugrid.encode_log_likelihood(log_likelihood))
-        out[rest] = levelled(steps, used)
+        out[rest] = supported(levelled(steps, used), used)
     return Evidence(out, reported)
+
+
+def supported(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
+    """Likelihoods (n, 32) that do not claim less than the grip used (n,) supports: of both what says more, bin by bin.
+
+    An estimator whose model is contradicted says nothing about the road, yet its accelerometers felt what was used. The
+    two are of one visit, so that they are not multiplied.
+    """
+    bound = levelled(mugrid.encode_log_likelihood(at_least(used)), np.minimum(used, c.UTILISED_MOST))
+    both = np.maximum(steps, bound)
+    return np.asarray(both - both.min(axis=1, keepdims=True))
 
 
 def levelled(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
@@ -77,7 +88,9 @@ def _level(steps: ByteArray, used: FloatArray) -> None:
 
 def at_least(used: FloatArray) -> FloatArray:
     """ℓ(μ) = ln Φ((μ - u) / σ_u): rises to u and is flat above; flat everywhere where u is NaN. (n, 32)."""
-    return log_distribution((mugrid.CENTRES - np.nan_to_num(used, nan=-np.inf)[:, None]) / c.UTILISED_STD)
+    told = np.minimum(np.nan_to_num(used, nan=-np.inf), c.UTILISED_MOST)[:, None]
+    std = np.hypot(c.UTILISED_STD, c.UTILISED_RELATIVE * np.maximum(told, 0.0))
+    return log_distribution((mugrid.CENTRES - told) / std)
 
 
 def posterior(mu: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:

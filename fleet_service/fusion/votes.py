@@ -182,7 +182,10 @@ def update(
     strength = weight * entries[entry].power * entries[entry].share
     if kind == VALUE and not new:
         ensure_change(p, change, min(strength, 1.0), weather.prior[prior])
-    vote(p, scratch[LIKELIHOOD], min((1.0 - c.CONTAMINATION) * strength, 1.0 - c.CONTAMINATION_LEAST))
+    if kind == VALUE:
+        vote(p, scratch[LIKELIHOOD], min((1.0 - c.CONTAMINATION) * strength, 1.0 - c.CONTAMINATION_LEAST))
+    else:
+        vote(p, scratch[LIKELIHOOD], (1.0 - c.BOUND_CONTAMINATION) * min(strength, 1.0))
     pack(p, belief, row)
     cells[row].time = time
     _count(cells, row, entries, entry)

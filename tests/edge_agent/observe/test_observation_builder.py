@@ -7,10 +7,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from edge_agent.observe.cell_tracker import NOWHERE
-from edge_agent.observe.observation_builder import RecordBlock
+from edge_agent.observe.cell_tracker import NOWHERE, locate
+from edge_agent.observe.observation_builder import FELT_STD, WHEEL_SHARE, OpenVisits, RecordBlock, observe
 from schemas import grid, mugrid
 from schemas.config import AgentConfig
+from schemas.signals import S
+from schemas.thresholds import GRAVITY
 from schemas.wire import Kind, column_types
 from tests.edge_agent.fakes import START_NS, Watch, estimates, ground, part, wanderers
 
@@ -117,6 +119,22 @@ def test_grip_used_in_the_cell_before_is_not_told_again() -> None:
     used[border - 5 : border + 9] = 0.7
     _, observations, _ = Watch.of(1).step(block, type(reported)(**{**vars(reported), "mu_utilised": used}))
     assert observations.columns["mu_utilised"][:2].tolist() == pytest.approx([0.7, 0.1])
+
+
+def test_grip_that_the_accelerometers_did_not_feel_in_the_cell_is_of_the_cell_before() -> None:
+    """At 14 m/s a cell takes less than the window: braking on the dry road before is not told of the ice."""
+    samples = 30
+    east = np.arange(samples)[:, None] * 1.4
+    block, reported = ground(east, np.zeros_like(east), np.zeros_like(east)), estimates(samples, 1, mu=0.9)
+    used = type(reported)(**{**vars(reported), "mu_utilised": np.full((samples, 1), 0.8)})
+    told = []
+    for felt in (0.1, 0.8, np.nan):
+        signals = block.signals.copy()
+        signals[..., S.AX], signals[..., S.AY] = -felt * GRAVITY, 0.0
+        _, located = locate(Watch.of(1).tracks, block.t, block.signals)
+        _, records, _ = observe(OpenVisits.start(1), block.time, located, used, AgentConfig(), signals)  # type: ignore[arg-type]
+        told.append(float(records.columns["mu_utilised"][0]))
+    assert told == pytest.approx([WHEEL_SHARE * 0.1 + FELT_STD, 0.8, 0.8])
 
 
 @pytest.mark.parametrize("rate", [0.5, 2.0, 10.0])

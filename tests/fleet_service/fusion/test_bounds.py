@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from fleet_service.fusion import Fusion
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.likelihoods import levelled
+from fleet_service.fusion.likelihoods import levelled, supported
 from fleet_service.lab import situations
 from schemas import mugrid
 from tests.fleet_service.examples import at_least, belief, interval, observations
@@ -35,3 +35,24 @@ def test_any_number_of_bounds_leaves_a_belief_that_is_flat_above_what_was_used(u
     lower, upper = interval(belief(fusion))
     assert lower <= max(used, interval(mugrid.PRIOR)[0]) + c.UTILISED_STD
     assert upper >= interval(mugrid.PRIOR)[1] - 0.02
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.floats(0.1, 0.9), st.integers(1, 200))
+def test_what_was_used_counts_where_an_estimator_was_contradicted_and_says_nothing(used: float, vehicles: int) -> None:
+    flat = np.zeros((vehicles, mugrid.BINS), np.uint8)
+    evidence = supported(flat, np.full(vehicles, used))
+    fusion = Fusion(120.0)
+    fusion.update(replace(observations(np.arange(vehicles) * 2.0, np.arange(vehicles), flat), evidence=evidence))
+    lower, upper = interval(belief(fusion))
+    assert lower <= max(used, interval(mugrid.PRIOR)[0]) + c.UTILISED_STD
+    assert upper >= interval(mugrid.PRIOR)[1] - 0.02
+    if vehicles >= 10:
+        assert lower >= used - 0.15
+
+
+def test_a_value_below_what_was_used_gives_way_to_it() -> None:
+    value = mugrid.encode_log_likelihood(-0.5 * np.square((mugrid.CENTRES - 0.6) / 0.05))[None]
+    assert mugrid.CENTRES[np.argmin(supported(value, np.array([0.8]))[0])] > 0.65
+    assert np.array_equal(supported(value, np.array([np.nan])), value)
+    assert np.array_equal(supported(value, np.array([0.1])), value)
