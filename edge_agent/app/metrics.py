@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from edge_agent.app.live_loop import Progress
-from edge_agent.publish.publisher import Publisher
+from edge_agent.publish.publisher import CLOCK_OFF_S, Publisher
 from schemas.runtime.metrics import Metric, gauge
 from schemas.wire import Kind
 
@@ -24,6 +24,7 @@ def metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
         Metric("acknowledged_records", "counter", "held by a service", _named(counts.acknowledged), "kind"),
         Metric("rejected_records", "counter", "refused by a service for good", _named(counts.rejected), "kind"),
         Metric("dropped_records", "counter", "given up for want of room", {"": publisher.dropped}),
+        Metric("late_batches", "counter", "when the map had gone on: old news", _named(counts.late), "kind"),
         Metric("resent_batches", "counter", "sent again", {"": counts.resent_batches}),
         Metric("bad_acks", "counter", "acknowledgements that could not be read", {"": counts.bad_acks}),
         Metric("damaged_spools", "counter", "times that the outbox was found damaged", {"": publisher.damage[0]}),
@@ -31,6 +32,7 @@ def metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
         Metric("sender_failures", "counter", "rounds of the sending thread that failed", {"": counts.failures}),
         gauge("stranded_records", "in the outbox under a name that is no longer used", publisher.stranded),
         gauge("unanswered_seconds", "since something was put that nobody answers", publisher.owed_s),
+        gauge("clock_behind_seconds", "of the service's clock", publisher.clock_behind_s),
         gauge("outbox_fill", "share of the outbox that is full", publisher.fill),
         gauge("unsettled_records", "neither acknowledged nor rejected yet", publisher.unsettled()),
         gauge("sessions", "sessions that are open", publisher.links),
@@ -49,6 +51,10 @@ def troubles(publisher: Publisher, progress: Progress) -> list[str]:
         found.append(f"nothing was acknowledged for {publisher.owed_s:.0f} s")
     if publisher.fill > FULL:
         found.append("the outbox is full: the oldest states go first")
+    if abs(publisher.clock_behind_s) > CLOCK_OFF_S:
+        found.append(
+            f"the clock is {publisher.clock_behind_s:.0f} s behind the service's: reports come late or not at all"
+        )
     if publisher.stranded:
         found.append(f"{publisher.stranded} records are kept under a former name; run once with --name as it was")
     if publisher.broken:

@@ -197,10 +197,11 @@ def _directions(ended: RecordArray) -> dict[str, FloatArray]:
 def _observations(ended: RecordArray, evidence: FloatArray | None, config: AgentConfig) -> RecordBlock:
     n = len(ended)
     mu, upper = ended["mu"], ended["mu_upper"]
+    used = np.minimum(ended["mu_utilised"], ended["felt"])  # the window may hold the cell before
     carried = ("enter_time", "leave_time", "cell", "sector", "latitude", "longitude", "yaw", "health")
     columns: dict[str, NDArray[np.generic]] = {
         **{name: ended[name] for name in (*carried, "mu", "mu_lower", "mu_upper")},
-        "mu_utilised": np.minimum(ended["mu_utilised"], ended["felt"]),  # the window may hold the cell before
+        "mu_utilised": used,
         "position_std": np.full(n, config.position_std),
         "yaw_std": np.full(n, config.yaw_std),
         "speed": ended["speed_sum"] / np.maximum(ended["samples"], 1),
@@ -210,7 +211,7 @@ def _observations(ended: RecordArray, evidence: FloatArray | None, config: Agent
         "abs_active": np.full(n, ABS_UNKNOWN),
         **_directions(ended),
     }
-    used, limit = columns["mu_utilised"], config.slippery_mu
+    limit = config.slippery_mu
     urgent = (upper < limit) | ((mu < limit) & (used >= EXCITED_SHARE * mu))
     return RecordBlock(Kind.OBSERVATION, _typed(Kind.OBSERVATION, columns), ended["vehicle"].copy(), urgent)
 

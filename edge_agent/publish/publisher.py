@@ -25,6 +25,7 @@ from edge_agent.publish.spool_file import is_damage
 from edge_agent.publish.zenoh_link import Link
 from schemas.config import AgentConfig
 from schemas.errors import WireError
+from schemas.thresholds import NS
 from schemas.wire import Kind, decode_ack
 
 TICK_S: Final = 0.05  # how often the sender looks for due batches when nothing is offered
@@ -32,6 +33,7 @@ QUEUE_LIMIT: Final = 20_000  # blocks of records; many minutes of a disk that do
 WAITING_LIMIT: Final = 10_000  # batches kept in memory while the disk refuses
 RESEND_LIMIT: Final = 64  # batches offered again per round, so that fresh ones are not held up
 CHECK_S: Final = 0.5  # between two looks whether a lost router is back
+CLOCK_OFF_S: Final = 30.0  # between a service's clock and ours: what is further ahead it refuses
 CLOSE_GRACE_S: Final = 0.5  # beyond the deadline, for a put or a close that hangs on a frozen router
 
 log = logging.getLogger(__name__)
@@ -46,6 +48,7 @@ class Counts:
     acknowledged: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
     rejected: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
     dropped: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))
+    late: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(Kind, 0))  # batches, not records
     resent_batches: int = 0
     bad_acks: int = 0
     failures: int = 0  # of the sending thread, which goes on
@@ -65,10 +68,12 @@ class Publisher:
         estimator: str,
         clock: Callable[[], float] = time.monotonic,
         on_open: Callable[[str, zenoh.Session], None] = lambda *_: None,
+        wall: Callable[[], int] = time.time_ns,
     ) -> None:
         self._on_open = on_open
         self._names = dict.fromkeys(names)
         self._outbox, self._config, self._clock = outbox, config, clock
+        self._wall, self.clock_behind_s = wall, 0.0
         self._batcher = Batcher(names, outbox.boot, estimator, flush_s=config.flush_s, rows=config.batch_rows)
         self._offered: queue.Queue[RecordBlock] = queue.Queue(QUEUE_LIMIT)
         self._acks: queue.SimpleQueue[tuple[str, bytes]] = queue.SimpleQueue()
@@ -271,6 +276,15 @@ class Publisher:
         for batch in self._outbox.due(self._clock(), RESEND_LIMIT, there) if there else ():
             self.counts.resent_batches += self._links[batch.stream.vehicle].put(batch)
 
+    def _compare_clocks(self, told: int) -> None:
+        """Hold our clock against that of a service [ns], 0 if it does not tell; an ack is some second old."""
+        if not told:
+            return
+        behind = (told - self._wall()) / NS
+        if abs(behind) > CLOCK_OFF_S and abs(behind - self.clock_behind_s) > CLOCK_OFF_S:
+            log.warning("the clock is %.0f s behind the service's: reports come late, or are refused", behind)
+        self.clock_behind_s = behind
+
     def _look(self) -> None:
         """Who has a router: what was put while there was none is lost, and is put anew as soon as there is one."""
         if self._clock() - self._checked_at < CHECK_S and len(self._connected) == len(self._links):
@@ -297,6 +311,8 @@ class Publisher:
             for ack in streams:
                 stream = Stream(vehicle, ack.boot, ack.kind, ack.region)
                 self.counts.acknowledged[ack.kind] += self._outbox.settle(stream, ack.durable)
+                self.counts.late[ack.kind] += sum(last - first + 1 for first, last in ack.late)
+                self._compare_clocks(ack.time)
                 for seq, row, reason in ack.rejected:
                     records = self._outbox.settle(stream, [(seq, seq)])
                     self.counts.rejected[ack.kind] += records

@@ -12,7 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from itertools import chain
+from itertools import chain, compress
 from pathlib import Path
 
 import numpy as np
@@ -99,7 +99,7 @@ class Engine:
         self._alerts.resume(begin.standing)
         self._guard = threading.Lock()
         self._tiles = TileCache(self.map, self._guard, config.public_vehicles)
-        self._acks = Acks()
+        self._acks, self._now = Acks(), 0
         self._streams = streams
         self._intake = BatchIntake(streams, Pseudonyms(root / "keys"), self.counts, self._acks)
         self._log: SegmentLog[BatchId] = SegmentLog(root, config.name)
@@ -199,6 +199,7 @@ class Engine:
         at = at if isinstance(at, TimeNow) else TimeNow(at)
         now, ahead = at.now, int(self._config.clock_ahead_s * NS) + at.slack
         clock = Clock(now, ahead, int(self._config.oldest_s * NS), at.doubt, at.least)
+        self._now = clock.now
         out: list[Alert] = []
         for kind, accepted in self._intake.accept(messages, clock).items():
             if kind is Kind.OBSERVATION:
@@ -229,6 +230,11 @@ class Engine:
         rows["weight"][heard], error[heard] = updated.weight, updated.error
         rows |= dict(zip(ERRORS, error.T, strict=True))
         self.counts["late"] += int(updated.late.sum())
+        if updated.late.any():
+            missed = np.zeros(n, bool)
+            missed[heard] = updated.late
+            of_batch = np.logical_or.reduceat(missed, np.flatnonzero(rows["row"] == 0))
+            self._acks.late(compress(accepted.batches, of_batch.tolist()))
         return raised
 
     def _beyond(self, rows: Rows) -> BoolArray:
@@ -293,7 +299,7 @@ class Engine:
         else:
             self.failing = False
             self._tiles.acknowledge()
-        return self._acks.messages()
+        return self._acks.messages(self._now)
 
     def tiles(self, now: int) -> list[tuple[int, bytes]]:
         """Tile and Arrow stream of every tile that changed since the last call, as far as it is public."""

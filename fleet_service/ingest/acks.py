@@ -21,6 +21,7 @@ class Acks:
 
     def __init__(self) -> None:
         self._durable: dict[SequenceTracker, list[int]] = defaultdict(list)
+        self._late: dict[SequenceTracker, set[int]] = defaultdict(set)
         self._rejected: dict[str, dict[AckedStream, list[tuple[int, int, str]]]] = defaultdict(
             lambda: defaultdict(list)
         )
@@ -31,25 +32,42 @@ class Acks:
         for stream, seq in batches:
             durable[stream].append(seq)
 
+    def late(self, batches: Iterable[BatchId]) -> None:
+        """The batches came when the map had gone on; told with what is durable of them."""
+        for stream, seq in batches:
+            self._late[stream].add(seq)
+
     def rejected(self, vehicle: str, batch: Head, row: int, reason: str) -> None:
         """The batch was refused for good."""
         self._rejected[vehicle][batch.boot, batch.kind, batch.region].append((batch.seq, row, reason))
 
-    def messages(self) -> list[tuple[str, bytes]]:
-        """Vehicle and `Ack` bytes of everything gathered; starts anew."""
+    def messages(self, time: int = 0) -> list[tuple[str, bytes]]:
+        """Vehicle and `Ack` bytes of everything gathered, with the service's `time` [ns]; starts anew."""
         settled: dict[str, dict[AckedStream, list[int]]] = {vehicle: {} for vehicle in self._rejected}
+        late: dict[tuple[str, AckedStream], set[int]] = defaultdict(set)
         for stream, seqs in self._durable.items():
             settled.setdefault(stream.vehicle, {}).setdefault(stream.key[1:], []).extend(seqs)
+            if stream in self._late:
+                told = self._late[stream].intersection(seqs)
+                late[stream.vehicle, stream.key[1:]] |= told
+                self._late[stream] -= told
+                if not self._late[stream]:
+                    del self._late[stream]
         out = []
         for vehicle, durable in sorted(settled.items()):
             rejected = self._rejected.get(vehicle, {})
             streams = [
                 part
                 for stream in sorted(durable.keys() | rejected.keys())
-                for part in _parts(stream, ranges(durable.get(stream, ())), tuple(rejected.get(stream, ())))
+                for part in _parts(
+                    stream,
+                    ranges(durable.get(stream, ())),
+                    tuple(rejected.get(stream, ())),
+                    ranges(late.get((vehicle, stream), ())),
+                )
             ]
             out += [
-                (vehicle, encode_ack(vehicle, streams[at : at + STREAMS_PER_ACK]))
+                (vehicle, encode_ack(vehicle, streams[at : at + STREAMS_PER_ACK], time))
                 for at in range(0, len(streams), STREAMS_PER_ACK)
             ]
         self._durable.clear()
@@ -58,12 +76,13 @@ class Acks:
 
 
 def _parts(
-    stream: AckedStream, durable: tuple[tuple[int, int], ...], rejected: tuple[tuple[int, int, str], ...]
-) -> Iterator[StreamAck]:
+    stream: AckedStream, durable: tuple[tuple[int, int], ...], rejected: tuple[tuple[int, int, str], ...],
+    late: tuple[tuple[int, int], ...],
+) -> Iterator[StreamAck]:  # fmt: skip
     """Acknowledgements of a stream that are due, in pieces."""
-    for at in range(0, max(len(durable), len(rejected)), ITEMS_PER_STREAM):
+    for at in range(0, max(len(durable), len(rejected), len(late)), ITEMS_PER_STREAM):
         some = slice(at, at + ITEMS_PER_STREAM)
-        yield StreamAck(*stream, durable[some], rejected[some])
+        yield StreamAck(*stream, durable[some], rejected[some], late[some])
 
 
 def ranges(numbers: Iterable[int]) -> tuple[tuple[int, int], ...]:

@@ -146,26 +146,30 @@ class Rejection(_message.Message):
     def __init__(self, seq: _Optional[int] = ..., row: _Optional[int] = ..., reason: _Optional[str] = ...) -> None: ...
 
 class StreamAck(_message.Message):
-    __slots__ = ("boot", "kind", "region", "durable", "rejected")
+    __slots__ = ("boot", "kind", "region", "durable", "rejected", "late")
     BOOT_FIELD_NUMBER: _ClassVar[int]
     KIND_FIELD_NUMBER: _ClassVar[int]
     REGION_FIELD_NUMBER: _ClassVar[int]
     DURABLE_FIELD_NUMBER: _ClassVar[int]
     REJECTED_FIELD_NUMBER: _ClassVar[int]
+    LATE_FIELD_NUMBER: _ClassVar[int]
     boot: int
     kind: Kind
     region: int
     durable: _containers.RepeatedCompositeFieldContainer[SeqRange]
     rejected: _containers.RepeatedCompositeFieldContainer[Rejection]
-    def __init__(self, boot: _Optional[int] = ..., kind: _Optional[_Union[Kind, str]] = ..., region: _Optional[int] = ..., durable: _Optional[_Iterable[_Union[SeqRange, _Mapping]]] = ..., rejected: _Optional[_Iterable[_Union[Rejection, _Mapping]]] = ...) -> None: ...
+    late: _containers.RepeatedCompositeFieldContainer[SeqRange]
+    def __init__(self, boot: _Optional[int] = ..., kind: _Optional[_Union[Kind, str]] = ..., region: _Optional[int] = ..., durable: _Optional[_Iterable[_Union[SeqRange, _Mapping]]] = ..., rejected: _Optional[_Iterable[_Union[Rejection, _Mapping]]] = ..., late: _Optional[_Iterable[_Union[SeqRange, _Mapping]]] = ...) -> None: ...
 
 class Ack(_message.Message):
-    __slots__ = ("vehicle", "streams")
+    __slots__ = ("vehicle", "streams", "time")
     VEHICLE_FIELD_NUMBER: _ClassVar[int]
     STREAMS_FIELD_NUMBER: _ClassVar[int]
+    TIME_FIELD_NUMBER: _ClassVar[int]
     vehicle: str
     streams: _containers.RepeatedCompositeFieldContainer[StreamAck]
-    def __init__(self, vehicle: _Optional[str] = ..., streams: _Optional[_Iterable[_Union[StreamAck, _Mapping]]] = ...) -> None: ...
+    time: int
+    def __init__(self, vehicle: _Optional[str] = ..., streams: _Optional[_Iterable[_Union[StreamAck, _Mapping]]] = ..., time: _Optional[int] = ...) -> None: ...
 
 class Alert(_message.Message):
     __slots__ = ("cell", "sector", "raised", "time", "mu", "mu_lower", "mu_upper", "p_slippery", "vehicles", "latitude", "longitude", "reason")

@@ -139,18 +139,23 @@ def parse(payload: bytes, encoding: str, message: type[Any], expected: str) -> A
 
 
 class StreamAck(NamedTuple):
-    """Settled batches of one stream: ranges of seq, both ends included, and (seq, row, reason) of the refused ones."""
+    """Settled batches of one stream: ranges of seq, both ends included, and (seq, row, reason) of the refused ones.
+
+    `late` are those of the durable that came when the map had gone on; `time` is the service's clock [ns], 0 if untold.
+    """
 
     boot: int
     kind: Kind
     region: int
     durable: tuple[tuple[int, int], ...] = ()
     rejected: tuple[tuple[int, int, str], ...] = ()
+    late: tuple[tuple[int, int], ...] = ()
+    time: int = 0
 
 
-def encode_ack(vehicle: str, streams: list[StreamAck]) -> bytes:
-    """Protobuf bytes of an acknowledgement."""
-    message = pb.Ack(vehicle=vehicle)
+def encode_ack(vehicle: str, streams: list[StreamAck], time: int = 0) -> bytes:
+    """Protobuf bytes of an acknowledgement that a service gives at `time` [ns] of its clock."""
+    message = pb.Ack(vehicle=vehicle, time=time)
     for stream in streams:
         part = message.streams.add()  # field by field: half of what keyword arguments take
         part.boot, part.kind, part.region = stream.boot, _PB_KIND[stream.kind], stream.region
@@ -159,6 +164,8 @@ def encode_ack(vehicle: str, streams: list[StreamAck]) -> bytes:
             run.first, run.last = first, last
         for seq, row, reason in stream.rejected:
             part.rejected.add(seq=seq, row=row, reason=reason)
+        for first, last in stream.late:
+            part.late.add(first=first, last=last)
     return message.SerializeToString()
 
 
@@ -176,6 +183,7 @@ def decode_ack(payload: bytes) -> tuple[str, list[StreamAck]]:
             stream.boot, _KIND_OF[stream.kind], stream.region,
             tuple((r.first, r.last) for r in stream.durable),
             tuple((r.seq, r.row, r.reason) for r in stream.rejected),
+            tuple((r.first, r.last) for r in stream.late), message.time,
         )
         for stream in message.streams
     ]  # fmt: skip

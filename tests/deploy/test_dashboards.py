@@ -40,9 +40,19 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
         found = service_metrics.metrics(engine, pulse, config, root)
     finally:
         engine.close()
-    counts: Any = SimpleNamespace(published={}, acknowledged={}, rejected={}, resent_batches=0, bad_acks=0, failures=0)
+    counts: Any = SimpleNamespace(
+        published={}, acknowledged={}, rejected={}, late={}, resent_batches=0, bad_acks=0, failures=0
+    )
     publisher: Any = SimpleNamespace(
-        counts=counts, dropped=0, damage=(0, 0), stranded=0, owed_s=0.0, fill=0.0, links=1, unsettled=lambda: 0
+        clock_behind_s=0.0,
+        counts=counts,
+        dropped=0,
+        damage=(0, 0),
+        stranded=0,
+        owed_s=0.0,
+        fill=0.0,
+        links=1,
+        unsettled=lambda: 0,
     )
     progress: Any = SimpleNamespace(behind=0, now_s=0.0, lag_s=0.0)
     found += agent_metrics.metrics(publisher, progress)

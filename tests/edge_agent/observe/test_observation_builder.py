@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
@@ -15,6 +16,9 @@ from schemas.signals import S
 from schemas.thresholds import GRAVITY
 from schemas.wire import Kind, column_types
 from tests.edge_agent.fakes import START_NS, Watch, estimates, ground, part, wanderers
+
+if TYPE_CHECKING:
+    from edge_agent.estimators import Estimates
 
 
 def joined(records: list[RecordBlock]) -> dict[str, np.ndarray]:
@@ -132,7 +136,8 @@ def test_grip_that_the_accelerometers_did_not_feel_in_the_cell_is_of_the_cell_be
         signals = block.signals.copy()
         signals[..., S.AX], signals[..., S.AY] = -felt * GRAVITY, 0.0
         _, located = locate(Watch.of(1).tracks, block.t, block.signals)
-        _, records, _ = observe(OpenVisits.start(1), block.time, located, used, AgentConfig(), signals)  # type: ignore[arg-type]
+        reading = cast("Estimates", used)
+        _, records, _ = observe(OpenVisits.start(1), block.time, located, reading, AgentConfig(), signals)
         told.append(float(records.columns["mu_utilised"][0]))
     assert told == pytest.approx([WHEEL_SHARE * 0.1 + FELT_STD, 0.8, 0.8])
 

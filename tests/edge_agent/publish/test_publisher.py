@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from edge_agent.app.live_loop import Progress
+from edge_agent.app.metrics import troubles
 from edge_agent.observe.observation_builder import RecordBlock
 from edge_agent.publish.batching import Batcher
 from edge_agent.publish.outbox import Outbox
 from edge_agent.publish.publisher import Publisher
 from schemas import grid, keys
 from schemas.config import AgentConfig, ZenohSettings
+from schemas.thresholds import NS
 from schemas.wire import Batch, Kind, StreamAck, encode_ack
 from tests.edge_agent.fakes import Watch, estimates, wanderers
 from tests.edge_agent.service import Router, Service
@@ -188,6 +192,31 @@ def test_acknowledgements_that_cannot_be_read_or_are_anothers_are_counted_and_se
     service.put_ack("car-a", encode_ack("car-b", [forged]))
     until(lambda: publisher.counts.bad_acks == 2)
     assert publisher.unsettled() == len(observations.vehicle)
+    publisher.close(within_s=0.1)
+
+
+def test_a_service_that_tells_its_time_shows_that_the_clock_is_off(
+    router: Router, service: Service, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    service.answer = False
+    publisher = publisher_of(settings(router, tmp_path))
+    observations, _ = drive()
+    publisher.offer(observations)
+    service.wait(lambda batches: rows(batches, Kind.OBSERVATION) == len(observations.vehicle))
+    mine = next(b for b in service.batches if b.vehicle == "car-a")
+    settled = StreamAck(mine.boot, mine.kind, mine.region, ((mine.seq, mine.seq),), late=((mine.seq, mine.seq),))
+    assert troubles(publisher, Progress()) == []
+    with caplog.at_level(logging.WARNING):
+        service.put_ack("car-a", encode_ack("car-a", [settled], time.time_ns() + 130 * NS))
+        until(lambda: publisher.counts.late[mine.kind] == 1)
+    until(lambda: abs(publisher.clock_behind_s - 130.0) < 10.0)
+    assert any("clock" in trouble for trouble in troubles(publisher, Progress()))
+    assert "behind the service's" in caplog.text
+    service.put_ack("car-a", encode_ack("car-a", [settled], time.time_ns()))
+    until(lambda: abs(publisher.clock_behind_s) < 10.0)
+    service.put_ack("car-a", encode_ack("car-a", [settled]))  # of a version that does not tell
+    until(lambda: publisher.counts.late[mine.kind] == 3)
+    assert troubles(publisher, Progress()) == []
     publisher.close(within_s=0.1)
 
 

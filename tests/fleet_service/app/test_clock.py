@@ -130,3 +130,15 @@ def test_a_vehicle_whose_clock_is_a_day_ahead_is_refused_and_does_not_make_the_o
         (stream,) = wire.decode_ack(ack)[1]
         assert stream.durable == ((2, 2),)
         assert [(seq, row) for seq, row, _ in stream.rejected] == [(1, 0)]
+
+
+def test_an_ack_says_what_came_late_once_and_what_time_it_is(tmp_path: Path) -> None:
+    now = time.time_ns()
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        engine.ingest([message(1, now)], now)
+        engine.ingest([message(2, now - HOUR // 6), message(3, now - SECOND)], now)
+        (stream,) = wire.decode_ack(engine.flush()[0][1])[1]
+        assert (stream.durable, stream.late, stream.time) == (((1, 3),), ((2, 2),), now)
+        engine.ingest([message(2, now - HOUR // 6)], now + SECOND)
+        (stream,) = wire.decode_ack(engine.flush()[0][1])[1]
+        assert (stream.durable, stream.late, stream.time) == (((2, 2),), (), now + SECOND)

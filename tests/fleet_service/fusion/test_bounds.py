@@ -40,10 +40,10 @@ def test_any_number_of_bounds_leaves_a_belief_that_is_flat_above_what_was_used(u
 @settings(max_examples=15, deadline=None)
 @given(st.floats(0.1, 0.9), st.integers(1, 200))
 def test_what_was_used_counts_where_an_estimator_was_contradicted_and_says_nothing(used: float, vehicles: int) -> None:
-    flat = np.zeros((vehicles, mugrid.BINS), np.uint8)
-    evidence = supported(flat, np.full(vehicles, used))
+    flat = np.zeros((vehicles, mugrid.BINS))
+    o = observations(np.arange(vehicles) * 2.0, np.arange(vehicles), flat)
     fusion = Fusion(120.0)
-    fusion.update(replace(observations(np.arange(vehicles) * 2.0, np.arange(vehicles), flat), evidence=evidence))
+    fusion.update(replace(o, evidence=supported(o.evidence, np.full(vehicles, used))))
     lower, upper = interval(belief(fusion))
     assert lower <= max(used, interval(mugrid.PRIOR)[0]) + c.UTILISED_STD
     assert upper >= interval(mugrid.PRIOR)[1] - 0.02
