@@ -37,9 +37,9 @@ def add_part(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bbox", metavar="W,S,E,N", help="degrees; without it, everything")
 
 
-def add_archive(parser: argparse.ArgumentParser) -> None:
+def add_archive(parser: argparse.ArgumentParser, *, required: bool = True) -> None:
     """Declare the archive of a command that works on one, and how it says what it did."""
-    parser.add_argument("--archive", metavar="DIR", type=Path, required=True, help="of a service, running or not")
+    parser.add_argument("--archive", metavar="DIR", type=Path, required=required, help="of a service, running or not")
     parser.add_argument("--json", action="store_true", help="say what was done as one line of JSON")
 
 

@@ -1,4 +1,7 @@
-"""`fleet-service export`: a part of the archive as a file for other programs; the map as it stands now, or stood."""
+"""`fleet-service export`: a part of the archive as a file for other programs; the map as it stands now, or stood.
+
+`export datex` asks the running services instead, and writes the slippery stretches as road authorities read them.
+"""
 
 from __future__ import annotations
 
@@ -7,29 +10,65 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from fleet_service.cli.common import ArchiveReport, add_archive, add_part, on_archive, span
+from fleet_service.cli.common import ArchiveReport, add_archive, add_connection, add_part, on_archive, span
 from schemas.errors import InputError
 from schemas.runtime import commandline, talk
 from schemas.thresholds import NS
 
 ENDINGS: Final = (".parquet", ".geojson", ".csv")
+WHAT: Final = ("map", "observations", "rollup")
+DATEX: Final = "datex"
+STATUSES: Final = ("real", "test", "technicalExercise", "securityExercise")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    add_archive(parser)
-    parser.add_argument("what", choices=("map", "observations", "rollup"), metavar="map|observations|rollup")
-    parser.add_argument("--out", metavar="FILE", type=Path, required=True, help=f"ends in {', '.join(ENDINGS)}")
+    add_archive(parser, required=False)
+    parser.add_argument("what", choices=(*WHAT, DATEX), metavar="|".join((*WHAT, DATEX)))
+    parser.add_argument(
+        "--out", metavar="FILE", type=Path, required=True, help=f"ends in {', '.join(ENDINGS)}; datex: in .xml"
+    )
     add_part(parser)
     parser.add_argument(
         "--min-vehicles", metavar="K", type=int, default=1, help="map: only cells of K vehicles or more"
     )
     parser.add_argument("--snapshot", action="store_true", help="map: the service's last hourly one, at once")
+    add_connection(parser)
+    parser.add_argument("--country", metavar="CC", help="datex: the supplier's, e.g. se")
+    parser.add_argument("--supplier", metavar="NAME", help="datex: the supplier's name at its National Access Point")
+    parser.add_argument("--status", choices=STATUSES, default="test", help="datex: of the information; default test")
+    parser.add_argument("--follow", action="store_true", help="datex: keep the file up until a signal")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command on its archive."""
-    return on_archive(arguments, _export)
+    """Run the command: on its archive, or on what the services say.
+
+    Raises:
+        InputError: an option is missing, or of the other kind of export.
+    """
+    live, archived = ("country", "supplier", "follow", "connect", "config"), ("archive", "bbox", "since", "until")
+    wrong = archived if arguments.what == DATEX else live
+    for name in wrong:
+        if getattr(arguments, name):
+            option = {"since": "from", "until": "to"}.get(name, name)
+            raise InputError(option, f"says nothing to export {arguments.what}", "leave it out")
+    for name in ("country", "supplier") if arguments.what == DATEX else ("archive",):
+        if getattr(arguments, name) is None:
+            raise InputError(name, f"is missing for export {arguments.what}", f"give --{name}")
+    return _datex(arguments) if arguments.what == DATEX else on_archive(arguments, _export)
+
+
+def _datex(arguments: argparse.Namespace) -> int:
+    from fleet_service.cli.common import stop_on_signals
+    from fleet_service.client.datex import Supplier
+    from fleet_service.client.datex_feed import DatexFeed, publish
+    from fleet_service.client.map_client import settings
+
+    commandline.ending("out", commandline.out_folder("out", arguments.out), (".xml",))
+    supplier = Supplier(arguments.country, arguments.supplier, arguments.status)
+    feed = DatexFeed(supplier, arguments.out, lambda line: print(line, flush=True))
+    publish(settings(arguments.connect, arguments.config), feed, stop_on_signals() if arguments.follow else None)
+    return 0
 
 
 def _export(arguments: argparse.Namespace) -> ArchiveReport:

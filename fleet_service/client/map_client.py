@@ -49,14 +49,14 @@ def ask(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
     form = query.parse(parameters).format
     selector = f"{keys.ROOT}/map/**" + ("?" + ";".join(f"{k}={v}" for k, v in parameters.items()) if parameters else "")
     payloads = []
-    with _session(connection) as session:
+    with joined(connection) as session:
         for reply in session.get(selector, timeout=TIMEOUT_S):
             if reply.ok is None:
                 problem = reply.err.payload.to_string() if reply.err else "no reply"
                 field, _, rest = problem.partition(": ")
                 raise InputError(field if rest else "query", rest or problem, "see above")
             payloads.append((str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
-        served = bool(payloads) or _served(session, query.parse(parameters))
+        served = bool(payloads) or is_served(session, query.parse(parameters))
     return replace(_joined(form, [payload for _, payload in sorted(payloads)]), served=served)
 
 
@@ -71,24 +71,35 @@ def served_table(answer: Answer) -> pa.Table:
     return answer.table
 
 
-def _served(session: zenoh.Session, asked: query.MapQuery) -> bool:
+def is_served(session: zenoh.Session, asked: query.MapQuery) -> bool:
     """Whether any service answers for the map: an empty answer of one is not the silence of none.
 
     A service has a token, which not every reader may see; and it answers for the tiles of its regions.
     """
     point = asked.route[0] if asked.route else asked.bbox[:2] if asked.bbox else (0.0, 0.0)
-    tile = grid.tile_of(int(grid.cell_of(point[1], point[0])))
+    if is_place_served(session, point[1], point[0]):
+        return True
+    return any(reply.ok is not None for reply in session.liveliness().get(f"{keys.ROOT}/shard/*", timeout=SERVED_S))
+
+
+def is_place_served(session: zenoh.Session, latitude: float, longitude: float) -> bool:
+    """Whether a service answers for the tile of a place [deg]; no takes SERVED_S."""
+    tile = grid.tile_of(int(grid.cell_of(latitude, longitude)))
     querier: Any = session.declare_querier(keys.map_key(int(tile)))
     deadline = time.monotonic() + SERVED_S
     while not querier.matching_status.matching:
         if time.monotonic() > deadline:
-            tokens = session.liveliness().get(f"{keys.ROOT}/shard/*", timeout=SERVED_S)
-            return any(reply.ok is not None for reply in tokens)
+            return False
         time.sleep(0.02)
     return True
 
 
-def _session(connection: ZenohSettings) -> zenoh.Session:
+def joined(connection: ZenohSettings) -> zenoh.Session:
+    """A session with a router.
+
+    Raises:
+        InputError: none is there.
+    """
     try:
         return zenoh.open(zenoh_session.configuration(connection))
     except zenoh.ZError as error:

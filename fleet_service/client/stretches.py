@@ -8,13 +8,14 @@ the larger part keeps it.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from typing import Any, Final, Literal
 
 import numpy as np
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree, shortest_path
 from scipy.spatial import cKDTree
 
 from schemas import grid
@@ -39,9 +40,10 @@ class StretchAlert:
         length_m: along its road direction, a cell at the least.
         direction: of the road, e.g. north-south; headings: of the vehicles that found it.
         latitude, longitude: its middle [deg]; bbox: west, south, east, north [deg].
-        mu, mu_lower, mu_upper: least of the cells', with that cell's interval.
+        mu, mu_lower, mu_upper, p_slippery: least of the cells', with that cell's interval.
         vehicles: most of any cell.
         reason: of the last cell that changed it.
+        points: latitude and longitude [deg] of the cells from one end to the other; branches are left out.
     """
 
     id: str
@@ -58,8 +60,10 @@ class StretchAlert:
     mu: float
     mu_lower: float
     mu_upper: float
+    p_slippery: float
     vehicles: int
     reason: str
+    points: tuple[tuple[float, float], ...]
 
     def values(self) -> dict[str, Any]:
         """All of it as JSON has it; times as ISO 8601, UTC."""
@@ -97,6 +101,15 @@ class Stretches:
         else:
             self._standing.pop(place, None)
         self._last = alert
+
+    def keep(self, is_standing: Callable[[Alert], bool]) -> None:
+        """Drop the alerts that ended while nobody heard of it."""
+        self._standing = {place: alert for place, alert in self._standing.items() if is_standing(alert)}
+
+    @property
+    def standing(self) -> list[StretchAlert]:
+        """All that stand, as `changes` told them last."""
+        return list(self._known.values())
 
     def changes(self) -> list[StretchAlert]:
         """What has changed since this was asked last."""
@@ -142,8 +155,9 @@ class Stretches:
             id=name, state="raised", since=known.since if known else min(one.time for one in group), time=last.time,
             length_m=length, direction=direction, headings=headings,
             latitude=middle[0], longitude=middle[1], bbox=bbox, cells=len(_cells(group)), mu=worst.mu,
-            mu_lower=worst.mu_lower, mu_upper=worst.mu_upper, vehicles=max(one.vehicles for one in group),
-            reason=last.reason,
+            mu_lower=worst.mu_lower, mu_upper=worst.mu_upper, p_slippery=worst.p_slippery,
+            vehicles=max(one.vehicles for one in group), reason=last.reason,
+            points=_points(np.array(sorted(_cells(group)), np.int64)),
         )  # fmt: skip
 
 
@@ -163,6 +177,22 @@ def _cells(group: list[Alert]) -> set[int]:
 
 def _new(first: Alert) -> str:
     return f"{grid.quadkey(first.cell, grid.CELL_ZOOM)}-{first.time // NS:x}"
+
+
+def _points(cell: IntArray) -> tuple[tuple[float, float], ...]:
+    """Centres [deg] of distinct cells along the longest way from neighbour to neighbour."""
+    places = np.stack(grid.deinterleave(cell), axis=1).astype(np.float64)
+    pairs = cKDTree(places).query_pairs(LINK_CELLS, p=np.inf, output_type="ndarray")
+    apart = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
+    tree = minimum_spanning_tree(coo_array((apart, (pairs[:, 0], pairs[:, 1])), shape=(len(cell), len(cell))))
+    far = shortest_path(tree, directed=False, indices=0)
+    end = int(np.argmax(far))
+    length, before = shortest_path(tree, directed=False, indices=end, return_predecessors=True)
+    way = [int(np.argmax(length))]
+    while way[-1] != end:
+        way.append(int(before[way[-1]]))
+    latitude, longitude = grid.centre(cell[way])
+    return tuple(zip(latitude.tolist(), longitude.tolist(), strict=True))
 
 
 def _shape(cell: IntArray) -> tuple[float, str, tuple[float, float], tuple[float, float, float, float]]:

@@ -81,14 +81,19 @@ def watch(
         if not wishes.only_alerts:
             session.declare_subscriber(f"{keys.ROOT}/map/**", changed)
         session.declare_subscriber(f"{keys.ROOT}/alert/**", alerted)
-        for reply in session.get(f"{keys.ROOT}/alert/**"):  # after the subscription: none is missed in between
-            if reply.ok is not None and near(str(reply.ok.key_expr)) is not None:
-                for alert in wire.decode_standing(reply.ok.payload.to_bytes()):
-                    take(alert)
+        for alert in standing_alerts(session):  # after the subscription: none is missed in between
+            if near(keys.alert_key(int(grid.tile_of(alert.cell)))) is not None:
+                take(alert)
         say(json.dumps({"event": "watching"}) if wishes.as_json else "watching")
         while not stop.wait(GATHER_S):
             tell()
         tell()
+
+
+def standing_alerts(session: zenoh.Session) -> list[wire.Alert]:
+    """The alerts that stand, of all services that answer."""
+    replies = (reply.ok for reply in session.get(f"{keys.ROOT}/alert/**") if reply.ok is not None)
+    return [alert for reply in replies for alert in wire.decode_standing(reply.payload.to_bytes())]
 
 
 def _tile_line(tile: int, table: pa.Table, as_json: bool) -> str:

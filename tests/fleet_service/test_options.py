@@ -91,6 +91,7 @@ SHOWN_BELOW: Final = {
     "completion": {"shell"},
     "certs": {"--renew-days", "--revoke", "--dry-run"},  # enrolment/test_certificates.py
     "run": {"--config", "--archive", "--weather"},
+    "export": {"--country", "--supplier", "--status", "--follow", "--connect", "--config"},  # client/test_datex.py
     "query": {"--bbox", "--route", "--min-vehicles", "--at", "--basis", "--format", "--out", "--connect", "--config"},
     "watch": {"--bbox", "--connect", "--config", "--alerts", "--json", "--webhook"},
 }

@@ -1,0 +1,270 @@
+"""Slippery stretches as a DATEX II publication (version 3): what a National Access Point takes. Pure.
+
+A stretch is a situation of category a of the safety-related traffic information (Regulation (EU) 886/2013, temporary
+slippery road). It says `slippery`, never `ice`: grip is known, its cause is not. A situation keeps its id; its record's
+version counts up when something of it changes; when the alert is over it is told with its end for KEPT_S more.
+
+The publication of before is all that has to be kept: the next one is made from it and from the alerts that stand.
+"""
+
+from __future__ import annotations
+
+import copy
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Final, Literal
+
+from fleet_service.client.stretches import StretchAlert, iso
+from schemas import grid
+from schemas.errors import InputError
+from schemas.thresholds import NS, SLIPPERY_MU
+
+KEPT_S: Final = 3600  # for which an ended situation is told: who pulls every few minutes does not miss the end
+INTERVAL_STD: Final = 3.29  # of a 90 % interval of a Gaussian
+CERTAIN, PROBABLE = 0.97, 0.8  # of P(slippery), from which on it is said
+DIGITS: Final = 6  # a tenth of a metre; a cell is ten
+_XSI: Final = "http://www.w3.org/2001/XMLSchema-instance"
+_SPACES: Final = {
+    "d2": "http://datex2.eu/schema/3/d2Payload", "com": "http://datex2.eu/schema/3/common",
+    "sit": "http://datex2.eu/schema/3/situation", "loc": "http://datex2.eu/schema/3/locationReferencing", "xsi": _XSI,
+}  # fmt: skip
+_BEARINGS: Final = {name: (90.0 - 90.0 * sector) % 360.0 for sector, name in enumerate(grid.HEADINGS)}
+
+
+@dataclass(frozen=True)
+class Supplier:
+    """Who answers for a publication.
+
+    Attributes:
+        country: two letters, ISO 3166.
+        name: of the supplier at its National Access Point.
+        status: real, or one of the exercises of the standard.
+
+    Raises:
+        InputError: the country is none, or the name is empty.
+    """
+
+    country: str
+    name: str
+    status: Literal["real", "test", "technicalExercise", "securityExercise"] = "test"
+
+    def __post_init__(self) -> None:
+        """Refuse what no reader would take."""
+        if not re.fullmatch("[a-z]{2}", self.country):
+            raise InputError("country", f"{self.country!r} is no country", "give two letters, e.g. se")
+        if not self.name.strip():
+            raise InputError("supplier", "is empty", "give the supplier's name at the access point")
+
+
+def publication(
+    supplier: Supplier,
+    standing: list[StretchAlert],
+    now: int,
+    before: bytes | None = None,
+    is_heard: Callable[[float, float], bool] = lambda *_: True,
+) -> bytes:
+    """The publication as of now [ns UTC].
+
+    Args:
+        supplier: who answers for it.
+        standing: every stretch that is under an alert.
+        now: [ns UTC].
+        before: the publication of before; None begins anew.
+        is_heard: whether a service speaks for a place (latitude, longitude); where none does, silence ends nothing.
+
+    Raises:
+        InputError: `before` is none.
+    """
+    old = {} if before is None else _records(before)
+    root = ET.Element(_name("d2:payload"), {_name("xsi:type"): "sit:SituationPublication", "lang": "en",
+                                            "modelBaseVersion": "3"})  # fmt: skip
+    _text(root, "com:publicationTime", iso(now))
+    creator = ET.SubElement(root, _name("com:publicationCreator"))
+    _text(creator, "com:country", supplier.country)
+    _text(creator, "com:nationalIdentifier", supplier.name)
+    told: set[str] = set()
+    for alert in standing:
+        known = alert.id if alert.id in old else _same_place(alert, old, told)
+        record = _record(alert, known or alert.id, now)
+        if known is not None:
+            record = _versioned(record, old[known])
+        told.add(record.get("id", ""))
+        root.append(_situation(supplier, record))
+    for name, record in old.items():
+        if name in told:
+            continue
+        shown = _found(record, "sit:locationReference/loc:coordinatesForDisplay")
+        heard = is_heard(*(float(child.text or "nan") for child in shown))
+        ended = _ended(record, now) if heard else record
+        if ended is not None:
+            root.append(_situation(supplier, ended))
+    ET.indent(root)
+    text = bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True)) + b"\n"
+    used = f'xmlns:sit="{_SPACES["sit"]}"'.encode()  # by the payload's type too, where no situation declares it
+    return text if used in text else text.replace(b"<d2:payload ", b"<d2:payload " + used + b" ", 1)
+
+
+def same_but_for_time(one: bytes, other: bytes) -> bool:
+    """Whether two publications say the same of the road."""
+    cut = re.compile(rb"<com:publicationTime>[^<]*</com:publicationTime>")
+    return cut.sub(b"", one) == cut.sub(b"", other)
+
+
+def _record(alert: StretchAlert, name: str, now: int) -> ET.Element:
+    record = ET.Element(_name("sit:situationRecord"), {_name("xsi:type"): "sit:WeatherRelatedRoadConditions",
+                                                       "id": name, "version": "1"})  # fmt: skip
+    _text(record, "sit:situationRecordCreationTime", iso(now))
+    _text(record, "sit:situationRecordObservationTime", iso(alert.time))
+    _text(record, "sit:situationRecordVersionTime", iso(now))
+    sure = "certain" if alert.p_slippery > CERTAIN else "probable" if alert.p_slippery > PROBABLE else "riskOf"
+    _text(record, "sit:probabilityOfOccurrence", sure)
+    _text(record, "sit:severity", "high" if alert.mu < SLIPPERY_MU / 2 else "medium")
+    _text(record, "sit:safetyRelatedMessage", "true")
+    source = ET.SubElement(record, _name("sit:source"))
+    _words(source, "com:sourceName", "GripMap: peak friction that vehicles' own dynamics showed")
+    _text(source, "com:sourceType", "vehicleProbeMeasurement")
+    validity = ET.SubElement(record, _name("sit:validity"))
+    _text(validity, "com:validityStatus", "active")
+    period = ET.SubElement(validity, _name("com:validityTimeSpecification"))
+    _text(period, "com:overallStartTime", iso(alert.since))
+    record.append(_location(alert))
+    _text(record, "sit:weatherRelatedRoadConditionType", "slippery")
+    measured = ET.SubElement(record, _name("sit:roadSurfaceConditionMeasurements"))
+    friction = ET.SubElement(
+        measured, _name("com:friction"),
+        {"numberOfInputValuesUsed": str(alert.vehicles),
+         "standardDeviation": f"{(alert.mu_upper - alert.mu_lower) / INTERVAL_STD:.3f}"},
+    )  # fmt: skip
+    _text(friction, "com:friction", f"{alert.mu:.2f}")
+    return record
+
+
+def _location(alert: StretchAlert) -> ET.Element:
+    """A line from end to end, the way that vehicles head; a point where the stretch is one cell."""
+    points, line = list(alert.points), len(alert.points) > 1
+    kind = "loc:LinearLocation" if line else "loc:PointLocation"
+    place = ET.Element(_name("sit:locationReference"), {_name("xsi:type"): kind})
+    _coordinates(place, "loc:coordinatesForDisplay", alert.latitude, alert.longitude)
+    about = ET.SubElement(place, _name("loc:supplementaryPositionalDescription"))
+    _text(about, "loc:lengthAffected", f"{alert.length_m:.0f}")
+    _words(about, "loc:locationDescription", f"{alert.direction}; vehicles heading {' and '.join(alert.headings)}")
+    if line:
+        north, east = points[-1][0] - points[0][0], points[-1][1] - points[0][1]
+        along = {"north": north, "south": -north, "east": east, "west": -east}
+        points = points if along[alert.headings[0]] >= 0.0 else points[::-1]
+        drawn = ET.SubElement(place, _name("loc:gmlLineString"), {"srsName": "urn:ogc:def:crs:EPSG::4326"})
+        _text(drawn, "loc:posList", " ".join(f"{value:.{DIGITS}f}" for point in points for value in point))
+    else:
+        point = ET.SubElement(place, _name("loc:pointByCoordinates"))
+        if len(alert.headings) == 1:
+            _text(point, "loc:bearing", f"{_BEARINGS[alert.headings[0]]:.0f}")
+        _coordinates(point, "loc:pointCoordinates", *points[0])
+    return place
+
+
+def _versioned(record: ET.Element, old: ET.Element) -> ET.Element:
+    """A record as the next version of an old one; the old one where nothing but times has changed."""
+    for tag in ("sit:situationRecordCreationTime", "sit:validity/com:validityTimeSpecification/com:overallStartTime"):
+        _found(record, tag).text = _found(old, tag).text
+    times = ("sit:situationRecordVersionTime", "sit:situationRecordObservationTime")
+    compared = [copy.deepcopy(one) for one in (record, old)]
+    for one in compared:
+        one.set("version", "")
+        for tag in times:
+            _found(one, tag).text = ""
+    if _plain(compared[0]) == _plain(compared[1]):
+        return old
+    record.set("version", str(int(old.get("version", "0")) + 1))
+    return record
+
+
+def _ended(record: ET.Element, now: int) -> ET.Element | None:
+    """A record with its end; None where that was told long enough."""
+    period = _found(record, "sit:validity/com:validityTimeSpecification")
+    end = period.find("com:overallEndTime", _SPACES)
+    if end is not None:
+        at = datetime.fromisoformat(end.text or "").timestamp()
+        return record if now / NS - at < KEPT_S else None
+    _text(period, "com:overallEndTime", iso(now))
+    _found(record, "sit:validity/com:validityStatus").text = "definedByValidityTimeSpec"
+    _found(record, "sit:situationRecordVersionTime").text = iso(now)
+    record.set("version", str(int(record.get("version", "0")) + 1))
+    return record
+
+
+def _same_place(alert: StretchAlert, old: dict[str, ET.Element], told: set[str]) -> str | None:
+    """The situation that has a cell of a stretch, where a reader began anew and names it otherwise."""
+    cells = {f"{latitude:.{DIGITS}f} {longitude:.{DIGITS}f}" for latitude, longitude in alert.points}
+    for name, record in old.items():
+        if name not in told and record.find(".//com:overallEndTime", _SPACES) is None and cells & _cells(record):
+            return name
+    return None
+
+
+def _cells(record: ET.Element) -> set[str]:
+    words = (record.findtext(".//loc:posList", "", _SPACES)).split()
+    point = record.find(".//loc:pointCoordinates", _SPACES)
+    if point is not None:
+        words = [f"{float(child.text or 'nan'):.{DIGITS}f}" for child in point]
+    return {f"{latitude} {longitude}" for latitude, longitude in zip(words[::2], words[1::2], strict=True)}
+
+
+def _records(document: bytes) -> dict[str, ET.Element]:
+    """The records of a publication by id."""
+    problem = InputError("out", "holds something else than a publication of this command", "name another file")
+    try:
+        root = ET.fromstring(document)
+    except ET.ParseError as error:
+        raise problem from error
+    if root.tag != _name("d2:payload") or root.get(_name("xsi:type")) != "sit:SituationPublication":
+        raise problem
+    return {record.get("id", ""): record for record in root.iterfind(".//sit:situationRecord", _SPACES)}
+
+
+def _situation(supplier: Supplier, record: ET.Element) -> ET.Element:
+    situation = ET.Element(_name("sit:situation"), {"id": f"situation-{record.get('id')}"})
+    _text(situation, "sit:situationVersionTime", _found(record, "sit:situationRecordVersionTime").text or "")
+    header = ET.SubElement(situation, _name("sit:headerInformation"))
+    _text(header, "com:informationStatus", supplier.status)
+    situation.append(record)
+    return situation
+
+
+def _coordinates(parent: ET.Element, tag: str, latitude: float, longitude: float) -> None:
+    point = ET.SubElement(parent, _name(tag))
+    _text(point, "loc:latitude", f"{latitude:.{DIGITS}f}")
+    _text(point, "loc:longitude", f"{longitude:.{DIGITS}f}")
+
+
+def _words(parent: ET.Element, tag: str, text: str) -> None:
+    values = ET.SubElement(ET.SubElement(parent, _name(tag)), _name("com:values"))
+    ET.SubElement(values, _name("com:value"), {"lang": "en"}).text = text
+
+
+def _text(parent: ET.Element, tag: str, text: str) -> None:
+    ET.SubElement(parent, _name(tag)).text = text
+
+
+def _found(element: ET.Element, path: str) -> ET.Element:
+    found = element.find(path, _SPACES)
+    if found is None:
+        raise InputError("out", f"holds a record without {path}", "name another file")
+    return found
+
+
+def _plain(element: ET.Element) -> bytes:
+    ET.indent(element)
+    element.tail = None
+    return bytes(ET.tostring(element))
+
+
+def _name(tag: str) -> str:
+    prefix, _, local = tag.partition(":")
+    return f"{{{_SPACES[prefix]}}}{local}"
+
+
+for _prefix, _space in _SPACES.items():
+    ET.register_namespace(_prefix, _space)

@@ -1,0 +1,117 @@
+"""The DATEX II publication as a file that others fetch: written once, or kept up while alerts come and go."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import zenoh
+
+from fleet_service.client.datex import Supplier, publication, same_but_for_time
+from fleet_service.client.map_client import is_place_served, is_served, joined
+from fleet_service.client.stretches import Stretches
+from fleet_service.client.watching import GATHER_S, standing_alerts
+from schemas import grid, keys, query, wire
+from schemas.config import ZenohSettings
+from schemas.errors import InputError
+from schemas.runtime.durable import written
+
+REFRESH_S: Final = 60.0  # between two looks at all that stands, and at the most between two times of publication
+
+
+class DatexFeed:
+    """One publication, from the alerts that are heard.
+
+    Args:
+        supplier: who answers for it.
+        path: the file; what it holds is gone on with.
+        say: takes a line when it changes.
+
+    Raises:
+        InputError: the file holds something else.
+    """
+
+    def __init__(self, supplier: Supplier, path: Path, say: Callable[[str], None]) -> None:
+        self._supplier, self._path, self._say = supplier, path, say
+        self._stretches, self._lock = Stretches(), threading.Lock()
+        self._before = path.read_bytes() if path.exists() else None
+        self._written = 0.0
+        self._heard: dict[int, bool] = {}
+        self._is_heard: Callable[[float, float], bool] = lambda *_: False
+        if self._before is not None:
+            publication(supplier, [], 0, self._before)
+
+    def take(self, alert: wire.Alert) -> None:
+        """An alert was raised or cleared, or still stands."""
+        with self._lock:
+            self._stretches.take(alert)
+
+    def look(self, session: zenoh.Session) -> None:
+        """Ask for all that stands. What a service no longer speaks for has not ended."""
+        found = standing_alerts(session)
+        places, self._heard = {(alert.cell, alert.sector) for alert in found}, {}
+
+        def is_heard(latitude: float, longitude: float) -> bool:
+            tile = int(grid.tile_of(int(grid.cell_of(latitude, longitude))))
+            if tile not in self._heard:
+                self._heard[tile] = is_place_served(session, latitude, longitude)
+            return self._heard[tile]
+
+        self._is_heard = is_heard
+        with self._lock:
+            self._stretches.keep(
+                lambda alert: (alert.cell, alert.sector) in places or not is_heard(alert.latitude, alert.longitude)
+            )
+            for alert in found:
+                self._stretches.take(alert)
+
+    def write(self) -> None:
+        """Write the publication where it says something new, or has not been written for long.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        with self._lock:
+            self._stretches.changes()
+            standing = self._stretches.standing
+        new = publication(self._supplier, standing, time.time_ns(), self._before, self._is_heard)
+        changed = self._before is None or not same_but_for_time(new, self._before)
+        if not changed and time.monotonic() < self._written + REFRESH_S:
+            return
+        try:
+            with written(self._path) as file:
+                file.write(new)
+        except OSError as error:
+            raise InputError(
+                "out", f"cannot write {self._path} ({error.strerror})", "name a file you may write"
+            ) from error
+        self._before, self._written = new, time.monotonic()
+        if changed:
+            self._say(f"{len(standing)} slippery stretches in {self._path}")
+
+
+def publish(connection: ZenohSettings, feed: DatexFeed, stop: threading.Event | None) -> None:
+    """Write the publication once, or, given `stop`, keep it up until that is set.
+
+    Raises:
+        InputError: no router, or no service answers at the start: an absent service is no dry road.
+    """
+    with joined(connection) as session:
+        session.declare_subscriber(f"{keys.ROOT}/alert/**", lambda sample: _take(feed, sample))
+        if not is_served(session, query.parse({})):
+            raise InputError("connect", "no service answers for the map", "start one; its silence ends no situation")
+        feed.look(session)
+        feed.write()
+        looked = time.monotonic()
+        while stop is not None and not stop.wait(GATHER_S):
+            if time.monotonic() > looked + REFRESH_S:
+                feed.look(session)
+                looked = time.monotonic()
+            feed.write()
+
+
+def _take(feed: DatexFeed, sample: zenoh.Sample) -> None:
+    feed.take(wire.decode_alert(sample.payload.to_bytes()))
