@@ -62,7 +62,7 @@ PURE = (
     "edge_agent/adaptation",
     "edge_agent/estimators",
     "edge_agent/observe",
-    *(f"edge_agent/ahead/{name}.py" for name in ("path", "known", "horizon", "roads", "warnings", "asking")),
+    *(f"edge_agent/ahead/{name}.py" for name in ("path", "known", "horizon", "roads", "warnings", "asking", "prior")),
     "edge_agent/inputs/block.py",
     "fleet_service/fusion",
     "fleet_service/ingest/dedup.py",

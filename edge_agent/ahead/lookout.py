@@ -18,9 +18,11 @@ import zenoh
 from edge_agent.ahead.ears import Ears
 from edge_agent.ahead.horizon import Horizon, horizon_length, look_ahead
 from edge_agent.ahead.path import GivenRoute, Path, Pose, corridor
+from edge_agent.ahead.prior import MapPrior
 from edge_agent.ahead.roads import ways_on
 from edge_agent.ahead.warnings import Active, warn
-from schemas import grid
+from schemas import grid, mugrid
+from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import NS
 from schemas.wire.ahead import GripWarning, Outlook, Runs, encode_ahead
 
@@ -86,6 +88,8 @@ class Lookout:
         self._watchers = {k: _Watcher(name) for k, name in enumerate(names) if listening(k)}
         self._number = {watcher.name: k for k, watcher in self._watchers.items()}
         self._poses: Sequence[Pose] = ()
+        self._prior = MapPrior(len(names))
+        self._here = np.full((len(names), 3), np.nan)
         self._wake, self._stop = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="lookout", daemon=True)
         self.counts = LookoutCounts()
@@ -104,6 +108,28 @@ class Lookout:
     def see(self, poses: Sequence[Pose]) -> None:
         """Where the vehicles are now; row k is vehicle k."""
         self._poses = poses
+
+    def believe(self, places: IntArray, beliefs: tuple[FloatArray, FloatArray] | None) -> None:
+        """What the vehicles' filters believe at the places that they are in, for what they believe with the map.
+
+        Args:
+            places: (N,) cell * 4 + sector, -1 where unknown.
+            beliefs: as of `EstimatorBank.beliefs`.
+        """
+        if beliefs is None:
+            return
+        told: dict[int, FloatArray | None] = {}
+        for k in self._prior.enters(places):
+            ears = self._watchers[k].ears if k in self._watchers else None
+            if ears is None or places[k] < 0:
+                told[k] = None
+            elif ears.looking().acquire(blocking=False):  # the loop does not wait: it asks again at the next block
+                try:
+                    told[k] = ears.known.belief(int(places[k]), time.time_ns())
+                finally:
+                    ears.looking().release()
+        informed = self._prior.step(places, *beliefs, told)
+        self._here = np.column_stack([mugrid.quantiles(informed, q) for q in (0.5, 0.05, 0.95)])
 
     def outlook(self, name: str) -> Outlook | None:
         """What a vehicle saw last."""
@@ -173,8 +199,9 @@ class Lookout:
             self._hear(watcher.name, warning)
         ended = tuple(warning for warning in told if warning.state == "ended")
         watcher.outlook = Outlook(
-            watcher.name, pose.time, paths[0].kind, (*(one.told for one in watcher.active), *ended), runs(horizons[0])
-        )
+            watcher.name, pose.time, paths[0].kind, (*(one.told for one in watcher.active), *ended), runs(horizons[0]),
+            tuple(self._here[k].tolist()),
+        )  # fmt: skip
         ears.follow(paths, pose)
         outlook = watcher.outlook
         ears.tell(lambda: encode_ahead(outlook))

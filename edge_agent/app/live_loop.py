@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from edge_agent.inputs.block import Block
 from edge_agent.observe.observation_builder import RecordBlock
-from edge_agent.observe.pipeline import Pipeline, Seen
+from edge_agent.observe.pipeline import Pipeline
 from edge_agent.publish.publisher import Publisher
 from schemas.runtime import watchdog
 from schemas.wire import Kind
@@ -49,20 +49,19 @@ def drive(
     clock: Callable[[], float] = time.monotonic,
     progress: Progress | None = None,
     admitted: Callable[[], bool] = lambda: True,
-    seen: Callable[[Seen], None] = lambda _: None,
+    after: Callable[[], None] = lambda: None,
 ) -> Progress:
     """Run until the blocks end, `duration_s` has passed or `stop` is set; then close the open visits.
 
     `progress` is kept up to date while it runs, for others to look at, and returned. Records of blocks that are not
-    `admitted` are held back, and counted. `seen` is told after each block where the vehicles are.
+    `admitted` are held back, and counted. `after` is called after each block.
     """
     progress, status_at = progress or Progress(), STATUS_EVERY_S
     started = first = float("nan")
     for block in blocks:
         _, observations, states = pipeline.step(block)
         _offer(publisher, progress, admitted(), observations, states)
-        if pipeline.seen is not None:
-            seen(pipeline.seen)
+        after()
         if not progress.blocks:
             started, first = clock(), float(block.t.min())  # the first block may have had to load kernels
         length = float(block.t.max()) - first - progress.signals_s

@@ -5,6 +5,10 @@ from __future__ import annotations
 import argparse
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from schemas.wire.ahead import GripWarning
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -12,6 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--vehicles", type=int, default=36, help="how many (default 36)")
     parser.add_argument("--scenario", default="demo", help="demo (default), hills, test; hills-7: drawn by seed 7")
     parser.add_argument("--rough", type=float, default=0.0, help="share of them as real cars are (default 0)")
+    parser.add_argument("--warned", type=float, default=0.0, help="share of them that hear the map and are warned")
     parser.add_argument("--estimator", help="estimator by name (default: the configuration's)")
     parser.add_argument("--config", type=Path, help="agent configuration (JSON)")
     parser.add_argument("--truth", type=Path, help="what they truly drove over, one row per cell visit (Parquet)")
@@ -22,10 +27,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Drive until the duration has passed or a signal comes; write the truth before leaving."""
+    from edge_agent.ahead.lookout import Lookout
     from edge_agent.app.estimates_file import writable
-    from edge_agent.cli.live import drive_live
+    from edge_agent.cli.live import drive_live, warning_lines
     from edge_agent.lab.simulation import SimulatedFleet
     from edge_agent.lab.simulation.blocks import blocks
+    from edge_agent.lab.simulation.listeners import WarnedDrivers
     from edge_agent.lab.truth_file import TruthRecorder
     from schemas.config import AgentConfig, load
 
@@ -34,4 +41,16 @@ def run(args: argparse.Namespace) -> int:
     recorder = TruthRecorder(tuple(fleet.names)) if args.truth and writable("truth", args.truth) else None
     source = blocks(fleet, args.rate, recorder)
     at_end = partial(recorder.write, args.truth) if recorder is not None else lambda: None
-    return drive_live(fleet.vehicles, fleet.names, source, config, args.estimator, args.duration, at_end)
+    drivers, lookout = WarnedDrivers(fleet, args.warned), None
+    if drivers.warned.any():
+        said = warning_lines(config)
+
+        def tell(name: str, warning: GripWarning) -> None:
+            said(name, warning)
+            drivers.hear(name, warning)
+
+        lookout = Lookout(fleet.names, tell, drivers.route_of, drivers.listens)
+        source = drivers.heeding(source)
+    return drive_live(
+        fleet.vehicles, fleet.names, source, config, args.estimator, args.duration, at_end, lookout=lookout
+    )

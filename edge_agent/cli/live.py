@@ -16,7 +16,7 @@ from edge_agent.app.live_loop import ENDED_DRAIN_S, STOPPED_DRAIN_S, Progress, d
 from edge_agent.app.metrics import metrics, troubles
 from edge_agent.cli.common import leave, publisher_of, status, stop_on_signal
 from edge_agent.inputs.block import Block
-from edge_agent.observe.pipeline import Pipeline, Seen
+from edge_agent.observe.pipeline import Pipeline
 from edge_agent.publish.publisher import Publisher
 from schemas.config import AgentConfig
 from schemas.runtime.metrics import serving
@@ -74,7 +74,7 @@ def drive_live(
             lookout.start()
         drive(
             blocks, pipeline, publisher, stop, report, duration_s=duration_s, progress=progress, admitted=admitted,
-            seen=(lambda seen: lookout.see(_poses(seen))) if lookout is not None else lambda _: None,
+            after=partial(_show, lookout, pipeline) if lookout is not None else lambda: None,
         )  # fmt: skip
         heard: dict[str, float] = {}
         if lookout is not None:
@@ -85,8 +85,11 @@ def drive_live(
     return 0
 
 
-def _poses(seen: Seen) -> list[Pose]:
-    return [Pose(*row) for row in zip(*(column.tolist() for column in seen), strict=True)]
+def _show(lookout: Lookout, pipeline: Pipeline) -> None:
+    """Tell a lookout where the vehicles are and what their filters believe."""
+    if pipeline.seen is not None:
+        lookout.see([Pose(*row) for row in zip(*(column.tolist() for column in pipeline.seen), strict=True)])
+        lookout.believe(pipeline.places, pipeline.beliefs())
 
 
 def warning_lines(config: AgentConfig) -> Callable[[str, GripWarning], None]:

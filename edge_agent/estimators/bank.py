@@ -41,7 +41,9 @@ class EstimatorBank:
         *,
         columns: int = ONE_FRICTION,
         evidence: bool = False,
+        beliefs: Kernel | None = None,
     ) -> None:
+        self._beliefs = beliefs
         self._filters, self._contexts, self._kernel, self._columns = filters, context, kernel, columns
         self._entered, count = kernel, len(filters)
         self._nowhere = ((np.zeros((0, count), np.bool_), np.zeros((0, count, BINS))),) if evidence else ()
@@ -80,3 +82,14 @@ class EstimatorBank:
         whole = (self._filters, self._contexts, t, signals, values, *visits)
         in_shares(lambda share, first, last: self._kernel(*whole, (share, first, last)), count, threads)
         return Estimates(values, evidence)
+
+    def beliefs(self) -> tuple[FloatArray, FloatArray] | None:
+        """What is believed now: log(posterior/uniform), and the evidence in the visit so far; (N, 32) each, maximum 0.
+
+        None where the estimator has no such belief.
+        """
+        if self._beliefs is None:
+            return None
+        own, visit = np.zeros((2, len(self._filters), BINS))
+        self._beliefs(self._filters, self._contexts, own, visit)
+        return own, visit

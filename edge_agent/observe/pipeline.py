@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from edge_agent.inputs.block import Block
-from edge_agent.observe.cell_tracker import locate, new_tracks
+from edge_agent.observe.cell_tracker import NOWHERE, locate, new_tracks
 from edge_agent.observe.observation_builder import OpenVisits, RecordBlock, observe
 from edge_agent.observe.trip_privacy import TripEnds
+from schemas.grid import SECTORS
 from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import NS
 
@@ -42,6 +43,7 @@ class Pipeline:
         self._ends = TripEnds(vehicles, config.trip_end_m, config.trip_end_s)
         self._last: Block | None = None
         self.seen: Seen | None = None
+        self.places: IntArray = np.full(vehicles, NOWHERE)  # cell * 4 + sector at the block's end
 
     def step(self, block: Block) -> tuple[Estimates, RecordBlock, RecordBlock]:
         """Estimates, observations and states of a block of at least one sample, the latter two without trip ends."""
@@ -52,8 +54,14 @@ class Pipeline:
         )
         self._last = block
         self.seen = Seen(located.latitude[-1], located.longitude[-1], located.yaw[-1], estimates.vx[-1], block.time[-1])
+        cell, sector = located.cell[-1], located.sector[-1]
+        self.places = np.where(cell == NOWHERE, NOWHERE, cell * SECTORS + sector)
         self._ends.drive(block.time, estimates.vx)
         return estimates, self._ends.cut(observations), self._ends.cut(states)
+
+    def beliefs(self) -> tuple[FloatArray, FloatArray] | None:
+        """What the estimators believe now, and the evidence of the visits so far; see `EstimatorBank.beliefs`."""
+        return self._bank.beliefs()
 
     def finish(self) -> RecordBlock | None:
         """Close the open visits and return their observations; None when there was no sample.

@@ -238,11 +238,14 @@ class Warning(_message.Message):
     def __init__(self, id: _Optional[str] = ..., state: _Optional[str] = ..., time: _Optional[int] = ..., distance_m: _Optional[float] = ..., length_m: _Optional[float] = ..., time_s: _Optional[float] = ..., mu: _Optional[float] = ..., mu_lower: _Optional[float] = ..., p_slippery: _Optional[float] = ..., age_s: _Optional[float] = ..., safe_speed: _Optional[float] = ..., way: _Optional[str] = ..., sure: _Optional[bool] = ..., reason: _Optional[str] = ...) -> None: ...
 
 class Ahead(_message.Message):
-    __slots__ = ("vehicle", "time", "way", "warnings", "start_m", "end_m", "cell", "sector", "mu", "mu_lower", "mu_upper", "p_slippery", "age_s", "basis", "safe_speed")
+    __slots__ = ("vehicle", "time", "way", "warnings", "here_mu", "here_mu_lower", "here_mu_upper", "start_m", "end_m", "cell", "sector", "mu", "mu_lower", "mu_upper", "p_slippery", "age_s", "basis", "safe_speed")
     VEHICLE_FIELD_NUMBER: _ClassVar[int]
     TIME_FIELD_NUMBER: _ClassVar[int]
     WAY_FIELD_NUMBER: _ClassVar[int]
     WARNINGS_FIELD_NUMBER: _ClassVar[int]
+    HERE_MU_FIELD_NUMBER: _ClassVar[int]
+    HERE_MU_LOWER_FIELD_NUMBER: _ClassVar[int]
+    HERE_MU_UPPER_FIELD_NUMBER: _ClassVar[int]
     START_M_FIELD_NUMBER: _ClassVar[int]
     END_M_FIELD_NUMBER: _ClassVar[int]
     CELL_FIELD_NUMBER: _ClassVar[int]
@@ -258,6 +261,9 @@ class Ahead(_message.Message):
     time: int
     way: str
     warnings: _containers.RepeatedCompositeFieldContainer[Warning]
+    here_mu: float
+    here_mu_lower: float
+    here_mu_upper: float
     start_m: _containers.RepeatedScalarFieldContainer[float]
     end_m: _containers.RepeatedScalarFieldContainer[float]
     cell: _containers.RepeatedScalarFieldContainer[int]
@@ -269,7 +275,7 @@ class Ahead(_message.Message):
     age_s: _containers.RepeatedScalarFieldContainer[float]
     basis: _containers.RepeatedScalarFieldContainer[Basis]
     safe_speed: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, vehicle: _Optional[str] = ..., time: _Optional[int] = ..., way: _Optional[str] = ..., warnings: _Optional[_Iterable[_Union[Warning, _Mapping]]] = ..., start_m: _Optional[_Iterable[float]] = ..., end_m: _Optional[_Iterable[float]] = ..., cell: _Optional[_Iterable[int]] = ..., sector: _Optional[_Iterable[int]] = ..., mu: _Optional[_Iterable[float]] = ..., mu_lower: _Optional[_Iterable[float]] = ..., mu_upper: _Optional[_Iterable[float]] = ..., p_slippery: _Optional[_Iterable[float]] = ..., age_s: _Optional[_Iterable[float]] = ..., basis: _Optional[_Iterable[_Union[Basis, str]]] = ..., safe_speed: _Optional[_Iterable[float]] = ...) -> None: ...
+    def __init__(self, vehicle: _Optional[str] = ..., time: _Optional[int] = ..., way: _Optional[str] = ..., warnings: _Optional[_Iterable[_Union[Warning, _Mapping]]] = ..., here_mu: _Optional[float] = ..., here_mu_lower: _Optional[float] = ..., here_mu_upper: _Optional[float] = ..., start_m: _Optional[_Iterable[float]] = ..., end_m: _Optional[_Iterable[float]] = ..., cell: _Optional[_Iterable[int]] = ..., sector: _Optional[_Iterable[int]] = ..., mu: _Optional[_Iterable[float]] = ..., mu_lower: _Optional[_Iterable[float]] = ..., mu_upper: _Optional[_Iterable[float]] = ..., p_slippery: _Optional[_Iterable[float]] = ..., age_s: _Optional[_Iterable[float]] = ..., basis: _Optional[_Iterable[_Union[Basis, str]]] = ..., safe_speed: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Weather(_message.Message):
     __slots__ = ("time", "air_temperature", "road_temperature", "precipitation", "prior")

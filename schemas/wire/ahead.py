@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Final, Literal, NamedTuple
 
@@ -12,6 +13,7 @@ from schemas.numeric import FloatArray, IntArray
 from schemas.proto import gripmap_pb2 as pb
 from schemas.wire.codec import encoding_of, parse
 
+_HERE: Final = ("here_mu", "here_mu_lower", "here_mu_upper")
 AHEAD_ENCODING: Final = encoding_of(pb.Ahead)
 Way = Literal["route", "road", "corridor"]
 WarningState = Literal["raised", "updated", "ended"]
@@ -64,19 +66,24 @@ class Runs(NamedTuple):
 
 
 class Outlook(NamedTuple):
-    """What lies ahead of one vehicle: the warnings that stand, and the horizon on the likeliest way on."""
+    """What lies ahead of one vehicle: the warnings that stand, and the horizon on the likeliest way on.
+
+    `here` is the friction where it is, by its own measurements and the map: median, 5 and 95 %; NaN where none is told.
+    """
 
     vehicle: str
     time: int
     way: Way
     warnings: tuple[GripWarning, ...]
     runs: Runs
+    here: tuple[float, float, float] = (math.nan, math.nan, math.nan)
 
 
 def encode_ahead(outlook: Outlook) -> bytes:
     """Protobuf bytes of what lies ahead."""
     columns: dict[str, Any] = {name: column.tolist() for name, column in outlook.runs._asdict().items()}
-    message = pb.Ahead(vehicle=outlook.vehicle, time=outlook.time, way=outlook.way, **columns)
+    here: dict[str, Any] = dict(zip(_HERE, outlook.here, strict=True))
+    message = pb.Ahead(vehicle=outlook.vehicle, time=outlook.time, way=outlook.way, **here, **columns)
     message.warnings.extend(pb.Warning(**vars(warning)) for warning in outlook.warnings)
     return message.SerializeToString()
 
@@ -98,4 +105,5 @@ def decode_ahead(payload: bytes) -> Outlook:
         GripWarning(**{name: getattr(one, name) for name in GripWarning.__dataclass_fields__})
         for one in message.warnings
     )
-    return Outlook(message.vehicle, message.time, message.way, warnings, runs)
+    here = (message.here_mu, message.here_mu_lower, message.here_mu_upper)
+    return Outlook(message.vehicle, message.time, message.way, warnings, runs, here)

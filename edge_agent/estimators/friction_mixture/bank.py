@@ -13,6 +13,7 @@ from edge_agent.estimators.friction_mixture.grip_guard import told_upper
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles, new_filters
 from edge_agent.estimators.friction_mixture.split_sides import BOTH, project
 from edge_agent.estimators.friction_mixture.step import step, velocity
+from edge_agent.estimators.friction_mixture.told import tell_beliefs
 from edge_agent.estimators.friction_mixture.workspace import MixtureContext, Scratch
 from schemas.mugrid import CENTRES
 from schemas.numeric import BoolArray, FloatArray
@@ -35,6 +36,7 @@ def mixture_bank(rows: FloatArray, design: MixtureDesign, spreads: FloatArray | 
         _advance,
         columns=FOUR_FRICTIONS,
         evidence=True,
+        beliefs=tell_beliefs,
     )
 
 

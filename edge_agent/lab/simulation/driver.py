@@ -43,6 +43,11 @@ class Driver(IntEnum):
     SHORT = 7  # [m] left to the next point of the lane
     STOPS = 8  # share of the ALERT_S in which he comes to a stop and waits; 0: nobody stops
     CROSS_SLOPE = 9  # rise of the road to his left [1], as it has turned over so far from one bend into the next
+    WARNED_IN = 10  # [s] until he acts on the warning that he was given
+    WARNED_START = 11  # [m] to the slippery stretch that he was warned of,
+    WARNED_END = 12  # [m] and to its end; 0 or less: he knows of none
+    WARNED_SPEED = 13  # [m/s] that he wants to have on it
+    WARNED_MU = 14  # grip that he expects there
 
 
 class Route(IntEnum):
@@ -62,6 +67,7 @@ BETTER_S: Final = 2.5
 ALARM_S: Final = 0.7  # e-folding of his belief while wheels slide
 SLIDING: Final = 3.5  # normalised slip that he feels as sliding: well past the peak
 LEAST_BELIEF: Final = 0.12
+WARNED_BRAKES: Final = 2.0  # [m/s^2] with which he slows down for a stretch that he was warned of
 SLOWEST: Final = 3.0  # [m/s] he creeps on, unless he stops
 LARGEST_STEER: Final = 0.55  # [rad]
 LARGEST_SLIP_ANGLE: Final = 0.09  # [rad] of the front wheels; more steering than that only scrubs
@@ -156,6 +162,21 @@ def believe(d: FloatArray, looks: float, w: FloatArray, dt: float) -> None:
 
 
 @compiled
+def heed(d: FloatArray, vx: float, dt: float) -> None:
+    """The stretch that he was warned of comes nearer, and is passed."""
+    if d[Driver.WARNED_END] > 0.0:
+        d[Driver.WARNED_IN] -= dt
+        d[Driver.WARNED_START] -= vx * dt
+        d[Driver.WARNED_END] -= vx * dt
+
+
+@compiled
+def heeds(d: FloatArray) -> bool:
+    """Whether he acts on a warning now."""
+    return bool(d[Driver.WARNED_END] > 0.0 and d[Driver.WARNED_IN] <= 0.0)
+
+
+@compiled
 def alerted(t: float, key: Key) -> float:
     """How hard somebody ahead makes him brake now, as a share of his budget; 0 for most of the time."""
     window = int(t / ALERT_S)
@@ -187,6 +208,8 @@ def wished_acceleration(
     if stays and row < last:
         there += (lanes[0][row + 1, LanePoint.PROFILE + g[Route.WAY]] - there) * beyond / lanes[3][lane]
     aim = min(q * there, cruise(d) ** 2)
+    if heeds(d):
+        aim = min(aim, d[Driver.WARNED_SPEED] ** 2 + 2.0 * WARNED_BRAKES * max(d[Driver.WARNED_START] - reach, 0.0))
     wish = (max(aim, SLOWEST**2) - vx * vx) / (2.0 * reach)
     across = min(abs(vx * x[Motion.YAW_RATE]) / q, 1.0)
     room = math.sqrt(1.0 - across * across)  # what cornering leaves of the budget
@@ -248,7 +271,11 @@ def drive(
     d[Driver.SHORT] = follow(x, g, lanes, keys[0])
     number, _ = ahead(d, g, lanes, max(LOOKING_S * x[Motion.VX], 0.0))
     point = lanes[0][number]
-    believe(d, look_up(friction, PatchColumn.LOOKS, t, point[LanePoint.X], point[LanePoint.Y]), w, dt)
+    looks = look_up(friction, PatchColumn.LOOKS, t, point[LanePoint.X], point[LanePoint.Y])
+    heed(d, x[Motion.VX], dt)
+    if heeds(d) and d[Driver.WARNED_START] <= LOOKING_S * x[Motion.VX]:
+        looks = min(looks, d[Driver.WARNED_MU])
+    believe(d, looks, w, dt)
     acceleration = wished_acceleration(x, d, g, lanes, p, t, keys[1])
     force = wished_force(p, d, x[Motion.VX], acceleration, along)
     if x[Motion.VX] < RESTING and stops(t, d[Driver.STOPS], keys[1]):

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from edge_agent.lab.simulation.counter_rng import checked_seed, key_of
-from edge_agent.lab.simulation.driver import ALERT_STREAM, ROUTE_STREAM, Driver, KeyArray, Lanes, Route, drive
+from edge_agent.lab.simulation.counter_rng import checked_seed, key_of, uniform
+from edge_agent.lab.simulation.driver import ALERT_STREAM, ROUTE_STREAM, Driver, KeyArray, Lanes, Route, drive, ways_of
 from edge_agent.lab.simulation.friction import PatchColumn, look_up
 from edge_agent.lab.simulation.misaligned import memory_of
 from edge_agent.lab.simulation.plant import (
@@ -47,6 +47,7 @@ from schemas.runtime.jit import compiled
 TURN_OVER_M = 6.0  # in which a road turns over from one crossfall to another
 VEHICLE_STREAM = 0
 STOPS = 0.3  # share of the 7 s in which a driver of a rough vehicle stops: two or three times a minute
+TOLD_S = 1.5  # from a warning to the foot on the brake (Green, Transportation Human Factors 2, 2000: 1.2 to 1.5 s)
 GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0  # multiples of it, modulo 1, are spread evenly however many there are
 
 
@@ -180,6 +181,28 @@ class SimulatedFleet:
         self._next += steps
         self.truth = _truth(records)
         return t, signals
+
+    def route_ahead(self, k: int, length: float) -> tuple[FloatArray, FloatArray]:
+        """Where vehicle k will drive, (latitude, longitude) [deg] of points a metre apart, `length` [m] or more."""
+        network, key = self.scenario.network, self._keys[0][k]
+        lane, point, way, turns = (int(value) for value in self._states[2][k])
+        parts, run = [], 0.0
+        while run < length:
+            part = network.lane(lane)[point:, [LanePoint.X, LanePoint.Y]]
+            parts.append(part)
+            run += len(part) * float(network.spacing[lane])
+            lane, point, turns = int(network.ways[lane, way]), 0, turns + 1
+            way = int(uniform(key, turns) * ways_of(network.ways, lane))
+        line = np.concatenate(parts)
+        return self.scenario.to_latlon(line[:, 0], line[:, 1])
+
+    def warn(self, k: int, stretch: tuple[float, float], speed: float, mu: float) -> None:
+        """Tell the driver of vehicle k of a slippery stretch, from and to so far ahead [m]; (0, 0): there is none."""
+        d = self._states[1][k]
+        if d[Driver.WARNED_END] <= 0.0:
+            d[Driver.WARNED_IN] = TOLD_S
+        d[Driver.WARNED_START], d[Driver.WARNED_END] = stretch
+        d[Driver.WARNED_SPEED], d[Driver.WARNED_MU] = speed, mu
 
 
 def rough_ones(vehicles: int, share: float) -> BoolArray:

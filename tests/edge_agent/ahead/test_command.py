@@ -61,3 +61,17 @@ def test_a_car_that_listens_prints_its_warnings_and_heeds_its_route(
 def test_a_route_without_listening_is_a_mistake(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*WORDS, "--route", str(tmp_path / "way.gpx")]) == 2
     assert "route: is of no use without --ahead" in capsys.readouterr().err
+
+
+def test_of_a_fleet_the_share_that_is_warned_hears_and_the_others_do_not(
+    router: Router, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now = time.time_ns()
+    words = ["fleet", "--scenario", "test", "--estimator", "ckf", "--vehicles", "4", "--duration", "6"]
+    with Town(router.settings, now, standing=everywhere_slippery(now)):
+        assert main([*words, *settings(tmp_path, router), "--warned", "0.5"]) == 0
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    warned = {one["vehicle"] for one in lines if one.get("event") == "warning"}
+    assert warned == {"sim-002", "sim-004"}
+    assert {one["way"] for one in lines if one.get("event") == "warning"} == {"route"}
+    assert main([*words, "--warned", "2"]) == 2

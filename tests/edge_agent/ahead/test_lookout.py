@@ -181,6 +181,18 @@ def test_a_map_of_yesterday_says_how_old_it_is(router: Router) -> None:
             assert np.nanmin(seen.runs.age_s) == pytest.approx(86_400.0, rel=0.01)
 
 
+def test_where_it_is_the_car_believes_its_filter_and_the_map(router: Router, town: Town) -> None:
+    town.mu = {int(key): 0.2 for key in keys_on()}
+    here, flat = np.array([keys_on()[0]]), (np.zeros((1, 32)), np.zeros((1, 32)))
+    with driving(router) as car:
+        car.lookout.believe(np.array([-1]), flat)
+        car.until(lambda seen: (seen.runs.basis == known.MEASURED).sum() > 10)
+        assert car.lookout.outlook(CAR).here[0] == pytest.approx(0.625, abs=0.02)  # type: ignore[union-attr]
+        car.lookout.believe(here, flat)
+        seen = car.until(lambda seen: seen.here[0] < 0.3)
+        assert seen.here[2] > 0.7, "a map may be wrong"
+
+
 def test_a_hostile_tile_is_refused_counted_and_changes_nothing(router: Router, town: Town) -> None:
     town.mu = {int(key): 0.15 for key in ICE}
     with driving(router) as car:

@@ -132,3 +132,33 @@ def test_bad_arguments_are_refused_by_name(field: str, arguments: tuple[str, int
 def test_a_block_needs_at_least_one_sample() -> None:
     with pytest.raises(InputError, match="^steps: "):
         SimulatedFleet(SCENARIOS["test"], 1, 0, 100.0).step(0)
+
+
+def test_a_driver_who_is_warned_slows_down_for_the_stretch_and_drives_on_after_it() -> None:
+    """The same driver, warned and not, from the same start."""
+    speeds = []
+    for warned in (False, True):
+        fleet = SimulatedFleet("demo", 1, 3, 50.0)
+        fleet.step(500)
+        before = fleet.truth.vx[-1, 0]
+        if warned:
+            fleet.warn(0, (40.0, 80.0), 4.0, 0.15)
+        fleet.step(1000)
+        speeds.append(fleet.truth.vx[:, 0])
+    free, careful = speeds
+    assert before > 6.0
+    assert careful.min() < 5.0
+    assert careful.min() < free.min() - 1.0
+    assert careful[500:].max() > 6.0, "the stretch is passed"
+    assert np.array_equal(free[:75], careful[:75]), "nobody reacts before his reaction time"
+
+
+def test_where_a_driver_will_go_is_where_he_goes() -> None:
+    fleet = SimulatedFleet("demo", 3, 3, 50.0)
+    fleet.step(100)
+    routes = [fleet.scenario.from_latlon(*fleet.route_ahead(k, 200.0)) for k in range(3)]
+    fleet.step(500)
+    for k, (x, y) in enumerate(routes):
+        off = np.hypot(fleet.truth.x[:, k, None] - x, fleet.truth.y[:, k, None] - y).min(axis=1)
+        driven = np.hypot(*np.diff([fleet.truth.x[:, k], fleet.truth.y[:, k]])).cumsum()
+        assert off[1:][driven < 150.0].max() < 3.0

@@ -1,0 +1,248 @@
+"""A town that listens, without a network: simulated cars, the fusion and its alerts, cars that hear the map and react.
+
+    python -m deploy.listening --out DIR [--seeds 20] [--vehicles 36] [--duration 150] [--scenario hills] [--quick]
+
+Every second what the cars observed is fused, as a service would; alerts and, now and then, tiles go to the cars that
+listen, by the bytes that would travel. Each seed is driven twice from the same start, once with all cars listening and
+once with none. DIR/figures.json gets what became of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from edge_agent.ahead.hearing import heard_alert, heard_cells
+from edge_agent.ahead.horizon import horizon_length, look_ahead
+from edge_agent.ahead.known import HeardMap
+from edge_agent.ahead.path import Pose
+from edge_agent.ahead.prior import MapPrior
+from edge_agent.ahead.warnings import Active, warn
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.inputs.block import Block, absolute
+from edge_agent.lab.seeds import FIGURES
+from edge_agent.lab.simulation import SimulatedFleet
+from edge_agent.lab.simulation.listeners import WarnedDrivers
+from edge_agent.observe.pipeline import Pipeline
+from fleet_service.fusion import Fusion
+from fleet_service.lab.end_to_end import observations_in
+from fleet_service.serve.alerts import Alerts
+from fleet_service.serve.encode import arrow_stream, batch_of
+from fleet_service.serve.view import view
+from schemas import grid, keys, mugrid, wire
+from schemas.config import AgentConfig
+from schemas.numeric import FloatArray, IntArray
+from schemas.runtime import figures
+from schemas.runtime.figures import Figure
+from schemas.thresholds import NS, SLIPPERY_MU
+
+RATE_HZ: Final = 100.0
+BLOCK: Final = 50  # samples: half a second
+START_NS: Final = 1_800_000_000 * NS
+LATENESS_S: Final = 120.0
+ASKED_S: Final = 30.0  # between two looks at the tiles
+LOST: Final = 0.98  # of the grip: a wheel was at its peak or past it
+
+
+@dataclass
+class Drive:
+    """What became of one drive; rows are visits of a vehicle to a cell, by the simulator's truth."""
+
+    slid: set[tuple[int, int]] = field(default_factory=set)  # (vehicle, lap) that lost grip on the new ice
+    passed: set[tuple[int, int]] = field(default_factory=set)  # ... and that were there
+    alert_passes: float = float("nan")  # over the new ice until its first alert
+    inside: list[bool] = field(default_factory=list)  # whether the truth lies in the map's interval, by cell
+    visits: int = 0  # that were fused
+    warned: int = 0
+    told_error: list[tuple[float, float]] = field(default_factory=list)  # |error| in a known cell: with, without
+
+
+class ListeningTown:
+    """One drive, second by second."""
+
+    def __init__(self, scenario: str, vehicles: int, seed: int, *, listening: bool, rough: float = 0.5) -> None:
+        self.fleet = SimulatedFleet(scenario, vehicles, seed, RATE_HZ, rough=rough)
+        config = AgentConfig()
+        self.bank = bank_of(config.estimator, self.fleet.vehicles)
+        self.pipeline = Pipeline(self.bank, vehicles, config)
+        self.fusion = Fusion(LATENESS_S)
+        self.alerts = Alerts(self.fusion)
+        self.drivers = WarnedDrivers(self.fleet, 1.0 if listening else 0.0)
+        self.heard, self.prior = HeardMap(), MapPrior(vehicles)
+        self.active: list[tuple[Active, ...]] = [()] * vehicles
+        self.drive = Drive()
+        self.ice = self.fleet.scenario.events[0]
+        self._listening, self._asked = listening, -ASKED_S
+        self._lap = np.zeros(vehicles, np.int64)
+        self._on = np.zeros(vehicles, np.bool_)
+        self._true: dict[int, float] = {}  # friction of the places, as it was driven over last
+
+    def run(self, duration_s: float) -> Drive:
+        """Drive, and judge the map at the end."""
+        for second in range(int(duration_s)):
+            parts = [self._block() for _ in range(round(RATE_HZ / BLOCK))]
+            self._fuse([part for part in parts if len(part["cell"])])
+            if self._listening:
+                self._hear(second)
+                self._look()
+        self.drive.inside = self._covered()
+        self.drive.visits = self.fusion.live.visits[: self.fusion.size].sum()
+        return self.drive
+
+    def _covered(self) -> list[bool]:
+        """Whether the map's interval holds the last truth, for each place that several vehicles visited."""
+        place = np.array(list(self._true), np.int64)
+        slots = self.fusion.slots_of(place // grid.SECTORS, place % grid.SECTORS)
+        several = slots >= 0
+        several[several] = self.fusion.live.vehicles[slots[several]] >= 2
+        belief = self.fusion.beliefs(slots[several], self._now())
+        truth = np.array(list(self._true.values()))[several]
+        lower, upper = (mugrid.quantiles(belief, q) for q in (0.05, 0.95))
+        return [bool(inside) for inside in (lower <= truth) & (truth <= upper)]
+
+    def _block(self) -> dict[str, Any]:
+        t, signals = self.fleet.step(BLOCK)
+        samples = Block(t, absolute(t, START_NS), signals)
+        _, seen, _ = self.pipeline.step(samples)
+        self._truth(float(t[-1, 0]))
+        if self._listening:
+            self._believe()
+        return seen.columns | {"vehicle": seen.vehicle}
+
+    def _truth(self, now: float) -> None:
+        """Who is on the new ice, and who slides there."""
+        true, patch = self.fleet.truth, self.ice
+        cells = grid.cell_of(*self.fleet.scenario.to_latlon(true.x[-1], true.y[-1]))
+        places = cells * grid.SECTORS + grid.sector_of(true.yaw[-1])
+        self._true |= dict(zip(places.tolist(), true.mu_wheel[-1].mean(axis=1).tolist(), strict=True))
+        on = (np.abs(true.x - patch.x) <= patch.length / 2) & (np.abs(true.y - patch.y) <= patch.width / 2)
+        on &= (now >= patch.start) & (true.mu_wheel.mean(axis=2) < SLIPPERY_MU)
+        here = on.any(axis=0)
+        self._lap += here & ~self._on
+        self._on[:] = here
+        slid = (on & (true.utilisation.max(axis=2) >= LOST)).any(axis=0)
+        self.drive.passed |= {(k, int(self._lap[k])) for k in np.flatnonzero(here).tolist()}
+        self.drive.slid |= {(k, int(self._lap[k])) for k in np.flatnonzero(slid).tolist()}
+
+    def _fuse(self, parts: list[dict[str, Any]]) -> None:
+        if not parts:
+            return
+        columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        raised = self.alerts.updated(self.fusion.update(observations_in(columns)).slots)
+        now = self._now()
+        for alert in raised:
+            if alert.raised and self._on_ice(alert.latitude, alert.longitude) and not self.drive.warned:
+                self.drive.alert_passes = float(len(self.drive.passed))
+                self.drive.warned = 1
+            key = keys.alert_key(int(grid.tile_of(alert.cell)))
+            self.heard.alert(heard_alert(key, wire.encode_alert(alert), now), now)
+
+    def _hear(self, second: int) -> None:
+        """The tiles as they would come, and the alerts that stand put again."""
+        now = self._now()
+        for alert in self.alerts.standing:
+            self.heard.alert(alert, now)
+        if second - self._asked < ASKED_S:
+            return
+        self._asked = second
+        slots = np.arange(self.fusion.size)
+        tiles = grid.tile_of(self.fusion.live.key[: self.fusion.size] // grid.SECTORS)
+        for tile in np.unique(tiles).tolist():
+            payload = arrow_stream(batch_of(view(self.fusion, slots[tiles == tile], now), now))
+            self.heard.take(*heard_cells(keys.map_key(tile), payload, now), now)
+
+    def _look(self) -> None:
+        self.drivers.refresh()
+        seen = self.pipeline.seen
+        assert seen is not None
+        for k, row in enumerate(zip(*(column.tolist() for column in seen), strict=True)):
+            pose, route = Pose(*row), self.drivers.route_of(k)
+            path = route.ahead(pose, horizon_length(pose.speed)) if route is not None else None
+            if path is None:
+                continue
+            self.active[k], told = warn(self.active[k], [look_ahead(path, self.heard, pose.time)], pose, self.heard)
+            for warning in told:
+                self.drivers.hear(self.fleet.names[k], warning)
+        self.drivers.act()
+
+    def _believe(self) -> None:
+        beliefs, seen = self.bank.beliefs(), self.pipeline.seen
+        if beliefs is None or seen is None:
+            return
+        key: IntArray = self.pipeline.places
+        told: dict[int, FloatArray | None] = {
+            k: self.heard.belief(int(key[k]), self._now()) if key[k] >= 0 else None for k in self.prior.enters(key)
+        }
+        informed = self.prior.step(key, *beliefs, told)
+        alone = np.exp(beliefs[0])
+        truth = self.fleet.truth.mu_wheel[-1].mean(axis=1)
+        for k, belief in told.items():
+            if belief is not None:
+                errors = [abs(float(mugrid.quantiles(p[k], 0.5)) - truth[k]) for p in (informed, alone)]
+                self.drive.told_error.append((errors[0], errors[1]))
+
+    def _on_ice(self, latitude: float, longitude: float) -> bool:
+        x, y = self.fleet.scenario.from_latlon(np.array([latitude]), np.array([longitude]))
+        near = 12.0
+        return bool(
+            abs(x[0] - self.ice.x) <= self.ice.length / 2 + near and abs(y[0] - self.ice.y) <= self.ice.width / 2 + near
+        )
+
+    def _now(self) -> int:
+        seen = self.pipeline.seen
+        return int(seen.time.max()) if seen is not None else START_NS
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Drive all seeds both ways and write the figures."""
+    parser = argparse.ArgumentParser(prog="deploy.listening", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--first", type=int, default=FIGURES, help="seed")
+    parser.add_argument("--vehicles", type=int, default=36)
+    parser.add_argument("--duration", type=float, default=150.0, help="[s] of driving")
+    parser.add_argument("--scenario", default="hills")
+    args = parser.parse_args(argv)
+    args.out.mkdir(parents=True, exist_ok=True)
+    with_: list[Drive] = []
+    without: list[Drive] = []
+    for seed in range(args.first, args.first + args.seeds):
+        for listening, out in ((True, with_), (False, without)):
+            drive = ListeningTown(args.scenario, args.vehicles, seed, listening=listening).run(args.duration)
+            out.append(drive)
+            kind, passes = "listening" if listening else "deaf", f"{len(drive.slid)} of {len(drive.passed)} passes slid"
+            print(f"  seed {seed} {kind}: {passes}; alert after {drive.alert_passes:.0f}", flush=True)
+    found = measured(with_, without)
+    figures.write(args.out / "figures.json", "deploy.listening", [args.first, args.first + args.seeds - 1], found)
+    print(figures.markdown(found))
+    return 0 if all(figure.holds for figure in found if figure.bar is not None) else 1
+
+
+def measured(with_: list[Drive], without: list[Drive]) -> list[Figure]:
+    """The figures of drives with and without listening."""
+    slid, before = (sum(len({k for k, _ in drive.slid}) for drive in drives) for drives in (with_, without))
+    laps, laps_before = (sum(len(drive.slid) for drive in drives) for drives in (with_, without))
+    errors = np.array([pair for drive in with_ for pair in drive.told_error]).reshape(-1, 2)
+    covered = [float(np.mean([inside for drive in drives for inside in drive.inside])) for drives in (with_, without)]
+    return [
+        Figure("ahead.lost_grip_ratio", slid / before if before else float("nan"), "", 0.5),
+        Figure("ahead.lost_grip.with", laps, "passes"),
+        Figure("ahead.lost_grip.without", laps_before, "passes"),
+        Figure("ahead.lost_grip.passes", sum(len(drive.passed) for drive in with_), "over new ice, with"),
+        Figure("ahead.alert_passes", float(np.nanmedian([drive.alert_passes for drive in without])), "median"),
+        Figure("prior.map_loop", abs(covered[0] - covered[1]), "", 0.02),
+        Figure("prior.map_loop.coverage90", covered[0], "of cells, all listen"),
+        Figure("prior.map_loop.coverage90.deaf", covered[1], "of cells, none does"),
+        Figure("prior.map_loop.visits", float(sum(drive.visits for drive in with_)), "fused, all listen"),
+        Figure("prior.entry_error_ratio.town", float(errors[:, 0].mean() / errors[:, 1].mean()), "", None),
+    ]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,94 @@
+"""The map as what a vehicle already knows of the cell that it is in; what it publishes never contains it. Pure.
+
+The estimator runs as if there were no map: its recursion, and the evidence of a visit that is published, are the same
+bit for bit. Beside it stands what it would believe had it begun the visit with the map's belief:
+
+    q(μ)  ∝  [(1 - h)·w⁻(μ) + h·u(μ)] · m(μ)/u(μ)     at a cell's border
+    p_M   ∝  q · L            p  =  (1 - β')·p_M + β'·w            in the cell
+
+Legend
+    w⁻, w   the filter's own belief at the border, and now             (32,)
+    m       the map's belief of this cell, faded with its age           (32,)
+    u       uniform on the friction grid                                (32,)
+    h       chance that the road changes at this border: how much the map's beliefs of the two cells differ (total
+            variation), BLIND where it knows only this one
+    L       likelihood of the visit's measurements so far               (32,)
+    β, β'   chance that the map is wrong here, before and after them: β' = β·Z_W/(β·Z_W + (1 - β)·Z_M) with
+            Z_M = Σ q·L and Z_W = Σ w⁻·L. It begins at SHARE, which no map can take away, and what a visit found
+            holds for the next ones, KEPT of it from border to border
+
+The filter's own belief is carried over a border, never the mixture, so that no cell of the map is counted twice.
+Hypotheses that are averaged by what they predicted: Hoeting et al., Bayesian model averaging, Stat. Sci. 14 (1999).
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from schemas import mugrid
+from schemas.numeric import FloatArray, IntArray
+
+SHARE: Final = 0.2  # of cells in which a map that says something sure is wrong: tyres, patches, fixes in the wrong cell
+MOST: Final = 0.98
+KEPT: Final = 0.9  # per cell: ten cells, a hundred metres, after which a map that was wrong may be right again
+BLIND: Final = 0.5
+LEAST_CHANGE: Final = 0.05  # in a cell of ten metres, as the estimator's own road change of 190 m
+NOWHERE: Final = -1
+
+
+class MapPrior:
+    """The map's part in what N vehicles believe."""
+
+    def __init__(self, vehicles: int) -> None:
+        self._key = np.full(vehicles, NOWHERE)
+        self._map: list[FloatArray | None] = [None] * vehicles
+        self._entry = np.tile(mugrid.PRIOR, (vehicles, 1))  # q
+        self._border = np.tile(mugrid.PRIOR, (vehicles, 1))  # w at the border
+        self._own = np.tile(mugrid.PRIOR, (vehicles, 1))  # w at the last step
+        self._wrong = np.full(vehicles, SHARE)  # at the border
+        self._found = np.full(vehicles, SHARE)  # now
+
+    def enters(self, keys: IntArray) -> list[int]:
+        """Vehicles that are in another place than at the last step: those whose map belief is wanted."""
+        return np.flatnonzero(keys != self._key).tolist()
+
+    def step(
+        self, keys: IntArray, own: FloatArray, visit: FloatArray, told: dict[int, FloatArray | None]
+    ) -> FloatArray:
+        """What the vehicles believe with the map's help, (N, 32) probabilities.
+
+        Args:
+            keys: (N,) place that each is in, NOWHERE where it is unknown.
+            own: (N, 32) log of the filter's posterior over uniform.
+            visit: (N, 32) log-likelihood of the visit so far.
+            told: the map's belief for those who `enters`; None where it knows nothing.
+        """
+        now = _normal(np.exp(own))
+        out = now.copy()
+        for k, belief in told.items():
+            self._enter(k, int(keys[k]), belief)
+        for k in [k for k, known in enumerate(self._map) if known is not None]:
+            likelihood = np.exp(visit[k])
+            informed = self._entry[k] * likelihood
+            right, wrong = informed.sum(), (self._border[k] * likelihood).sum()
+            share = self._wrong[k] * wrong / (self._wrong[k] * wrong + (1.0 - self._wrong[k]) * right)
+            self._found[k] = min(max(share, SHARE), MOST)
+            out[k] = (1.0 - self._found[k]) * informed / right + self._found[k] * now[k]
+        self._own = now
+        return out
+
+    def _enter(self, k: int, key: int, belief: FloatArray | None) -> None:
+        before, self._map[k], self._key[k] = self._map[k], belief, key
+        self._wrong[k] = self._found[k] = SHARE + KEPT * (self._found[k] - SHARE)
+        if belief is None:
+            return
+        change = BLIND if before is None else max(1.0 - float(np.minimum(before, belief).sum()), LEAST_CHANGE)
+        self._border[k] = (1.0 - LEAST_CHANGE) * self._own[k] + LEAST_CHANGE * mugrid.PRIOR
+        carried = (1.0 - change) * self._own[k] + change * mugrid.PRIOR
+        self._entry[k] = _normal((carried * belief)[None])[0]
+
+
+def _normal(weights: FloatArray) -> FloatArray:
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True))

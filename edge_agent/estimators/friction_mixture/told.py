@@ -1,0 +1,36 @@
+"""What a filter believes now, for those who look on: read, never written."""
+
+from __future__ import annotations
+
+from edge_agent.estimators.common.arrays import clear
+from edge_agent.estimators.friction_mixture.constants import NODES
+from edge_agent.estimators.friction_mixture.friction_grid import visit_evidence
+from edge_agent.estimators.friction_mixture.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.split_sides import BOTH, project
+from edge_agent.estimators.friction_mixture.workspace import MixtureContext
+from schemas.mugrid import CENTRES
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+from schemas.runtime.records import Records
+
+
+@compiled
+def tell_beliefs(
+    filters: Records[MixtureMemory], contexts: Records[MixtureContext], own: FloatArray, visit: FloatArray
+) -> None:
+    """Write log(posterior/uniform) of each filter, and its evidence in the visit so far; both (N, 32), maximum 0."""
+    design, scratch = contexts[0].design, contexts[0].scratch
+    for n in range(own.shape[0]):
+        memory = filters[n]
+        if not memory.started:
+            clear(own[n])
+            clear(visit[n])
+        elif memory.split:
+            project(design.sides.prior, design.sides.share[BOTH], scratch.expected)
+            project(memory.weight, design.sides.share[BOTH], scratch.projected)
+            visit_evidence(design.mu, scratch.expected, scratch.projected, CENTRES, own[n])
+            project(memory.visit_weight, design.sides.share[BOTH], scratch.projected)
+            visit_evidence(design.mu, scratch.expected, scratch.projected, CENTRES, visit[n])
+        else:
+            visit_evidence(design.mu, design.prior, memory.weight[:NODES], CENTRES, own[n])
+            visit_evidence(design.mu, design.prior, memory.visit_weight[:NODES], CENTRES, visit[n])

@@ -1,0 +1,74 @@
+"""Simulated drivers who are warned: where they will drive, what they are told, and that they slow down for it."""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Callable, Iterator
+from typing import Final
+
+from edge_agent.ahead.path import GivenRoute
+from edge_agent.inputs.block import Block
+from edge_agent.lab.simulation.fleet import SimulatedFleet, rough_ones
+from schemas.errors import InputError
+from schemas.numeric import BoolArray
+from schemas.wire.ahead import GripWarning
+
+ROUTE_M: Final = 600.0
+EVERY: Final = 10  # blocks between two looks at the route
+
+
+class WarnedDrivers:
+    """The share of a fleet's drivers who are warned.
+
+    Args:
+        fleet: the vehicles.
+        share: of them, from 0 to 1; vehicle k is or is not however many there are.
+
+    Raises:
+        InputError: no share.
+    """
+
+    def __init__(self, fleet: SimulatedFleet, share: float) -> None:
+        if not 0.0 <= share <= 1.0:
+            raise InputError("warned", f"{share} is not a share", "give a number from 0 to 1")
+        self._fleet = fleet
+        self.warned: BoolArray = rough_ones(len(fleet.names), share)
+        self._number = {name: k for k, name in enumerate(fleet.names)}
+        self._routes: dict[int, GivenRoute] = {}
+        self._told: queue.SimpleQueue[tuple[int, GripWarning]] = queue.SimpleQueue()
+
+    def listens(self, k: int) -> bool:
+        """Whether vehicle k is warned."""
+        return bool(self.warned[k])
+
+    def route_of(self, k: int) -> GivenRoute | None:
+        """Where vehicle k will drive."""
+        return self._routes.get(k)
+
+    def hear(self, name: str, warning: GripWarning) -> None:
+        """A warning for a driver; from any thread. He acts on it from the next block on, after his reaction."""
+        self._told.put((self._number[name], warning))
+
+    def heeding(self, blocks: Iterator[Block], hear: Callable[[], None] = lambda: None) -> Iterator[Block]:
+        """The blocks, with the drivers told between them what was heard; `hear` is called before each."""
+        for number, block in enumerate(blocks):
+            if number % EVERY == 0:
+                self.refresh()
+            yield block
+            hear()
+            self.act()
+
+    def refresh(self) -> None:
+        """Look where the drivers will go."""
+        for k in self.warned.nonzero()[0].tolist():
+            self._routes[k] = GivenRoute(*self._fleet.route_ahead(k, ROUTE_M))
+
+    def act(self) -> None:
+        """Hand the drivers what was heard for them."""
+        while not self._told.empty():
+            k, warning = self._told.get()
+            if warning.state == "ended":
+                self._fleet.warn(k, (0.0, 0.0), 0.0, 0.0)
+            else:
+                end = warning.distance_m + warning.length_m
+                self._fleet.warn(k, (warning.distance_m, end), warning.safe_speed, warning.mu_lower)

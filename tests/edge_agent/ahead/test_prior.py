@@ -1,0 +1,105 @@
+"""The map as a prior: expected at entry, gone again when it is wrong, and never in what is published."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edge_agent.ahead.known import belief_of
+from edge_agent.ahead.prior import MOST, NOWHERE, SHARE, MapPrior
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.inputs.block import Block
+from edge_agent.lab.simulation import SimulatedFleet
+from edge_agent.lab.simulation.blocks import blocks
+from edge_agent.observe.pipeline import Pipeline
+from schemas import mugrid
+from schemas.config import AgentConfig
+from schemas.numeric import FloatArray
+
+FLAT = np.zeros((1, mugrid.BINS))
+
+
+def sharp(mu: float, std: float = 0.06) -> FloatArray:
+    """The map's belief of a cell."""
+    said = (np.array([value]) for value in (mu - 1.6 * std, mu, mu + 1.6 * std, float(mu < 0.4)))
+    return np.asarray(belief_of(*said)[0])
+
+
+def saying(mu: float, std: float = 0.08) -> FloatArray:
+    """Log-likelihood of measurements, (1, 32)."""
+    log = -0.5 * ((mugrid.CENTRES - mu) / std) ** 2
+    return np.asarray((log - log.max())[None])
+
+
+def middle(p: FloatArray) -> float:
+    return float(mugrid.quantiles(p, 0.5)[0])
+
+
+def key(k: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    return np.array([k])
+
+
+def test_without_a_map_the_vehicle_believes_what_its_filter_believes() -> None:
+    prior, own = MapPrior(1), saying(0.7)
+    out = prior.step(key(5), own, saying(0.7), {0: None})
+    assert np.array_equal(out, np.exp(own) / np.exp(own).sum())
+
+
+def test_at_the_border_of_a_cell_that_the_map_knows_its_belief_is_expected() -> None:
+    prior = MapPrior(1)
+    prior.step(key(4), saying(0.9), FLAT, {0: sharp(0.9)})
+    assert prior.enters(key(5)) == [0]
+    out = prior.step(key(5), saying(0.9), FLAT, {0: sharp(0.2)})
+    assert prior.enters(key(5)) == []
+    assert out[0, mugrid.CENTRES < 0.4].sum() > 0.7
+    assert mugrid.quantiles(out, 0.95)[0] > 0.8, "what no map can take away"
+
+
+def test_a_map_that_is_wrong_is_left_as_fast_as_measurements_come_and_the_next_cells_believe_it_less() -> None:
+    prior, says = MapPrior(1), []
+    prior.step(key(4), saying(0.9), FLAT, {0: sharp(0.9)})
+    for cell in range(5, 9):
+        entered = prior.step(key(cell), saying(0.2, 0.3), FLAT, {0: sharp(0.9)})
+        says.append(middle(entered))
+        left = prior.step(key(cell), saying(0.2), saying(0.2), {})
+        assert middle(left) < 0.35
+    assert says[-1] < says[0] - 0.1
+
+
+def test_a_map_says_nothing_twice() -> None:
+    """However many cells say the same, the belief does not grow beyond that of one."""
+    prior, widths = MapPrior(1), []
+    for cell in range(30):
+        out = prior.step(key(cell), FLAT, FLAT, {0: sharp(0.6)})
+        widths.append(float((mugrid.quantiles(out, 0.95) - mugrid.quantiles(out, 0.05))[0]))
+    assert min(widths[1:]) == pytest.approx(widths[1], abs=1e-9)
+
+
+def test_who_is_nowhere_knows_no_map() -> None:
+    prior = MapPrior(2)
+    out = prior.step(np.array([NOWHERE, 7]), np.zeros((2, 32)), np.zeros((2, 32)), {1: sharp(0.2)})
+    assert np.array_equal(out[0], mugrid.PRIOR)
+    assert not np.array_equal(out[1], mugrid.PRIOR)
+    assert 0.0 < SHARE < MOST < 1.0
+
+
+def test_what_is_published_is_the_same_bit_for_bit_whatever_the_map_says() -> None:
+    fleet, published = SimulatedFleet("test", 2, 3, 100.0), []
+    source = blocks(fleet, 100.0)
+    driven: list[Block] = [next(source) for _ in range(60)]
+    for lie in (None, sharp(0.15), sharp(1.0)):
+        pipeline = Pipeline(bank_of("aco-fckf", fleet.vehicles), 2, AgentConfig())
+        prior, records, helped = MapPrior(2), [], 0.0
+        for block in driven:
+            _, seen, states = pipeline.step(block)
+            records += [*seen.columns.values(), *states.columns.values()]
+            beliefs = pipeline.beliefs()
+            assert beliefs is not None
+            own, visit = beliefs
+            out = prior.step(pipeline.places, own, visit, dict.fromkeys(prior.enters(pipeline.places), lie))
+            alone = np.exp(own) / np.exp(own).sum(axis=1, keepdims=True)
+            helped = max(helped, float(np.abs(out - alone).max()))
+        published.append(records)
+        assert (helped > 0.05) == (lie is not None)
+    for one in published[1:]:
+        assert all(np.array_equal(a, b, equal_nan=a.dtype.kind == "f") for a, b in zip(published[0], one, strict=True))
