@@ -27,10 +27,10 @@ class Record(BaseModel):
 
 
 class Score(Record):
-    """How one set of memberships does on one set of drives."""
+    """How one set of memberships does on one set of drives; null where nobody knows the true friction."""
 
-    interval_score: Annotated[Finite, Field(description="of the 90 % friction interval, less is better [1]")]
-    coverage: Annotated[Finite, Field(description="share of true frictions inside it [1]")]
+    interval_score: Annotated[Finite | None, Field(description="of the 90 % friction interval, less is better [1]")]
+    coverage: Annotated[Finite | None, Field(description="share of true frictions inside it [1]")]
     log_likelihood: Annotated[Finite, Field(description="of the innovations, more is better [nat/s]")]
     nis_ratio: Annotated[Finite, Field(description="normalised innovation squared over its expectation [1]")]
 
@@ -68,7 +68,7 @@ class Document(Record):
     estimator: str
     memberships: dict[str, list[Finite]]
     objective: str
-    winner: Annotated[str, Field(description="way that found them: least interval score held out")] = "colony"
+    winner: Annotated[str, Field(description="way that found them: the best held out")] = "colony"
     scores: dict[str, SplitScores]
     candidates: Annotated[
         dict[str, list[dict[str, list[Finite]]]], Field(description="what every search of a way found")

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import json
+import sys
 from pathlib import Path
+
+from edge_agent.cli.options import add_json
 
 NOT_PASSED = 1
 
@@ -12,6 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("log", type=Path, help="signal log (Parquet)")
     parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON) (default: LOG.json beside LOG.parquet)")
+    add_json(parser, "what was found")
     parser.add_argument("--out", type=Path, help="page with the evidence and its plots (HTML)")
     parser.add_argument(
         "--fix",
@@ -28,14 +33,17 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.inputs.bring_in import profile_of
     from edge_agent.inputs.doctor.findings import diagnose
     from edge_agent.inputs.doctor.fix import fixed
-    from edge_agent.inputs.doctor.report import advice, lines, page
+    from edge_agent.inputs.doctor.report import advice, document, lines, page
     from edge_agent.inputs.signal_log import read_log
     from schemas.vehicle import load_vehicle
 
     file = args.vehicle or beside(args.log)
     vehicle, log = load_vehicle(file), read_log(args.log)
     said = diagnose(log.t, log.signals, vehicle, log.ground)
-    print("\n".join([*lines(said), f"{args.log}: {advice(said)}"]))
+    if args.json:
+        print(json.dumps({"log": str(args.log), **document(said)}, allow_nan=False))
+    else:
+        print("\n".join([*lines(said), f"{args.log}: {advice(said)}"]))
     if args.out is not None:
         writable("out", args.out).write_text(page(said, f"{args.log.name}, {vehicle.name}"), encoding="utf-8")
     if args.fix is not None and said.findings:
@@ -44,6 +52,10 @@ def run(args: argparse.Namespace) -> int:
         if corrected != vehicle:
             writable("vehicle", file).write_text(corrected.model_dump_json(indent=1, exclude_none=True) + "\n")
         for finding in left:
-            print(f"not mended: {finding.channel} {finding.kind}: its recording must be decoded otherwise")
-        print(f"{args.fix}: the corrected profile; import the recording again with it")
+            _tell(f"not mended: {finding.channel} {finding.kind}: its recording must be decoded otherwise")
+        _tell(f"{args.fix}: the corrected profile; import the recording again with it")
     return 0 if said.passed else NOT_PASSED
+
+
+def _tell(line: str) -> None:
+    print(line, file=sys.stderr)

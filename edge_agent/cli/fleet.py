@@ -7,6 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from edge_agent.cli.options import add_estimator, memberships_of
+
 if TYPE_CHECKING:
     from schemas.wire.ahead import GripWarning
 
@@ -17,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scenario", default="demo", help="demo (default), hills, test; hills-7: drawn by seed 7")
     parser.add_argument("--rough", type=float, default=0.0, help="share of them as real cars are (default 0)")
     parser.add_argument("--warned", type=float, default=0.0, help="share of them that hear the map and are warned")
-    parser.add_argument("--estimator", help="estimator by name (default: the configuration's)")
+    add_estimator(parser)
     parser.add_argument("--config", type=Path, help="agent configuration (JSON)")
     parser.add_argument("--truth", type=Path, help="what they truly drove over, one row per cell visit (Parquet)")
     parser.add_argument("--rate", type=float, default=100.0, help="samples per second (default 100)")
@@ -52,5 +54,13 @@ def run(args: argparse.Namespace) -> int:
         lookout = Lookout(fleet.names, tell, drivers.route_of, drivers.listens)
         source = drivers.heeding(source)
     return drive_live(
-        fleet.vehicles, fleet.names, source, config, args.estimator, args.duration, at_end, lookout=lookout
+        fleet.vehicles,
+        fleet.names,
+        source,
+        config,
+        args.estimator,
+        args.duration,
+        at_end,
+        lookout=lookout,
+        memberships=memberships_of(args),
     )

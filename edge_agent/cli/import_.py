@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from edge_agent.cli.options import add_json, print_list
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
@@ -13,6 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--profile", help="which signal is which channel: a file, or a shipped one (--list)")
     parser.add_argument("--list", action="store_true", help="list the shipped profiles and leave")
+    add_json(parser, "the list")
     parser.add_argument("--dbc", type=Path, help="CAN database (default: the profile's)")
     parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON): radius of the wheels, steering ratio")
     parser.add_argument("--draft", type=Path, help="where to write a drafted profile (default: beside the log)")
@@ -33,8 +36,7 @@ def run(args: argparse.Namespace) -> int:
     from schemas.vehicle import load_vehicle
 
     if args.list:
-        for name in shipped():
-            print(f"{name:<16} {load_profile(name)[0].about}")
+        print_list({name: load_profile(name)[0].about for name in shipped()}, as_json=args.json)
         return 0
     if not args.source or args.out is None:
         raise InputError("source", "sources and --out are needed", "name recordings, and the log to write")

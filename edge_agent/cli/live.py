@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 
+from edge_agent.adaptation.memberships import Memberships
 from edge_agent.ahead.lookout import Lookout
 from edge_agent.ahead.path import Pose
 from edge_agent.app.estimator_factory import bank_of
@@ -26,11 +27,11 @@ from schemas.vehicle import Vehicle
 from schemas.wire.ahead import GripWarning
 
 
-def _warm_up(estimator: str, vehicle: Vehicle, config: AgentConfig) -> None:
+def _warm_up(estimator: str, vehicle: Vehicle, config: AgentConfig, memberships: Memberships | None) -> None:
     """Load or compile the kernels before the clock runs, on a vehicle that is thrown away."""
     t, time = np.zeros((1, 1)), np.zeros((1, 1), dtype=np.int64)
     signals = np.full((1, 1, len(CHANNELS)), np.nan)
-    Pipeline(bank_of(estimator, [vehicle]), 1, config).step(Block(t, time, signals))
+    Pipeline(bank_of(estimator, [vehicle], memberships), 1, config).step(Block(t, time, signals))
 
 
 def drive_live(
@@ -45,15 +46,16 @@ def drive_live(
     admitted: Callable[[], bool] = lambda: True,
     troubled: Callable[[], list[str]] = list,
     lookout: Lookout | None = None,
+    memberships: Memberships | None = None,
 ) -> int:
     """Drive in real time, do what is due `at_end`, take leave; prints a line of counts and returns 0.
 
     What is learned while not `admitted` is not published; `troubled` tells what is wrong with the sources. A `lookout`
-    hears the map over the vehicles' sessions.
+    hears the map over the vehicles' sessions. `memberships` stand in for the estimator's own.
     """
     chosen = estimator or config.estimator
     log_as(config.log, sys.stderr)
-    _warm_up(chosen, vehicles[0], config)
+    _warm_up(chosen, vehicles[0], config, memberships)
     progress, running = Progress(), list[Publisher]()
     with (
         stop_on_signal() as stop,
@@ -66,7 +68,7 @@ def drive_live(
     ):
         if address:
             print_line(f"metrics: {address}/metrics", sys.stderr)
-        pipeline = Pipeline(bank_of(chosen, vehicles), len(vehicles), config)
+        pipeline = Pipeline(bank_of(chosen, vehicles, memberships), len(vehicles), config)
         publisher = publisher_of(names, config, chosen, lookout.attach if lookout else lambda *_: None)
         running.append(publisher)
         report = partial(status, publisher=publisher, log_line=line_logger(config.log, sys.stderr))

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from edge_agent.cli.options import add_estimator, memberships_of
 from schemas.runtime import commandline
 from schemas.thresholds import NS
 
@@ -28,8 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("log", type=Path, nargs="+", help="signal log (Parquet)")
     parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON) (default: LOG.json beside LOG.parquet)")
-    parser.add_argument("--estimator", help="estimator by name (default: the configuration's, aco-fckf)")
-    parser.add_argument("--memberships", type=Path, metavar="FILE", help="fuzzy sets that tune wrote")
+    add_estimator(parser)
     parser.add_argument(
         "--out", type=Path, required=True, help="estimates to write (.parquet, .csv); of several logs, a folder"
     )
@@ -49,7 +49,6 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.app.estimates_file import EstimatesFile
     from edge_agent.app.estimator_factory import bank_of
     from edge_agent.app.plausible import IMPLAUSIBLE, Plausibility
-    from edge_agent.app.tuned_memberships import load as load_memberships
     from edge_agent.cli.common import insist_on_sound, warn_of_faults
     from edge_agent.inputs.correct import corrected
     from edge_agent.inputs.signal_log import read_log
@@ -59,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
 
     config = load(args.config, AgentConfig)
     estimator = args.estimator or config.estimator
-    memberships = load_memberships(args.memberships).memberships if args.memberships else None
+    memberships = memberships_of(args)
     if len(args.log) > 1 or args.out.is_dir():
         if args.publish:
             raise InputError(

@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from edge_agent.cli.options import add_estimator, memberships_of
+
 if TYPE_CHECKING:
     from edge_agent.ahead.lookout import Lookout
     from edge_agent.inputs.block import Block
@@ -32,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--ahead", action="store_true", help="hear the map, and warn of slippery road ahead")
     parser.add_argument("--route", type=Path, help="where it drives to, for --ahead (GPX or GeoJSON)")
     parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON); needed but with simulated")
-    parser.add_argument("--estimator", help="estimator by name (default: the configuration's)")
+    add_estimator(parser)
     parser.add_argument("--name", help="name to publish under (default: the vehicle's)")
     parser.add_argument("--config", type=Path, help="agent configuration (JSON)")
     parser.add_argument("--scenario", default="demo", help="where the simulated vehicle drives (default demo)")
@@ -62,14 +64,14 @@ def run(args: argparse.Namespace) -> int:
         blocks = plugins.loaded(plugins.SOURCES, kind)(sources[0].partition(":")[2])
         return drive_live(
             [vehicle], [checked_name(args.name or vehicle.name)], blocks, config, args.estimator, args.duration,
-            lookout=_lookout(args, args.name or vehicle.name, config),
+            lookout=_lookout(args, args.name or vehicle.name, config), memberships=memberships_of(args),
         )  # fmt: skip
     if len(sources) > 1:
         raise InputError("source", f"{', '.join(sources)} do not go together", "name live ones, or one log")
     vehicle, name, blocks = _simulated(args) if sources[0] == SIMULATED else _logged(args, Path(sources[0]))
     return drive_live(
         [vehicle], [checked_name(name)], blocks, config, args.estimator, args.duration,
-        lookout=_lookout(args, name, config),
+        lookout=_lookout(args, name, config), memberships=memberships_of(args),
     )  # fmt: skip
 
 
@@ -102,7 +104,7 @@ def _live(args: argparse.Namespace, sources: list[str], config: AgentConfig) -> 
         return drive_live(
             [trip.vehicle], [name], blocks, config, args.estimator, args.duration, trip.end,
             admitted=trip.admitted, troubled=lambda: [*rows.troubles(), *trip.troubles()],
-            lookout=_lookout(args, name, config),
+            lookout=_lookout(args, name, config), memberships=memberships_of(args),
         )  # fmt: skip
     finally:
         blocks.close()

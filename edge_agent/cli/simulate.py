@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from edge_agent.cli.options import add_json, print_list
+
 SENSORS = ("ideal", "mems", "mems-leak", "mems-patchy", "rough", "rough-coarse", "rough-late")
 ROADS = ("level", "rolling", "stepped", "banked", "hilly")
 
@@ -13,6 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("manoeuvre", nargs="?", help="name of the manoeuvre; --list shows them")
     parser.add_argument("--list", action="store_true", help="list the manoeuvres and leave")
+    add_json(parser, "the list")
     parser.add_argument("--mu", type=float, help="peak friction of the road; else the manoeuvre's own")
     parser.add_argument("--speed", type=float, help="[m/s]; else the manoeuvre's own")
     parser.add_argument("--duration", type=float, help="[s]; else the manoeuvre's own")
@@ -33,8 +36,7 @@ def run(args: argparse.Namespace) -> int:
     from schemas.errors import InputError
 
     if args.list:
-        for name, manoeuvre in MANOEUVRES.items():
-            print(f"{name:<24} {manoeuvre.about}")
+        print_list({name: manoeuvre.about for name, manoeuvre in MANOEUVRES.items()}, as_json=args.json)
         return 0
     if args.manoeuvre is None:
         raise InputError("manoeuvre", "is not given", "name one (--list shows them)")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -16,19 +17,25 @@ from typing import Final
 import numpy as np
 
 from edge_agent.adaptation.memberships import Memberships
+from edge_agent.app.backfill import beside
 from edge_agent.app.tuned_memberships import WAYS, Budget, Document, Provenance, Score, SplitScores, save
+from edge_agent.cli.common import warn_of_faults
+from edge_agent.inputs.signal_log import read_log
 from edge_agent.lab.tuning import colony, random_search
 from edge_agent.lab.tuning.objectives import (
     OBJECTIVES,
+    TuningScores,
     TuningSet,
     choices,
     objective_on,
     record_all,
     scores_of,
 )
+from edge_agent.lab.tuning.own_logs import own_drives
 from edge_agent.lab.tuning.search import Iteration, Objective, Problem, Progress, Result
 from schemas.errors import InputError
 from schemas.runtime import figures
+from schemas.vehicle import load_vehicle
 
 ESTIMATOR: Final = "aco-fckf"
 ANTS, ITERATIONS, DURATION_S = 12, 8, 12.0
@@ -40,15 +47,16 @@ POSITIONS: Final = 7  # per vertex: the default and three to each side
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `edge-agent tune`."""
+    parser.add_argument("log", type=Path, nargs="*", help="signal logs of your own in place of simulated drives")
+    parser.add_argument("--vehicle", type=Path, help="vehicle file of the logs (default: LOG.json beside LOG.parquet)")
     parser.add_argument("--seed", type=int, default=0, help="of the ants and of the random search (default 0)")
     parser.add_argument("--ants", type=int, help=f"paths per iteration (default {ANTS})")
     parser.add_argument("--iterations", type=int, help=f"default {ITERATIONS}")
     parser.add_argument(
         "--objective",
         choices=tuple(OBJECTIVES),
-        default="interval",
-        help="interval score of friction (needs the truth), log-likelihood of the innovations, or that with a price on"
-        " wrong calibration (default %(default)s)",
+        help="interval score of friction (needs the truth: simulated drives' default), log-likelihood of the"
+        " innovations, or that with a price on wrong calibration (default with logs: predictive)",
     )
     parser.add_argument("--repeats", type=int, default=1, help="searches each way (default %(default)s)")
     parser.add_argument("--out", type=Path, default=Path(f"{ESTIMATOR}.json"), help="default %(default)s")
@@ -75,9 +83,10 @@ def run(args: argparse.Namespace) -> int:
     if args.study is not None:
         return _study(args, ants, iterations)
 
-    train, held_out = record_all("train", duration), record_all("held_out", duration)
+    chosen = args.objective or ("predictive" if args.log else "interval")
+    train, held_out = _drives(args, chosen, duration)
     print_line(f"{len(train.vehicles)} drives to search on, {len(held_out.vehicles)} to judge by, {duration:g} s each")
-    objective = objective_on(train, ESTIMATOR, args.objective)
+    objective = objective_on(train, ESTIMATOR, chosen)
     objective(Memberships().to_vector())  # loads the compiled filter: the first iteration's time tells the others'
     results = [_search(objective, ants, iterations, args.seed + k) for k in range(args.repeats)]
     sets = {way: [Memberships.from_vector(found[way].best) for found in results] for way in WAYS[1:]}
@@ -85,20 +94,41 @@ def run(args: argparse.Namespace) -> int:
     found = {"default": Memberships()} | {way: Memberships.from_vector(vector) for way, vector in best.items()}
     scores = {way: SplitScores(train=_score(found[way], train), held_out=_score(found[way], held_out)) for way in WAYS}
     print(table(scores))
-    winner = min(WAYS, key=lambda way: scores[way].held_out.interval_score)
+    winner = max(WAYS, key=lambda way: _worth(scores[way].held_out, chosen))
     evaluations = {way: sum(found[way].evaluations for found in results) for way in WAYS[1:]}
     command = (
         f"edge-agent tune --seed {args.seed} --ants {ants} --iterations {iterations} --repeats {args.repeats}"
-        f" --objective {args.objective}{' --quick' * args.quick}"
+        f" --objective {chosen}{' --quick' * args.quick}{''.join(f' {log.name}' for log in args.log)}"
     )
     document = _document(
-        found[winner], args.objective, scores, Budget(ants=ants, iterations=iterations, evaluations=evaluations),
+        found[winner], chosen, scores, Budget(ants=ants, iterations=iterations, evaluations=evaluations),
         command, args.seed,
     )  # fmt: skip
     candidates = {way: [one.to_json() for one in found] for way, found in sets.items()}
     save(args.out, document.model_copy(update={"winner": winner, "candidates": candidates}))
     print(f"wrote {args.out}: what {winner} found")
     return 0
+
+
+def _drives(args: argparse.Namespace, objective: str, duration_s: float) -> tuple[TuningSet, TuningSet]:
+    """What is searched on, and what judges: simulated drives, or parts of one's own."""
+    if not args.log:
+        return record_all("train", duration_s), record_all("held_out", duration_s)
+    if objective == "interval":
+        raise InputError("objective", "interval wants the true friction, which no log tells", "use predictive")
+    logs = []
+    for path in args.log:
+        vehicle = load_vehicle(args.vehicle or beside(path))
+        logs.append((read_log(path), vehicle))
+        warn_of_faults(*logs[-1])
+    return own_drives(logs, duration_s)
+
+
+def _worth(score: Score, objective: str) -> float:
+    """What decides between the ways: the interval score where there is a truth, else the objective."""
+    if score.interval_score is not None:
+        return -score.interval_score
+    return OBJECTIVES[objective](TuningScores(math.nan, math.nan, score.log_likelihood, score.nis_ratio))
 
 
 def _study(args: argparse.Namespace, ants: int, iterations: int) -> int:
@@ -171,7 +201,8 @@ def reporter(way: str, iterations: int, clock: Callable[[], float], write: Calla
 
 
 def _score(memberships: Memberships, drives: TuningSet) -> Score:
-    return Score(**asdict(scores_of(memberships, drives, ESTIMATOR)))
+    found = asdict(scores_of(memberships, drives, ESTIMATOR))
+    return Score.model_validate({name: None if math.isnan(value) else value for name, value in found.items()})
 
 
 def _document(
@@ -192,13 +223,17 @@ def _document(
     )
 
 
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
 def table(scores: dict[str, SplitScores]) -> str:
     """The comparison as plain text, a row per way and set of drives."""
     lines = [f"{'':<8} {'drives':<9} {'interval score':>15} {'coverage':>9} {'innovations [nat/s]':>20} {'NIS':>6}"]
     for way, row in scores.items():
         for drives, score in (("train", row.train), ("held out", row.held_out)):
             lines.append(
-                f"{way:<8} {drives:<9} {score.interval_score:>15.4f} {score.coverage:>9.3f}"
+                f"{way:<8} {drives:<9} {_number(score.interval_score, 4):>15} {_number(score.coverage, 3):>9}"
                 f" {score.log_likelihood:>20.2f} {score.nis_ratio:>6.2f}"
             )
     return "\n".join(lines)

@@ -69,6 +69,8 @@ def test_simulate_lists_the_manoeuvres(capsys: Output) -> None:
     assert main(["simulate", "--list"]) == 0
     listed = capsys.readouterr().out
     assert all(re.search(rf"^{re.escape(name)}\s+\S", listed, re.MULTILINE) for name in MANOEUVRES)
+    assert main(["simulate", "--list", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {name: found.about for name, found in MANOEUVRES.items()}
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)

@@ -18,7 +18,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from edge_agent.adaptation.memberships import Memberships
 from edge_agent.app.estimator_factory import bank_of
+from edge_agent.app.tuned_memberships import FOLDER
 from edge_agent.cli import COMMANDS, live, main
 from edge_agent.inputs.block import Block
 from edge_agent.lab.simulation import SimulatedFleet
@@ -49,7 +51,8 @@ LOGGED = ["--source", "{0}.parquet", "--vehicle", "{0}.json", "--trust"]
 CHANGED: dict[tuple[str, str], list[str]] = {
     ("run", "--source"): LOGGED, ("run", "--vehicle"): ["--vehicle", "{1}.json"],
     **{(command, option): [option, value] for command in ("run", "fleet") for option, value in (
-        ("--estimator", "ckf"), ("--config", "{0}.agent"), ("--scenario", "hills"), ("--rate", "50"), ("--seed", "1"),
+        ("--memberships", "{0}.memberships"), ("--estimator", "ckf"),
+        ("--config", "{0}.agent"), ("--scenario", "hills"), ("--rate", "50"), ("--seed", "1"),
         ("--duration", "7"),
     )},
     ("run", "--name"): ["--name", "car-one"], ("fleet", "--vehicles"): ["--vehicles", "4"],
@@ -71,23 +74,25 @@ LIVE = "test_a_live_car_is_driven_by_its_bus_and_its_receiver"
 LISTENS = "test_a_car_that_listens_prints_its_warnings_and_heeds_its_route"
 FIX = "test_a_fix_makes_the_drive_pass"
 ELSEWHERE = {
-    "simulate": {"--list": "test_simulate_lists_the_manoeuvres",
+    "simulate": {"--list": "test_simulate_lists_the_manoeuvres", "--json": "test_simulate_lists_the_manoeuvres",
                  "--out": "test_simulate_writes_a_log_with_truth_and_the_vehicle_file",
                  "--vehicle-out": "test_simulate_writes_a_log_with_truth_and_the_vehicle_file"},
     "import": {"source": REAL, "--profile": REAL, "--vehicle": REAL, "--out": REAL,
-               "--list": "test_the_shipped_profiles_are_listed",
+               "--list": "test_the_shipped_profiles_are_listed", "--json": "test_the_shipped_profiles_are_listed",
                "--dbc": "test_another_database_and_a_named_draft", "--draft": "test_another_database_and_a_named_draft",
                "--clock": "test_clocks_that_do_not_meet_are_an_error_with_its_remedy"},
     "replay": {"log": REPLAYED, "--vehicle": REPLAYED, "--estimator": REPLAYED, "--out": REPLAYED, "--config": REPLAYED,
                "--publish": SENT_BY_REPLAY, "--trust": UNFIT, "--name": SENT_BY_REPLAY, "--start": SENT_BY_REPLAY,
                "--jobs": "test_so_many_drives_are_under_way_at_once",
                "--memberships": "test_memberships_that_tune_wrote_change_what_replay_says"},
-    "check": {"log": FIX, "--vehicle": FIX, "--out": FIX, "--fix": FIX},
+    "check": {"log": FIX, "--vehicle": FIX, "--out": FIX, "--fix": FIX,
+              "--json": "test_what_the_doctor_found_is_json_for_a_program"},
     "calibrate": {"log": LEARNED, "--vehicle": LEARNED, "--out": LEARNED, "--trust": LEARNED},
     "run": {"--trust": UNFIT, "--profile": LIVE, "--dbc": LIVE, "--ahead": LISTENS, "--route": LISTENS},
     "fleet": {"--warned": "test_of_a_fleet_the_share_that_is_warned_hears_and_the_others_do_not"},
     "completion": {"shell": "test_completion_is_a_script_of_the_shell"},
-    "tune": {"--quick": "test_quick_tuning_writes_a_valid_file_and_says_what_it_does",
+    "tune": {"log": "test_drives_of_one_s_own_are_searched_on", "--vehicle": "test_drives_of_one_s_own_are_searched_on",
+             "--quick": "test_quick_tuning_writes_a_valid_file_and_says_what_it_does",
              "--study": "test_the_quick_study_writes_figures_table_plot_and_a_tuned_file"},
     "evaluate": {"--out": CAMPAIGN, "--quick": CAMPAIGN, "--seeds": SEEDS, "--no-plots": SEEDS, "--plots": CAMPAIGN,
                  "--recorded": "test_only_the_inputs_are_evaluated_where_so_asked",
@@ -138,6 +143,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for k in (0, 1):
         files = ["--out", str(folder / f"{k}.parquet"), "--vehicle-out", str(folder / f"{k}.json")]
         assert main(["simulate", "slalom", "--duration", "2", "--seed", str(k), *files]) == 0
+    shutil.copy(FOLDER / "paper-aco-fckf.json", folder / "0.memberships")
     (folder / "0.agent").write_text(json.dumps({"estimator": "sr-ukf", "batch_rows": 7}))
     return folder
 
@@ -149,13 +155,13 @@ def driven(words: list[str], monkeypatch: pytest.MonkeyPatch, folder: Path) -> o
     def note(
         vehicles: Sequence[Vehicle], names: Sequence[str], source: Iterator[Block], config: AgentConfig,
         estimator: str | None, duration_s: float, at_end: Callable[[], None] = lambda: None,
-        lookout: object | None = None,
+        lookout: object | None = None, memberships: Memberships | None = None,
     ) -> int:  # fmt: skip
         assert lookout is None
         first = [next(source) for _ in range(3)]
         at_end()
         signals = [(block.t.tolist(), np.nan_to_num(block.signals).tolist()) for block in first]
-        seen.append([list(vehicles), list(names), signals, config, estimator, duration_s])
+        seen.append([list(vehicles), list(names), signals, config, estimator, memberships, duration_s])
         return 0
 
     monkeypatch.setattr(live, "drive_live", note)

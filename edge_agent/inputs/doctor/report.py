@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from html import escape
 from typing import Final
 
@@ -17,6 +18,7 @@ AXES: Final = {
     "ground": ("speed of the wheels [m/s]", "speed over ground [m/s]"),
     "turning": ("yaw rate [rad/s]", "of the course [rad/s]"),
 }  # fmt: skip
+SHOWN: Final = ("gain", "offset", "correlation", "lag_s", "excited_s")  # of an identity, to a program
 POINTS: Final = 600
 SIDE: Final = 260  # of a plot [pixel]
 EDGE: Final = 36
@@ -32,6 +34,23 @@ def lines(said: Diagnosis) -> list[str]:
     lines = [f"{'FAULT':<8} {f.channel:<10} {f.kind:<24} {f.words}" for f in said.findings]
     lines += [f"{'unknown':<8} {channel:<10} nothing in this drive tells" for channel in said.unknown]
     return [*lines, *(f"{'sound':<8} {channel}" for channel in said.sound)]
+
+
+def document(said: Diagnosis) -> dict[str, object]:
+    """What was found, for a program: scale, offset and delay mend a channel, in this order."""
+    return {
+        "passed": said.passed, "advice": advice(said), "sound": said.sound, "unknown": said.unknown,
+        "findings": [
+            {name: _finite(value) for name, value in asdict(finding).items()} for finding in said.findings
+        ],
+        "identities": {
+            name: {what: _finite(getattr(fit, what)) for what in SHOWN} for name, fit in said.fits.items()
+        },
+    }  # fmt: skip
+
+
+def _finite(value: object) -> object:
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def advice(said: Diagnosis) -> str:

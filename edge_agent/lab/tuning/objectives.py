@@ -89,12 +89,12 @@ class TuningSet:
     vehicles: tuple[Vehicle, ...]
     t: FloatArray  # (T, N) [s]
     signals: FloatArray  # (T, N, channels)
-    mu: FloatArray  # (T, N) true friction, mean of the wheels
+    mu: FloatArray  # (T, N) true friction, mean of the wheels; NaN where nobody knows it
 
 
 @dataclass(frozen=True)
 class TuningScores:
-    """Scores of memberships on recorded drives."""
+    """Scores of memberships on drives; the first two are NaN where nobody knows the true friction."""
 
     interval_score: float  # less is better [1]
     coverage: float  # share of samples whose truth lies in the 90 % interval [1]
@@ -157,13 +157,14 @@ def interval_score(lower: FloatArray, upper: FloatArray, truth: FloatArray) -> F
 def scores_of(memberships: Memberships, drives: TuningSet, estimator: str) -> TuningScores:
     """Run the estimator over the drives and score what it says after the first second."""
     estimates = create(estimator, drives.vehicles, memberships=memberships).advance(drives.t, drives.signals, threads=2)
-    settled = drives.t[:, 0] >= SETTLED_S
+    settled = drives.t.min(axis=1) >= SETTLED_S
+    rate_hz = (len(drives.t) - 1) / float(np.mean(drives.t[-1] - drives.t[0]))
     lower, upper, truth = estimates.mu_lower[settled], estimates.mu_upper[settled], drives.mu[settled]
     log_likelihoods = np.nan_to_num(estimates.innovation_log_likelihood[settled], nan=WORST, neginf=WORST, posinf=WORST)
     return TuningScores(
         interval_score=float(interval_score(lower, upper, truth).mean()),
-        coverage=float(((lower <= truth) & (truth <= upper)).mean()),
-        log_likelihood=float(np.maximum(log_likelihoods, WORST).mean()) * RATE_HZ,
+        coverage=float(np.where(np.isnan(truth), np.nan, (lower <= truth) & (truth <= upper)).mean()),
+        log_likelihood=float(np.maximum(log_likelihoods, WORST).mean()) * rate_hz,
         nis_ratio=float(np.nanmean(estimates.innovation_nis[settled])),
     )
 

@@ -71,6 +71,18 @@ def test_a_fix_makes_the_drive_pass(rough: Recorded, tmp_path: Path, name: str, 
     assert main(["check", good, *log[1:]]) == 0
 
 
+def test_what_the_doctor_found_is_json_for_a_program(rough: Recorded, tmp_path: Path, capsys: Output) -> None:
+    for name, drive in (("good", rough), ("bad", PLANTED["a_y flipped"].spoil(rough))):
+        log = write(tmp_path / f"{name}.parquet", drive)
+        assert main(["check", *log, "--json"]) == (1 if name == "bad" else 0)
+        said = json.loads(capsys.readouterr().out)
+        assert said["passed"] is (name == "good")
+        assert said["identities"]["lateral"]["correlation"] != 0.0
+    (found,) = said["findings"]
+    assert (found["channel"], found["scale"]) == ("ay", -1.0)
+    assert "ay" not in said["sound"]
+
+
 @pytest.mark.timeout(600)  # the kernels of the default estimator may have to be compiled
 def test_the_first_drive(tmp_path: Path, router: Router, service: Service, capsys: Output) -> None:
     """The README's five lines on the real minute."""

@@ -200,6 +200,8 @@ def test_a_rim_speed_without_a_radius_is_an_error(tmp_path: Path, some: list[can
 def test_the_shipped_profiles_are_listed(capsys: Output) -> None:
     assert main(["import", "--list"]) == 0
     assert {line.split()[0] for line in capsys.readouterr().out.splitlines()} == set(shipped())
+    assert main(["import", "--list", "--json"]) == 0
+    assert set(json.loads(capsys.readouterr().out)) == set(shipped())
 
 
 def test_another_database_and_a_named_draft(tmp_path: Path, some: list[can.Message]) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.app.tuned_memberships import WAYS, Score, SplitScores, load
-from edge_agent.cli import tune
+from edge_agent.cli import main, tune
 from edge_agent.lab.tuning.objectives import (
     HELD_OUT,
     OBJECTIVES,
@@ -156,7 +156,7 @@ def test_quick_tuning_writes_a_valid_file_and_says_what_it_does(
         provenance.command
         == f"edge-agent tune --seed 4 --ants 3 --iterations 2 --repeats 1 --objective {objective} --quick"
     )
-    assert min(scores, key=lambda way: scores[way].held_out.interval_score) == tuned.document.winner
+    assert min(scores, key=lambda way: scores[way].held_out.interval_score or np.inf) == tuned.document.winner
     assert {way: len(found) for way, found in tuned.document.candidates.items()} == {"random": 1, "colony": 1}
     assert provenance.budget.evaluations == {"random": 6, "colony": 6}
 
@@ -187,3 +187,25 @@ def test_table_has_a_row_per_way_and_set_of_drives() -> None:
 def test_another_drive_of_the_set_gives_another_worth(drives: TuningSet) -> None:
     other = record((replace(TRAIN[0], seed=77), *TRAIN[1:3]), 4.0)
     assert scores_of(Memberships(), other, ESTIMATOR) != scores_of(Memberships(), drives, ESTIMATOR)
+
+
+def test_drives_of_one_s_own_are_searched_on(tmp_path: Path) -> None:
+    """Without a truth: what is measured next judges, on the last third of the recordings."""
+    logs, found = [], []
+    for name, seed in (("one", "1"), ("two", "2")):
+        logs.append(str(tmp_path / f"{name}.parquet"))
+        words = ["--duration", "6", "--seed", seed, "--sensors", "rough", "--rate", "50", "--out", logs[-1]]
+        assert main(["simulate", "slalom", *words, "--vehicle-out", str(tmp_path / "car.json")]) == 0
+    car = ["--vehicle", str(tmp_path / "car.json")]
+    for given in (logs[:1], logs):
+        out = tmp_path / f"{len(given)}.json"
+        assert main(["tune", *given, *car, "--quick", "--out", str(out)]) == 0
+        found.append(load(out).document)
+        assert found[-1].objective == "predictive"
+        assert found[-1].scores["default"].held_out.interval_score is None
+        assert str(tmp_path) not in out.read_text()
+    assert found[0].scores != found[1].scores
+    replayed = ["replay", logs[0], *car, "--memberships", str(out), "--out", str(tmp_path / "e.parquet")]
+    assert main(replayed) in (0, 3)
+    assert main(["tune", *logs, *car, "--quick", "--objective", "interval", "--out", str(out)]) == 2
+    assert main(["tune", logs[0], *car, "--out", str(out)]) == 2

@@ -1,0 +1,39 @@
+"""Options that several commands have; light, for every help needs them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from edge_agent.adaptation.memberships import Memberships
+
+
+def add_estimator(parser: argparse.ArgumentParser) -> None:
+    """Declare which estimator, and with which fuzzy sets."""
+    parser.add_argument("--estimator", help="estimator by name (default: the configuration's, aco-fckf)")
+    parser.add_argument("--memberships", type=Path, metavar="FILE", help="fuzzy sets that tune wrote")
+
+
+def memberships_of(args: argparse.Namespace) -> Memberships | None:
+    """The fuzzy sets of the option; None where it was not given."""
+    from edge_agent.app.tuned_memberships import load
+
+    return load(args.memberships).memberships if args.memberships else None
+
+
+def add_json(parser: argparse.ArgumentParser, what: str) -> None:
+    """Declare that a program reads what is said."""
+    parser.add_argument("--json", action="store_true", help=f"print {what} as JSON")
+
+
+def print_list(entries: Mapping[str, str], *, as_json: bool) -> None:
+    """Names with a line about each: for people, or one JSON object."""
+    if as_json:
+        print(json.dumps(dict(entries)))
+    else:
+        for name, about in entries.items():
+            print(f"{name:<24} {about}")

@@ -1,0 +1,45 @@
+"""Recorded drives as a search takes them: without a truth, so that only what was measured next can judge."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from edge_agent.inputs.correct import corrected
+from edge_agent.inputs.signal_log import SignalLog
+from edge_agent.lab.tuning.objectives import TuningSet
+from schemas.errors import InputError
+from schemas.vehicle import Vehicle
+
+MOST_PARTS: Final = 24  # as many drives as the simulated ones
+FEWEST_PARTS: Final = 3
+HELD_OUT: Final = 3  # the last of so many parts of the recordings judge
+
+
+def own_drives(logs: Sequence[tuple[SignalLog, Vehicle]], duration_s: float) -> tuple[TuningSet, TuningSet]:
+    """Recordings cut into parts of `duration_s` [s]: those to search on, and the last third of them, to judge by.
+
+    Recordings may have any rate; parts have as many samples as the slowest gives in that time.
+
+    Raises:
+        InputError: they are too short.
+    """
+    samples = min(round(duration_s / float(np.median(np.diff(log.t)))) for log, _ in logs)
+    parts = [(log, vehicle, first) for log, vehicle in logs for first in range(0, len(log.t) - samples + 1, samples)]
+    if len(parts) < FEWEST_PARTS or samples < 2:
+        raise InputError(
+            "log", f"{len(parts)} parts of {duration_s:g} s are too few", f"give {FEWEST_PARTS} at least, better twenty"
+        )
+    chosen = [parts[k] for k in np.unique(np.linspace(0, len(parts) - 1, MOST_PARTS).round().astype(int))]
+    train = len(chosen) - max(1, len(chosen) // HELD_OUT)
+    return _side_by_side(chosen[:train], samples), _side_by_side(chosen[train:], samples)
+
+
+def _side_by_side(parts: Sequence[tuple[SignalLog, Vehicle, int]], samples: int) -> TuningSet:
+    t = np.stack([log.t[first : first + samples] - log.t[first] for log, _, first in parts], axis=1)
+    signals = np.stack(
+        [corrected(log.signals[first : first + samples], vehicle) for log, vehicle, first in parts], axis=1
+    )
+    return TuningSet(tuple(vehicle for _, vehicle, _ in parts), t, signals, np.full(t.shape, np.nan))
