@@ -59,7 +59,8 @@ class Drive:
     alert_passes: float = float("nan")  # over the new ice until its first alert
     inside: list[bool] = field(default_factory=list)  # whether the truth lies in the map's interval, by cell
     visits: int = 0  # that were fused
-    warned: int = 0
+    alerts: int = 0  # on the new ice
+    warnings: int = 0
     told_error: list[tuple[float, float]] = field(default_factory=list)  # |error| in a known cell: with, without
 
 
@@ -137,9 +138,10 @@ class ListeningTown:
         raised = self.alerts.updated(self.fusion.update(observations_in(columns)).slots)
         now = self._now()
         for alert in raised:
-            if alert.raised and self._on_ice(alert.latitude, alert.longitude) and not self.drive.warned:
-                self.drive.alert_passes = float(len(self.drive.passed))
-                self.drive.warned = 1
+            if alert.raised and self._on_ice(alert.latitude, alert.longitude):
+                if not self.drive.alerts:
+                    self.drive.alert_passes = float(len(self.drive.passed))
+                self.drive.alerts += 1
             key = keys.alert_key(int(grid.tile_of(alert.cell)))
             self.heard.alert(heard_alert(key, wire.encode_alert(alert), now), now)
 
@@ -167,6 +169,7 @@ class ListeningTown:
             if path is None:
                 continue
             self.active[k], told = warn(self.active[k], [look_ahead(path, self.heard, pose.time)], pose, self.heard)
+            self.drive.warnings += sum(one.state == "raised" for one in told)
             for warning in told:
                 self.drivers.hear(self.fleet.names[k], warning)
         self.drivers.act()
@@ -207,17 +210,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--first", type=int, default=FIGURES, help="seed")
     parser.add_argument("--vehicles", type=int, default=36)
     parser.add_argument("--duration", type=float, default=150.0, help="[s] of driving")
-    parser.add_argument("--scenario", default="hills")
+    parser.add_argument("--scenario", default="hills-SEED", help="hills-SEED: drawn anew by each seed")
     args = parser.parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
     with_: list[Drive] = []
     without: list[Drive] = []
     for seed in range(args.first, args.first + args.seeds):
         for listening, out in ((True, with_), (False, without)):
-            drive = ListeningTown(args.scenario, args.vehicles, seed, listening=listening).run(args.duration)
+            drive = ListeningTown(
+                args.scenario.replace("SEED", str(seed)), args.vehicles, seed, listening=listening
+            ).run(args.duration)
             out.append(drive)
-            kind, passes = "listening" if listening else "deaf", f"{len(drive.slid)} of {len(drive.passed)} passes slid"
-            print(f"  seed {seed} {kind}: {passes}; alert after {drive.alert_passes:.0f}", flush=True)
+            passes = f"{len(drive.slid)} of {len(drive.passed)} passes slid, alert after {drive.alert_passes:.0f}"
+            more = f"{drive.alerts} alerts on the ice, {drive.warnings} warnings"
+            print(f"  seed {seed} {'listening' if listening else 'deaf'}: {passes}; {more}", flush=True)
     found = measured(with_, without)
     figures.write(args.out / "figures.json", "deploy.listening", [args.first, args.first + args.seeds - 1], found)
     print(figures.markdown(found))

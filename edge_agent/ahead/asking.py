@@ -19,6 +19,7 @@ from schemas.thresholds import NS
 BESIDE_M: Final = 12.0  # of a box beside the way: a cell, so that lanes, fixes and coarse routes are in it
 AREA_M2: Final = 7000.0  # of a box: an answer has 3.2 kB of schema, a cell 130 bytes
 LONGEST_M: Final = 300.0
+FURTHER_M: Final = 300.0  # than one looks is asked for at once, or each second would ask for its own ten metres
 REFRESH_S: Final = 300.0  # a map is asked anew while it lies ahead; what changes at once comes as an alert
 STEP: Final = 4  # metres between the points that are looked at
 MOST_BOXES: Final = 128
@@ -45,14 +46,19 @@ class Asked:
         """Ask for everything anew: a session has come back."""
         self._boxes.clear()
 
-    def wanting(self, path: Path, pose: Pose) -> list[Box]:
-        """Boxes that are to be asked for now, along a path; they count as asked."""
+    def wanting(self, path: Path, pose: Pose, within: float) -> list[Box]:
+        """Boxes that are to be asked for now, along a path; they count as asked.
+
+        Nothing is asked for before something nearer than `within` [m] is wanting; then all of the path is.
+        """
         latitude, longitude = degrees(path.x[::STEP], path.y[::STEP], pose)
         open_ = np.ones(len(latitude), np.bool_)
         for box, at in self._boxes:
             if pose.time - at < REFRESH_S * NS:
                 inside = (latitude >= box.south) & (latitude <= box.north)
                 open_ &= ~(inside & (longitude >= box.west) & (longitude <= box.east))
+        if not open_[: max(int(within / STEP), 1)].any():
+            return []
         found = [_around(path, first, last, pose) for first, last in _pieces(path, open_)]
         self._boxes.extend((box, pose.time) for box in found)
         return found

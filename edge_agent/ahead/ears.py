@@ -71,11 +71,14 @@ class Ears:
         """Whether a router was there at the last look."""
         return bool(self._routers)
 
-    def follow(self, paths: list[Path], pose: Pose) -> None:
-        """Hear and ask for what lies along the ways on, the likeliest first; never waits for an answer."""
+    def follow(self, paths: list[Path], pose: Pose, within: float) -> None:
+        """Hear and ask for what lies along the ways on, the likeliest first; never waits for an answer.
+
+        Alerts are heard for the metres `within`; the map is asked for further on, see `Asked.wanting`.
+        """
         routers = frozenset(str(zid) for zid in self._session.info.routers_zid())
         back, self._routers = bool(routers - self._routers), routers
-        fresh, gone = self._tiles.follow(paths, pose)
+        fresh, gone = self._tiles.follow([path.near(within) for path in paths], pose)
         for tile in gone:
             self._subscribers.pop(tile).undeclare()
         for tile in fresh:
@@ -87,7 +90,7 @@ class Ears:
         for tile in self._tiles.heard if back else fresh:  # after the subscription: none is missed in between
             self._get(keys.alert_key(tile), self._on_standing)
         for path in paths:
-            for box in self._asked.wanting(path, pose):
+            for box in self._asked.wanting(path, pose, within):
                 self._ask(box)
         with self._lock:
             self._map.forget(pose.time)

@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 import zenoh
 
+from edge_agent.ahead.asking import FURTHER_M
 from edge_agent.ahead.ears import Ears
 from edge_agent.ahead.horizon import Horizon, horizon_length, look_ahead
 from edge_agent.ahead.path import GivenRoute, Path, Pose, corridor
@@ -189,8 +190,8 @@ class Lookout:
     def _look(self, k: int, watcher: _Watcher, ears: Ears, pose: Pose) -> None:
         length = horizon_length(pose.speed)
         with ears.looking():
-            paths = paths_ahead(pose, self._route_of(k), ears, length)
-            horizons = [look_ahead(path, ears.known, pose.time) for path in paths]
+            paths = paths_ahead(pose, self._route_of(k), ears, length + FURTHER_M)
+            horizons = [look_ahead(path.near(length), ears.known, pose.time) for path in paths]
             watcher.active, told = warn(watcher.active, horizons, pose, ears.known)
         watcher.places = frozenset(np.concatenate([path.places.ravel() for path in paths]).tolist())
         self.counts.looks += 1
@@ -202,7 +203,7 @@ class Lookout:
             watcher.name, pose.time, paths[0].kind, (*(one.told for one in watcher.active), *ended), runs(horizons[0]),
             tuple(self._here[k].tolist()),
         )  # fmt: skip
-        ears.follow(paths, pose)
+        ears.follow(paths, pose, length)
         outlook = watcher.outlook
         ears.tell(lambda: encode_ahead(outlook))
 

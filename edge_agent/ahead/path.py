@@ -58,6 +58,11 @@ class Path(NamedTuple):
     x: FloatArray
     y: FloatArray
 
+    def near(self, length: float) -> Path:
+        """Its first metres."""
+        n = max(int(length), 1)
+        return Path(self.kind, self.distance[:n], self.places[:n], self.curvature[:n], self.x[:n], self.y[:n])
+
 
 def plane(latitude: FloatArray, longitude: FloatArray, pose: Pose) -> tuple[FloatArray, FloatArray]:
     """East and north [m] of the car; exact to a centimetre within a kilometre."""

@@ -63,6 +63,7 @@ def warn(
     told: list[GripWarning] = []
     stretches = [stretch for horizon in horizons for stretch in _stretches(horizon, pose.speed)]
     kept: dict[str, Active] = {one.told.id: one for one in active}
+    here: set[str] = set()  # those that lie ahead now
     for places, ways in _by_place(stretches):
         nearest = min(ways, key=lambda stretch: stretch.start)
         before = next((one for one in kept.values() if one.places & places), None)
@@ -75,7 +76,9 @@ def warn(
             one = _warning(name, "raised", nearest, pose, sure)
             told.append(one)
             kept[name] = Active(one, places, pose.time, nearest.start)
+            here.add(name)
             continue
+        here.add(before.told.id)
         name, one = before.told.id, _warning(before.told.id, "updated", nearest, pose, sure)
         grown = len(places - before.places) >= CHANGED_PLACES
         if grown or abs(one.mu - before.told.mu) >= CHANGED_MU:
@@ -84,7 +87,7 @@ def warn(
         else:
             kept[name] = replace(before, seen=pose.time, distance_m=nearest.start)
     for name, last in list(kept.items()):
-        if last.seen == pose.time:
+        if name in here:
             continue
         stands = worth_a_warning(known.look_up(np.array(sorted(last.places)), pose.time)).any()
         if not stands or pose.time - last.seen > ABSENT_S * NS:

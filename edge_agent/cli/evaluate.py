@@ -18,10 +18,11 @@ if TYPE_CHECKING:
 
 LEAST_SEEDS: Final = 20  # of a campaign whose bars count
 QUICK_SEEDS: Final = 2
-ONLY: Final = ("inputs",)
+ONLY: Final = ("inputs", "ahead")
 LEARNED_CARS: Final = 20
 LIVE_S: Final = 60.0
 QUICK_S: Final = 10
+ENTRY_TOWNS: Final = 4  # of the map as a prior, where the estimator itself drives
 CARS: Final = 5  # smooth ones, and as many rough ones, of the inputs' campaign
 
 
@@ -31,7 +32,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quick", action="store_true", help="three scenarios, two estimators, two seeds: does it run?")
     parser.add_argument("--seeds", type=int, help=f"how many drives per scenario (default {LEAST_SEEDS})")
     parser.add_argument(
-        "--only", choices=ONLY, help="a campaign of its own: inputs: readers, signal doctor, calibration, live sources"
+        "--only",
+        choices=ONLY,
+        help="a campaign of its own: inputs: readers, signal doctor, calibration, live sources; "
+        "ahead: warnings, their cost and delay, the map as a prior",
     )
     parser.add_argument(
         "--plots", choices=("png", "svg", "pdf"), default="png", help="their format (default %(default)s)"
@@ -61,6 +65,8 @@ def run(args: argparse.Namespace) -> int:
         args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError("out", f"cannot make {args.out} ({error.strerror})", "name another folder") from error
+    if args.only == "ahead":
+        return _ahead(args, count)
     if args.only:
         return _inputs(args)
     began, seeds = time.monotonic(), range(FIGURES, FIGURES + count)
@@ -89,6 +95,30 @@ def _inputs(args: argparse.Namespace) -> int:
         figures = _measured(Path(scratch), args)
     write(args.out / "figures.json", "edge-agent evaluate --only inputs", [FIGURES, FIGURES + 1], figures)
     text = f"# Inputs\n\n{markdown(figures)}\n"
+    (args.out / "report.md").write_text(text, encoding="utf-8")
+    print(text)
+    return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
+
+
+def _ahead(args: argparse.Namespace, count: int) -> int:
+    from edge_agent.lab.ahead import approaches, cost, entry, latency
+    from edge_agent.lab.seeds import FIGURES
+    from schemas.runtime.figures import markdown, write
+
+    seeds, quick = range(FIGURES, FIGURES + count), args.quick
+    rows: list[Callable[[], list[Figure]]] = [
+        lambda: cost.figures(FIGURES, 2e3 if quick else 20e3),
+        lambda: latency.figures(FIGURES, 20 if quick else 300, 20 if quick else latency.VEHICLES),
+        lambda: approaches.figures(seeds[:1] if quick else seeds, 60.0 if quick else 150.0, 6 if quick else 24),
+        lambda: entry.figures(seeds[:1] if quick else seeds[:ENTRY_TOWNS], 40.0 if quick else 90.0, 6 if quick else 16),
+    ]
+    figures: list[Figure] = []
+    for row in rows:
+        found = row()
+        figures += found
+        print(markdown(found).partition("|---|---|---|---|\n")[2], file=sys.stderr, flush=True)
+    write(args.out / "figures.json", "edge-agent evaluate --only ahead", list(seeds), figures)
+    text = f"# What lies ahead\n\n{markdown(figures)}\n"
     (args.out / "report.md").write_text(text, encoding="utf-8")
     print(text)
     return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1

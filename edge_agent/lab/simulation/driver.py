@@ -67,6 +67,7 @@ BETTER_S: Final = 2.5
 ALARM_S: Final = 0.7  # e-folding of his belief while wheels slide
 SLIDING: Final = 3.5  # normalised slip that he feels as sliding: well past the peak
 LEAST_BELIEF: Final = 0.12
+PREPARED_S: Final = 1.5  # before the stretch he expects its grip: three times WORSE_S
 WARNED_BRAKES: Final = 2.0  # [m/s^2] with which he slows down for a stretch that he was warned of
 SLOWEST: Final = 3.0  # [m/s] he creeps on, unless he stops
 LARGEST_STEER: Final = 0.55  # [rad]
@@ -193,6 +194,20 @@ def stops(t: float, share: float, key: Key) -> bool:
 
 
 @compiled
+def warned_square(d: FloatArray, g: IntArray, lanes: Lanes) -> float:
+    """Square of the speed [m^2/s^2] with which he means to come to the stretch that he was warned of.
+
+    As he was told, and so that he need not brake on it for what comes next by more than he expects it to bear.
+    """
+    row, _ = ahead(d, g, lanes, max(d[Driver.WARNED_START], 0.0))
+    lane = g[Route.LANE]
+    stays = lanes[1][lane] <= row < lanes[1][lane] + lanes[2][lane]
+    profile = lanes[0][row, LanePoint.PROFILE + (g[Route.WAY] if stays else 0)]
+    q = min(d[Driver.STYLE] * max(d[Driver.WARNED_MU], LEAST_BELIEF) * GRAVITY, d[Driver.COMFORT])
+    return float(max(min(d[Driver.WARNED_SPEED] ** 2, q * profile), SLOWEST**2))
+
+
+@compiled
 def wished_acceleration(
     x: FloatArray, d: FloatArray, g: IntArray, lanes: Lanes, p: FloatArray, t: float, key: Key
 ) -> float:
@@ -209,7 +224,7 @@ def wished_acceleration(
         there += (lanes[0][row + 1, LanePoint.PROFILE + g[Route.WAY]] - there) * beyond / lanes[3][lane]
     aim = min(q * there, cruise(d) ** 2)
     if heeds(d):
-        aim = min(aim, d[Driver.WARNED_SPEED] ** 2 + 2.0 * WARNED_BRAKES * max(d[Driver.WARNED_START] - reach, 0.0))
+        aim = min(aim, warned_square(d, g, lanes) + 2.0 * WARNED_BRAKES * max(d[Driver.WARNED_START] - reach, 0.0))
     wish = (max(aim, SLOWEST**2) - vx * vx) / (2.0 * reach)
     across = min(abs(vx * x[Motion.YAW_RATE]) / q, 1.0)
     room = math.sqrt(1.0 - across * across)  # what cornering leaves of the budget
@@ -273,7 +288,7 @@ def drive(
     point = lanes[0][number]
     looks = look_up(friction, PatchColumn.LOOKS, t, point[LanePoint.X], point[LanePoint.Y])
     heed(d, x[Motion.VX], dt)
-    if heeds(d) and d[Driver.WARNED_START] <= LOOKING_S * x[Motion.VX]:
+    if heeds(d) and d[Driver.WARNED_START] <= PREPARED_S * x[Motion.VX]:
         looks = min(looks, d[Driver.WARNED_MU])
     believe(d, looks, w, dt)
     acceleration = wished_acceleration(x, d, g, lanes, p, t, keys[1])

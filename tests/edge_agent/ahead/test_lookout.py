@@ -16,13 +16,13 @@ from edge_agent.ahead.asking import LEAVE_S, MOST_TILES, REFRESH_S, Asked, Tiles
 from edge_agent.ahead.hearing import heard_alert, heard_cells, heard_standing
 from edge_agent.ahead.lookout import Lookout
 from edge_agent.ahead.path import GivenRoute, Path, Pose, corridor
+from edge_agent.lab.ahead.made_up_service import MadeUpService, tile_payload
 from schemas import grid, keys, wire
 from schemas.errors import WireError
 from schemas.runtime.zenoh_session import open_session
 from schemas.thresholds import NS
 from schemas.wire.ahead import AHEAD_ENCODING, GripWarning, Outlook, decode_ahead, encode_ahead
 from tests.edge_agent.ahead.roads import HOME, alert, keys_on, line
-from tests.edge_agent.ahead.town import Town, tile_payload
 from tests.edge_agent.service import Router
 from tests.waiting import until
 
@@ -85,13 +85,13 @@ def driving(router: Router) -> Iterator[Driving]:
 
 
 @pytest.fixture
-def town(router: Router) -> Iterator[Town]:
+def town(router: Router) -> Iterator[MadeUpService]:
     """A service's side without any ice yet."""
-    with Town(router.settings, NOW) as town:
+    with MadeUpService(router.settings, NOW) as town:
         yield town
 
 
-def test_an_alert_ahead_is_a_warning_at_once_and_its_end_too(router: Router, town: Town) -> None:
+def test_an_alert_ahead_is_a_warning_at_once_and_its_end_too(router: Router, town: MadeUpService) -> None:
     with driving(router) as car:
         until(lambda: any("alert" in asked for asked in town.asked))
         town.put(alert(int(ICE[0]), time=NOW))
@@ -103,13 +103,13 @@ def test_an_alert_ahead_is_a_warning_at_once_and_its_end_too(router: Router, tow
         assert car.next().state == "ended"
 
 
-def test_ice_that_was_found_before_the_car_came_is_asked_for(router: Router, town: Town) -> None:
+def test_ice_that_was_found_before_the_car_came_is_asked_for(router: Router, town: MadeUpService) -> None:
     town.standing = [alert(int(key), time=NOW) for key in ICE]
     with driving(router) as car:
         assert car.next().mu == pytest.approx(0.15, abs=0.03)
 
 
-def test_the_map_alone_warns_and_what_it_says_lies_on_the_horizon(router: Router, town: Town) -> None:
+def test_the_map_alone_warns_and_what_it_says_lies_on_the_horizon(router: Router, town: MadeUpService) -> None:
     town.mu = {int(key): 0.85 for key in keys_on()} | {int(key): 0.15 for key in ICE}
     with driving(router) as car:
         warning = car.next()
@@ -122,7 +122,7 @@ def test_the_map_alone_warns_and_what_it_says_lies_on_the_horizon(router: Router
         assert all("bbox=" in asked for asked in town.asked if "/map/" in asked), "pieces, never the whole map"
 
 
-def test_what_lies_ahead_is_put_on_the_vehicles_own_key(router: Router, town: Town) -> None:
+def test_what_lies_ahead_is_put_on_the_vehicles_own_key(router: Router, town: MadeUpService) -> None:
     town.standing = [alert(int(ICE[0]), time=NOW)]
     owner = open_session(router.settings)
     assert owner is not None
@@ -143,7 +143,9 @@ def test_what_lies_ahead_is_put_on_the_vehicles_own_key(router: Router, town: To
     assert encode_ahead(told) == sample.payload.to_bytes()
 
 
-def test_ice_that_came_while_the_router_was_away_is_heard_when_the_session_is_back(router: Router, town: Town) -> None:
+def test_ice_that_came_while_the_router_was_away_is_heard_when_the_session_is_back(
+    router: Router, town: MadeUpService
+) -> None:
     with driving(router) as car:
         until(lambda: any("alert" in asked for asked in town.asked))
         router.stop()
@@ -155,7 +157,7 @@ def test_ice_that_came_while_the_router_was_away_is_heard_when_the_session_is_ba
         assert any("alert" in asked for asked in town.asked[before:])
 
 
-def test_without_a_link_the_horizon_fades_to_unknown_and_the_car_looks_on(router: Router, town: Town) -> None:
+def test_without_a_link_the_horizon_fades_to_unknown_and_the_car_looks_on(router: Router, town: MadeUpService) -> None:
     town.mu = {int(key): 0.85 for key in keys_on()}
     with driving(router) as car:
         car.until(lambda seen: (seen.runs.basis == known.MEASURED).sum() > 10)
@@ -174,14 +176,14 @@ def test_without_a_link_the_horizon_fades_to_unknown_and_the_car_looks_on(router
 
 def test_a_map_of_yesterday_says_how_old_it_is(router: Router) -> None:
     day = 86_400 * NS
-    with Town(router.settings, NOW - day) as town:
+    with MadeUpService(router.settings, NOW - day) as town:
         town.mu = {int(key): 0.85 for key in keys_on()}
         with driving(router) as car:
             seen = car.until(lambda seen: (seen.runs.basis == known.MEASURED).any())
             assert np.nanmin(seen.runs.age_s) == pytest.approx(86_400.0, rel=0.01)
 
 
-def test_where_it_is_the_car_believes_its_filter_and_the_map(router: Router, town: Town) -> None:
+def test_where_it_is_the_car_believes_its_filter_and_the_map(router: Router, town: MadeUpService) -> None:
     town.mu = {int(key): 0.2 for key in keys_on()}
     here, flat = np.array([keys_on()[0]]), (np.zeros((1, 32)), np.zeros((1, 32)))
     with driving(router) as car:
@@ -193,7 +195,7 @@ def test_where_it_is_the_car_believes_its_filter_and_the_map(router: Router, tow
         assert seen.here[2] > 0.7, "a map may be wrong"
 
 
-def test_a_hostile_tile_is_refused_counted_and_changes_nothing(router: Router, town: Town) -> None:
+def test_a_hostile_tile_is_refused_counted_and_changes_nothing(router: Router, town: MadeUpService) -> None:
     town.mu = {int(key): 0.15 for key in ICE}
     with driving(router) as car:
         assert car.next().state == "raised"
@@ -270,17 +272,17 @@ def _at(metre: float, seconds: float) -> Pose:
 def test_pieces_of_the_way_are_asked_for_once_and_again_when_they_are_old() -> None:
     asked, pose = Asked(), _at(0, 0)
     path = corridor(pose, 150.0)
-    boxes = asked.wanting(path, pose)
+    boxes = asked.wanting(path, pose, 100.0)
     assert 1 <= len(boxes) <= 6
     latitude, longitude = line(150.0)
     covered = np.zeros(150, bool)
     for box in boxes:
         covered |= (latitude >= box.south) & (latitude <= box.north) & (longitude >= box.west) & (longitude <= box.east)
     assert covered.all()
-    assert asked.wanting(path, pose) == []
-    assert asked.wanting(path, pose._replace(time=pose.time + round((REFRESH_S + 1) * NS)))
+    assert asked.wanting(path, pose, 100.0) == []
+    assert asked.wanting(path, pose._replace(time=pose.time + round((REFRESH_S + 1) * NS)), 100.0)
     asked.forget()
-    assert asked.wanting(path, pose), "the session has come back"
+    assert asked.wanting(path, pose, 100.0), "the session has come back"
 
 
 def test_a_handful_of_tiles_is_heard_and_a_car_at_a_border_does_not_flicker() -> None:

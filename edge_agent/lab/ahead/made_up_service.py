@@ -1,4 +1,4 @@
-"""A service's side for the tests of listening cars: answers for the map and for standing alerts, puts alerts."""
+"""A service's side for what judges listening cars: answers for the map and for standing alerts, puts alerts."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def tile_payload(key: IntArray, friction: float | FloatArray, now: int, **change
 
 
 @dataclass
-class Town:
-    """Serves places of known friction, and alerts."""
+class MadeUpService:
+    """Serves places of known friction (`mu` by cell * 4 + sector), and alerts that stand; notes what it was asked."""
 
     settings: ZenohSettings
     now: int
@@ -65,6 +65,7 @@ class Town:
         self.session.close()
 
     def put(self, alert: Alert) -> None:
+        """Raise or end an alert."""
         tile = int(grid.tile_of(alert.cell))
         self.session.put(keys.alert_key(tile), wire.encode_alert(alert), encoding=wire.ALERT_ENCODING)
 

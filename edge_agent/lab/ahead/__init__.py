@@ -1,0 +1,1 @@
+"""How well cars that listen are warned, what it costs, and what the map as a prior is worth."""

@@ -1,0 +1,155 @@
+"""Are cars that come to an alerted stretch warned in time, and no others? Simulated drivers, the real warnings.
+
+The link is up and the map known, within SPREAD of `known_town`: what is judged is what a car makes of it, with the
+fixes of its receiver. A car is warned in time when it could stop before the stretch from where it was told: 1.5 s of
+reaction, then braking with the true friction of the road before it, with 3 m/s² at the most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from edge_agent.ahead.horizon import COMFORT, REACTION_S, horizon_length, look_ahead
+from edge_agent.ahead.known import HeardMap
+from edge_agent.ahead.path import GivenRoute, Path, Pose, corridor
+from edge_agent.ahead.roads import ways_on
+from edge_agent.ahead.warnings import Active, warn
+from edge_agent.lab.ahead.known_town import heard, places_of
+from edge_agent.lab.simulation import SimulatedFleet
+from edge_agent.observe.cell_tracker import locate, new_tracks
+from schemas.numeric import FloatArray
+from schemas.runtime.figures import Figure
+from schemas.thresholds import GRAVITY, NS
+
+RATE_HZ: Final = 50.0
+AFTER_S: Final = 80.0  # of the scenario's clock: all its events have happened
+SETTLE_S: Final = 10.0  # until the cars are under way
+NEW_M: Final = 60.0  # without ice before an approach counts as one
+ALERTED: Final = 0.3  # what lies below has P(slippery) > 0.9 on such a map, and the service alerts
+NEAR_SLIPPERY: Final = 0.45  # a stretch may begin in a cell that is half ice
+START_NS: Final = 1_800_000_000 * NS
+
+
+@dataclass
+class Approaches:
+    """What was counted."""
+
+    came: int = 0
+    warned: int = 0
+    raised: int = 0
+    false: int = 0
+    metres: float = 0.0
+    short: list[float] = field(default_factory=list)  # [m] too late
+
+
+@dataclass
+class _Track:
+    """One car's way: metre, speed and friction at each look, what it was told, and where it is on the ice."""
+
+    metre: list[float] = field(default_factory=list)
+    speed: list[float] = field(default_factory=list)
+    mu: list[float] = field(default_factory=list)
+    told: list[tuple[int, float, float]] = field(default_factory=list)  # look, distance, length
+    active: tuple[Active, ...] = ()
+
+
+def figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Figure]:
+    """Shares and rates over drawn towns, on given routes and, beside them, without."""
+    found = {routed: Approaches() for routed in (True, False)}
+    for seed in seeds:
+        for routed, counts in found.items():
+            drive(seed, seconds, vehicles, counts, routed=routed)
+    out = []
+    for routed, ending in ((True, ""), (False, ".unrouted")):
+        counts = found[routed]
+        km = counts.metres / 1e3
+        out += [
+            Figure(f"ahead.warned_share{ending}", counts.warned / counts.came if counts.came else float("nan"), "",
+                   0.99 if routed else None, "more"),
+            Figure(f"ahead.false_per_1000km{ending}", 1e3 * counts.false / km if km else float("nan"), "",
+                   1 if routed else None),
+            Figure(f"ahead.approaches{ending}", counts.came, "to alerted stretches"),
+            Figure(f"ahead.driven_km{ending}", km, "km"),
+        ]  # fmt: skip
+    return out
+
+
+def drive(seed: int, seconds: float, vehicles: int, counts: Approaches, *, routed: bool) -> None:
+    """Drive one town and add what happened to the counts."""
+    fleet = SimulatedFleet(f"hills-{seed}", vehicles, seed, RATE_HZ, rough=0.5)
+    known = heard(places_of(fleet.scenario, AFTER_S), START_NS)
+    tracks, located_tracks = [_Track() for _ in range(vehicles)], new_tracks(vehicles)
+    steps, driven = round(RATE_HZ), np.zeros(vehicles)
+    fleet.step(round(AFTER_S * RATE_HZ))
+    for second in range(int(seconds)):
+        t, signals = fleet.step(steps)
+        located_tracks, located = locate(located_tracks, t, signals)
+        true = fleet.truth
+        moved = np.hypot(np.diff(true.x, axis=0), np.diff(true.y, axis=0)).sum(axis=0)
+        driven += moved
+        counts.metres += float(moved.sum())
+        for k, track in enumerate(tracks):
+            latitude, longitude, yaw = (
+                float(column[-1, k]) for column in (located.latitude, located.longitude, located.yaw)
+            )
+            pose = Pose(latitude, longitude, yaw, float(true.vx[-1, k]), START_NS + second * NS)
+            track.metre.append(float(driven[k]))
+            track.speed.append(pose.speed)
+            track.mu.append(float(true.mu_wheel[:, k].min()))
+            if np.isfinite([latitude, longitude, yaw]).all():
+                _look(track, pose, known, _ways(fleet, k, pose, known, routed=routed))
+    for track in tracks:
+        _judge(track, counts)
+
+
+def _ways(fleet: SimulatedFleet, k: int, pose: Pose, known: HeardMap, *, routed: bool) -> list[Path]:
+    length = horizon_length(pose.speed)
+    if routed:
+        given = GivenRoute(*fleet.route_ahead(k, length + 50.0)).ahead(pose, length)
+        if given is not None:
+            return [given]
+    return ways_on(pose, known.keys(), length) or [corridor(pose, length)]
+
+
+def _look(track: _Track, pose: Pose, known: HeardMap, ways: list[Path]) -> None:
+    now = pose.time
+    known_now = known  # the link is up: nothing fades
+    track.active, told = warn(track.active, [look_ahead(way, known_now, now) for way in ways], pose, known_now)
+    look = len(track.metre) - 1
+    track.told += [(look, one.distance_m, one.length_m) for one in told if one.state == "raised"]
+
+
+def _judge(track: _Track, counts: Approaches) -> None:
+    metre, speed, mu = (np.array(column) for column in (track.metre, track.speed, track.mu))
+    slippery = mu < ALERTED
+    for look in np.flatnonzero(slippery[1:] & ~slippery[:-1]) + 1:
+        far = metre[look] - metre
+        before = (far > 0.0) & (far <= NEW_M)
+        if look < SETTLE_S or not before.any() or slippery[before].any():
+            continue
+        counts.came += 1
+        start = float(metre[look - 1])  # the ice begins after the look before, at the latest by this one
+        late = min(
+            (_short(metre, speed, mu, at, start) for at, *_ in track.told if metre[look] - 250.0 <= metre[at] <= start),
+            default=float("inf"),
+        )
+        counts.warned += late <= 0.0
+        if late > 0.0:
+            counts.short.append(late)
+    counts.raised += len(track.told)
+    for at, distance, length in track.told:
+        ahead = (metre >= metre[at] - 10.0) & (metre <= metre[at] + distance + length + 30.0)
+        whole = metre[-1] >= metre[at] + distance + length + 30.0  # the drive went on so far
+        counts.false += bool(whole and not (mu[ahead] < NEAR_SLIPPERY).any())
+
+
+def _short(metre: FloatArray, speed: FloatArray, mu: FloatArray, at: int, start: float) -> float:
+    """By how much the way to the stretch [m] is too short to stop on it, from look `at`; 0 or less: it is not."""
+    v = float(speed[at])
+    on_the_way = (metre >= metre[at]) & (metre <= start)
+    brakes = min(GRAVITY * float(mu[on_the_way].min()), COMFORT) if on_the_way.any() else COMFORT
+    return v * REACTION_S + v * v / (2.0 * brakes) - (start - float(metre[at]))

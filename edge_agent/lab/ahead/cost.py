@@ -1,0 +1,116 @@
+"""What listening costs a car in a day: megabytes down in a busy city, and processor.
+
+The city is a grid of streets 100 m apart, every place of both directions measured, STANDING alerts in each tile; the
+car drives DAY_KM through it at city speed. The bytes are those of the answers that a service would send, with their
+keys and FRAME bytes of transport each.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Final
+
+import numpy as np
+
+from edge_agent.ahead.asking import FURTHER_M, Asked, Tiles, keys_of
+from edge_agent.ahead.hearing import heard_cells
+from edge_agent.ahead.horizon import horizon_length, look_ahead
+from edge_agent.ahead.known import HeardMap
+from edge_agent.ahead.path import GivenRoute, Path, Pose, corridor, degrees
+from edge_agent.ahead.roads import ways_on
+from edge_agent.ahead.warnings import Active, warn
+from edge_agent.lab.ahead.made_up_service import tile_payload
+from schemas import grid, keys
+from schemas.numeric import FloatArray, IntArray
+from schemas.runtime.figures import Figure
+from schemas.thresholds import NS
+
+DAY_KM: Final = 40.0  # of a car in Europe: 13 000 km a year on 325 days
+SPEED: Final = 9.0  # [m/s]
+BLOCK_M: Final = 100.0
+BLOCKS: Final = 40  # a side of the city
+STANDING: Final = 3  # alerts in each tile of 1.3 km, put again every two seconds
+ALERT_BYTES: Final = 190  # of one, with its key
+FRAME: Final = 40
+CENTRE: Final = Pose(57.70, 11.97, 0.0, SPEED, 1_800_000_000 * NS)
+
+
+def streets() -> IntArray:
+    """Every place of the city's streets, sorted."""
+    side = np.arange(0.0, BLOCK_M * BLOCKS, 4.0)
+    line = np.arange(0.0, BLOCK_M * (BLOCKS + 1), BLOCK_M)
+    found = []
+    for offset, sectors in ((2.0, (0, 1)), (-2.0, (2, 3))):
+        for along_x, sector in zip((True, False), sectors, strict=True):
+            a, b = (grid_.ravel() for grid_ in np.meshgrid(side, line + (-offset if along_x else offset)))
+            cell = grid.cell_of(*degrees(*((a, b) if along_x else (b, a)), CENTRE))
+            found.append(np.unique(cell) * grid.SECTORS + sector)
+    return np.unique(np.concatenate(found))
+
+
+def way(rng: np.random.Generator, metres: float) -> FloatArray:
+    """A drive through the city, corners (n, 2) [m]: at each crossing straight on, left or right, never out of it."""
+    here, heading = np.array([BLOCKS // 2, BLOCKS // 2]), 0
+    corners = [here]
+    for _ in range(math.ceil(metres / BLOCK_M)):
+        turns = [heading, heading, heading, (heading + 1) % 4, (heading + 3) % 4]
+        rng.shuffle(turns)
+        for turn in turns:
+            there = here + np.array([[1, 0], [0, 1], [-1, 0], [0, -1]][turn])
+            if ((there >= 0) & (there <= BLOCKS)).all():
+                here, heading = there, turn
+                break
+        corners.append(here)
+    return np.array(corners) * BLOCK_M
+
+
+def figures(seed: int, metres: float) -> list[Figure]:
+    """Megabytes a day and share of a core, on a given route and, beside it, without."""
+    known, out = streets(), []
+    for routed, ending in ((True, ""), (False, ".unrouted")):
+        megabytes, share = drive(np.random.default_rng(seed), known, metres, routed=routed)
+        out += [
+            Figure(f"ahead.mb_per_day{ending}", megabytes * 1e3 * DAY_KM / metres, "MB", 5 if routed else None),
+            Figure(f"ahead.core_share{ending}", share, "of a core", 0.01 if routed else None),
+        ]
+    return out
+
+
+def drive(rng: np.random.Generator, known: IntArray, metres: float, *, routed: bool) -> tuple[float, float]:
+    """Megabytes heard, and processor time over time driven."""
+    corners = way(rng, metres)
+    run = BLOCK_M * np.arange(len(corners))
+    route = GivenRoute(*degrees(corners[:, 0], corners[:, 1], CENTRE))
+    heard, asked, tiles = HeardMap(), Asked(), Tiles()
+    active: tuple[Active, ...] = ()
+    total, spent = 0, 0.0
+    for second in range(int(metres / SPEED)):
+        s = second * SPEED
+        x, y = np.interp(s, run, corners[:, 0]), np.interp(s, run, corners[:, 1])
+        step = corners[min(int(s / BLOCK_M) + 1, len(corners) - 1)] - corners[int(s / BLOCK_M)]
+        latitude, longitude = degrees(np.asarray(x), np.asarray(y), CENTRE)
+        now = CENTRE.time + second * NS
+        pose = Pose(float(latitude), float(longitude), math.atan2(step[1], step[0]), SPEED, now)
+        began, length = time.process_time(), horizon_length(SPEED)
+        paths: list[Path] = []
+        if routed and (given := route.ahead(pose, length + FURTHER_M)) is not None:
+            paths = [given]
+        paths = paths or ways_on(pose, heard.keys(), length + FURTHER_M) or [corridor(pose, length)]
+        active, _ = warn(active, [look_ahead(path.near(length), heard, now) for path in paths], pose, heard)
+        tiles.follow([path.near(length) for path in paths], pose)
+        boxes = [box for path in paths for box in asked.wanting(path, pose, length)]
+        spent += time.process_time() - began
+        for box in boxes:
+            inside = known[grid.touches(box, grid.bounds(known // grid.SECTORS))]
+            tile = grid.tile_of(inside // grid.SECTORS)
+            for one in np.unique(tile).tolist():
+                payload, key = tile_payload(inside[tile == one], 0.7, now), keys.map_key(one)
+                total += len(payload) + len(key) + FRAME
+                began = time.process_time()
+                heard.take(*heard_cells(key, payload, now), now)
+                spent += time.process_time() - began
+            total += FRAME * len(keys_of(box))
+        if second % 2 == 0:
+            total += len(tiles.heard) * STANDING * (ALERT_BYTES + FRAME)
+    return total / 1e6, spent / int(metres / SPEED)

@@ -1,0 +1,198 @@
+"""What the map as a prior is worth: the error at entry, how long a wrong map delays, and what of it is published.
+
+One drive of the default estimator through drawn towns gives what each filter believed and measured, ten times a second;
+the maps are laid beside it afterwards, since the filter never sees one. A map is `known_town`'s: off by chance as far
+as it says. It is wrong where the scenario's black ice appears, dry as it was before; and, the other way round, where it
+says ice of as long a stretch that is dry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from edge_agent.ahead.known import HeardMap
+from edge_agent.ahead.prior import NOWHERE, MapPrior
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.inputs.block import Block, absolute
+from edge_agent.lab.ahead.known_town import KnownPlaces, heard, places_of
+from edge_agent.lab.simulation import SimulatedFleet
+from edge_agent.lab.simulation.roads import LanePoint
+from edge_agent.lab.simulation.scenarios import Scenario
+from edge_agent.observe.pipeline import Pipeline
+from schemas import grid, mugrid
+from schemas.config import AgentConfig
+from schemas.numeric import BoolArray, FloatArray, IntArray
+from schemas.runtime.figures import Figure
+from schemas.thresholds import NS
+
+RATE_HZ: Final = 100.0
+BLOCK: Final = 10
+FIRST_S: Final = 1.0
+ARRIVED: Final = 0.1  # as `arrival` in the evaluation
+START_NS: Final = 1_800_000_000 * NS
+BEFORE_S: Final = 0.0  # of the scenario's clock: no event yet
+FAKE_ICE: Final = 0.15
+FAKE_M: Final = 22.0  # half of a fake stretch
+
+
+@dataclass
+class Heading:
+    """What N filters said at each of T blocks: place (T, N), own and visit (T, N, 32), truth (T, N)."""
+
+    place: IntArray
+    own: FloatArray
+    visit: FloatArray
+    truth: FloatArray
+    published: list[bytes]
+
+
+def figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Figure]:
+    """Ratios over all towns, and the largest change of what is published."""
+    errors: list[FloatArray] = []
+    delays: dict[str, list[tuple[float, float]]] = {"dry": [], "ice": []}
+    nats = 0.0
+    for seed in seeds:
+        fleet = SimulatedFleet(f"hills-{seed}", vehicles, seed, RATE_HZ, rough=0.5)
+        said = record(fleet, seconds)
+        scenario, now = fleet.scenario, START_NS
+        rng = np.random.default_rng(seed)
+        true_map = heard(places_of(scenario, seconds), now, rng)
+        old_map = heard(places_of(scenario, BEFORE_S), now, rng)
+        fake_map = heard(_with_fake_ice(scenario, seconds, rng), now, rng)
+        errors.append(entry_errors(said, true_map, now))
+        # where the old map says grip and there is ice; where the fake one says ice and there is grip
+        for name, wrong in (("ice", old_map), ("dry", fake_map)):
+            delays[name] += arrivals(said, wrong, true_map, now)
+        nats = max(nats, published_change(fleet, said, seconds))
+    with_, without = np.concatenate(errors).T
+    out = [
+        Figure("prior.entry_error_ratio", float(with_.mean() / without.mean()), "", 0.5),
+        Figure("prior.entry_error.with", float(with_.mean()), "mean |error|"),
+        Figure("prior.entry_error.without", float(without.mean()), "mean |error|"),
+    ]
+    both = np.array([pair for pairs in delays.values() for pair in pairs]).reshape(-1, 2)
+    out.append(Figure("prior.wrong_map_delay_ratio", _ratio(both), "", 1.2))
+    for name, pairs in delays.items():
+        out.append(Figure(f"prior.wrong_map_delay_ratio.{name}_there", _ratio(np.array(pairs).reshape(-1, 2)), ""))
+        out.append(Figure(f"prior.wrong_map.{name}_there", len(pairs), "stretches"))
+    return [*out, Figure("prior.evidence_nats", nats, "nat", 0.5)]
+
+
+def record(fleet: SimulatedFleet, seconds: float, prior: HeardMap | None = None) -> Heading:
+    """Drive, and note what the filters say; with a `prior`, as a car does that hears that map."""
+    vehicles = len(fleet.vehicles)
+    config = AgentConfig()
+    pipeline = Pipeline(bank_of(config.estimator, fleet.vehicles), vehicles, config)
+    columns: list[tuple[IntArray, FloatArray, FloatArray, FloatArray]] = []
+    published: list[bytes] = []
+    informed = MapPrior(vehicles)
+    for _ in range(int(seconds * RATE_HZ / BLOCK)):
+        t, signals = fleet.step(BLOCK)
+        _, seen, _ = pipeline.step(Block(t, absolute(t, START_NS), signals))
+        published += [row.tobytes() for row in seen.columns["log_likelihood"]]
+        beliefs = pipeline.beliefs()
+        if beliefs is None:
+            raise RuntimeError("the default estimator tells no belief")
+        if prior is not None:
+            now = START_NS
+            told = {k: _belief(prior, int(pipeline.places[k]), now) for k in informed.enters(pipeline.places)}
+            informed.step(pipeline.places, *beliefs, told)
+        columns.append((pipeline.places, *beliefs, fleet.truth.mu_wheel[-1].mean(axis=1)))
+    place, own, visit, truth = (np.stack(column) for column in zip(*columns, strict=True))
+    return Heading(place, own, visit, truth, published)
+
+
+def entry_errors(said: Heading, known: HeardMap, now: int) -> FloatArray:
+    """|error| of the median within FIRST_S of entering a cell that the map knows, (n, 2): with the map and without."""
+    told, alone = with_map(said, known, now), _medians(np.exp(said.own))
+    since = _since_entry(said.place)
+    first = (since * BLOCK / RATE_HZ < FIRST_S) & np.isin(said.place, known.keys())
+    first[: int(RATE_HZ / BLOCK * 5.0)] = False  # the first seconds of a drive are nobody's entry
+    return np.column_stack([np.abs(one - said.truth)[first] for one in (told, alone)])
+
+
+def arrivals(said: Heading, wrong: HeardMap, right: HeardMap, now: int) -> list[tuple[float, float]]:
+    """Seconds from where a map is wrong until |μ - truth| <= ARRIVED, with it and without; the stay, if never."""
+    differ = _differ(said.place, wrong, right, now)
+    told, alone = with_map(said, wrong, now), _medians(np.exp(said.own))
+    out = []
+    for k in range(said.place.shape[1]):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], differ[:, k], [False]]).astype(np.int8)))
+        for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+            if last - first < RATE_HZ / BLOCK:  # less than a second there
+                continue
+            pair = []
+            for one in (told, alone):
+                near = np.abs(one[first:last, k] - said.truth[first:last, k]) <= ARRIVED
+                pair.append((int(near.argmax()) if near.any() else last - first) * BLOCK / RATE_HZ)
+            out.append((pair[0], pair[1]))
+    return out
+
+
+def published_change(fleet: SimulatedFleet, said: Heading, seconds: float) -> float:
+    """Largest change [nat] of a published likelihood where the cars hear a map that is wrong everywhere."""
+    seed = int(fleet.scenario.name.split("-")[1])
+    again = SimulatedFleet(fleet.scenario, len(fleet.vehicles), seed, RATE_HZ, rough=0.5)
+    short = min(seconds, 20.0)
+    lie = places_of(fleet.scenario, 0.0)
+    heard_lie = heard(lie._replace(mu=np.where(lie.mu < 0.4, 0.9, 0.15)), START_NS)
+    other = record(again, short, heard_lie).published
+    count = min(len(other), len(said.published))
+    if not count:
+        return float("nan")
+    pairs = (np.frombuffer(b"".join(rows[:count]), np.uint8).astype(np.float64) for rows in (other, said.published))
+    a, b = pairs
+    return float(np.abs(a - b).max()) / mugrid.STEPS_PER_NAT
+
+
+def with_map(said: Heading, known: HeardMap, now: int) -> FloatArray:
+    """Median of what would be believed with a map, (T, N)."""
+    prior, out = MapPrior(said.place.shape[1]), np.empty(said.place.shape)
+    for t, place in enumerate(said.place):
+        told = {k: _belief(known, int(place[k]), now) for k in prior.enters(place)}
+        out[t] = mugrid.quantiles(prior.step(place, said.own[t], said.visit[t], told), 0.5)
+    return out
+
+
+def _belief(known: HeardMap, place: int, now: int) -> FloatArray | None:
+    return known.belief(place, now) if place != NOWHERE else None
+
+
+def _medians(weights: FloatArray) -> FloatArray:
+    return mugrid.quantiles(weights, 0.5)
+
+
+def _since_entry(place: IntArray) -> IntArray:
+    out = np.zeros(place.shape, np.int64)
+    for t in range(1, len(place)):
+        out[t] = np.where(place[t] == place[t - 1], out[t - 1] + 1, 0)
+    return out
+
+
+def _differ(place: IntArray, wrong: HeardMap, right: HeardMap, now: int) -> BoolArray:
+    """Where one map says slippery and the other does not."""
+    keys, inverse = np.unique(place, return_inverse=True)
+    one, other = (known.look_up(keys, now).mu for known in (wrong, right))
+    with np.errstate(invalid="ignore"):
+        apart = (np.abs(one - other) > 0.3) & ((one < 0.4) != (other < 0.4))
+    return np.asarray(apart[inverse.reshape(place.shape)])
+
+
+def _with_fake_ice(scenario: Scenario, t: float, rng: np.random.Generator) -> KnownPlaces:
+    places = places_of(scenario, t)
+    points = scenario.network.points
+    mu = places.mu.copy()
+    latitude, longitude = grid.centre(places.key // grid.SECTORS)
+    x, y = scenario.from_latlon(latitude, longitude)
+    for row in points[rng.integers(0, len(points), 6)]:
+        near = np.hypot(x - row[LanePoint.X], y - row[LanePoint.Y]) <= FAKE_M
+        mu[near & (mu > 0.5)] = FAKE_ICE
+    return places._replace(mu=mu)
+
+
+def _ratio(pairs: FloatArray) -> float:
+    return float(pairs[:, 0].sum() / pairs[:, 1].sum()) if len(pairs) and pairs[:, 1].sum() > 0.0 else float("nan")

@@ -1,0 +1,51 @@
+"""A scenario's roads as a fleet that has been everywhere would know them: every place with its truth."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from edge_agent.ahead.known import MEASURED, HeardCells, HeardMap, belief_of
+from edge_agent.lab.simulation.roads import LanePoint
+from edge_agent.lab.simulation.scenarios import Scenario
+from schemas import grid, mugrid
+from schemas.numeric import FloatArray, IntArray
+from schemas.thresholds import SLIPPERY_MU, Z_95
+
+VEHICLES = 4
+SPREAD = 0.06  # standard deviation of what the map says of a cell, and of how far it is off
+
+
+class KnownPlaces(NamedTuple):
+    """Places that lanes lead through, each once, (n,): cell * 4 + sector, and least friction there."""
+
+    key: IntArray
+    mu: FloatArray
+
+
+def places_of(scenario: Scenario, t: float) -> KnownPlaces:
+    """The places of a scenario's lanes as they are at t [s]."""
+    points = scenario.network.points
+    x, y = points[:, LanePoint.X], points[:, LanePoint.Y]
+    yaw = np.arctan2(points[:, LanePoint.SIN], points[:, LanePoint.COS])
+    key = grid.cell_of(*scenario.to_latlon(x, y)) * grid.SECTORS + grid.sector_of(yaw)
+    mu = scenario.friction(t, x, y)
+    order = np.lexsort((mu, key))
+    first = np.append(True, np.diff(key[order]) > 0)
+    return KnownPlaces(key[order][first], mu[order][first])
+
+
+def heard(places: KnownPlaces, now: int, rng: np.random.Generator | None = None) -> HeardMap:
+    """What a car has heard that was told of all places, by the truth, or off it by chance."""
+    off = np.zeros(len(places.key)) if rng is None else rng.normal(0.0, SPREAD, len(places.key))
+    mu = np.clip(places.mu + off, mugrid.LOWER + 0.02, mugrid.UPPER - 0.02)
+    lower, upper = np.maximum(mu - Z_95 * SPREAD, mugrid.LOWER), np.minimum(mu + Z_95 * SPREAD, mugrid.UPPER)
+    slippery = np.clip(0.5 + (SLIPPERY_MU - mu) / (3.0 * SPREAD), 0.0, 1.0)
+    belief, cache = belief_of(lower, mu, upper, slippery), HeardMap(most_cells=1 << 20)
+    n = len(places.key)
+    cells = HeardCells(places.key, belief, *(np.full(n, value) for value in (MEASURED, VEHICLES, now, now)))
+    tiles = grid.tile_of(places.key // grid.SECTORS)
+    for tile in np.unique(tiles).tolist():
+        cache.take(tile, HeardCells._make(column[tiles == tile] for column in cells), now)
+    return cache

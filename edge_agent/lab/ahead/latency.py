@@ -1,0 +1,129 @@
+"""From an alert's put to the warning: VEHICLES cars of one process, a session each, all of them looking, a real router.
+
+Every car stands on a road of its own and looks ahead each second; the service's side answers their questions. Alerts
+are put, one after the other, on the roads of cars drawn by chance, and what comes back is timed.
+"""
+
+from __future__ import annotations
+
+import json
+import queue
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Final
+
+import numpy as np
+import zenoh
+
+from edge_agent.ahead.lookout import Lookout
+from edge_agent.ahead.path import Pose, degrees
+from edge_agent.lab.ahead.made_up_service import MadeUpService
+from schemas import grid
+from schemas.config import ZenohSettings
+from schemas.numeric import FloatArray
+from schemas.runtime.figures import Figure
+from schemas.runtime.zenoh_session import open_session
+from schemas.thresholds import NS
+from schemas.wire import Alert
+from schemas.wire.ahead import GripWarning
+
+VEHICLES: Final = 200
+APART_M: Final = 60.0  # roads, northwards of each other
+AHEAD_M: Final = 45.0
+SPEED: Final = 14.0
+PATIENCE_S: Final = 10.0
+SETTLE_S: Final = 3.0
+ORIGIN: Final = Pose(57.70, 11.97, 0.0, SPEED, 0)
+
+
+@contextmanager
+def router() -> Iterator[ZenohSettings]:
+    """A router in this process, on a free port of loopback."""
+    config = zenoh.Config()
+    chosen = {
+        "mode": "router", "listen/endpoints": ["tcp/127.0.0.1:0"], "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False, "scouting/delay": 0, "adminspace/enabled": True,
+        "transport/shared_memory/enabled": False,
+    }  # fmt: skip
+    for key, value in chosen.items():
+        config.insert_json5(key, json.dumps(value))
+    with zenoh.open(config) as session:
+        answer = next(iter(session.get(f"@/{session.zid()}/router"))).ok
+        if answer is None:
+            raise RuntimeError("the router does not tell its endpoints")
+        yield ZenohSettings(connect=[json.loads(answer.payload.to_string())["locators"][0]])
+
+
+def figures(seed: int, alerts: int, vehicles: int = VEHICLES) -> list[Figure]:
+    """Quantiles of the time from put to warning, and the processor's share of looking."""
+    waited, share, lost = measure(np.random.default_rng(seed), alerts, vehicles)
+    return [
+        Figure("ahead.latency_p99_ms", float(np.quantile(waited, 0.99)) * 1e3 if len(waited) else float("nan"), "ms",
+               250),
+        Figure("ahead.latency_p50_ms", float(np.median(waited)) * 1e3 if len(waited) else float("nan"), "ms"),
+        Figure("ahead.latency.unwarned", lost, f"of {alerts} alerts", 0),
+        Figure("ahead.core_share.live", share, "of a core and car, questions included", 0.01),
+    ]  # fmt: skip
+
+
+def measure(rng: np.random.Generator, alerts: int, vehicles: int) -> tuple[list[float], float, int]:
+    """Seconds of each alert, share of a core per car, and alerts that no warning came of."""
+    names = [f"car-{k:04d}" for k in range(vehicles)]
+    told: dict[str, queue.Queue[tuple[float, GripWarning]]] = {name: queue.Queue() for name in names}
+
+    def hear(name: str, warning: GripWarning) -> None:
+        told[name].put((time.perf_counter(), warning))
+
+    places = [degrees(np.zeros(1), np.array([APART_M * k]), ORIGIN) for k in range(vehicles)]
+
+    def poses() -> list[Pose]:
+        now = time.time_ns()
+        return [Pose(float(a[0]), float(o[0]), 0.0, SPEED, now) for a, o in places]
+
+    waited: list[float] = []
+    lost = 0
+    with router() as settings, MadeUpService(settings, time.time_ns()) as service, ExitStack() as stack:
+        lookout = Lookout(names, hear)
+        for name in names:
+            session = open_session(settings)
+            assert session is not None
+            stack.callback(session.close)
+            lookout.attach(name, session)
+        lookout.see(poses())
+        lookout.start()
+        stack.callback(lookout.close)
+        while lookout.counts.looks < 2 * vehicles:  # all have subscribed
+            time.sleep(0.05)
+            lookout.see(poses())
+        time.sleep(SETTLE_S)
+        began, busy, looks = time.perf_counter(), lookout.counts.busy_s, lookout.counts.looks
+        for k in rng.integers(0, vehicles, alerts).tolist():
+            lookout.see(poses())
+            put = time.perf_counter()
+            service.put(_ice(places[k], raised=True))
+            try:
+                at, _ = told[names[k]].get(timeout=PATIENCE_S)
+                waited.append(at - put)
+            except queue.Empty:
+                lost += 1
+            service.put(_ice(places[k], raised=False))
+            try:
+                told[names[k]].get(timeout=PATIENCE_S)
+            except queue.Empty:
+                lost += 1
+        seconds = time.perf_counter() - began
+        share = (lookout.counts.busy_s - busy) / max(seconds * vehicles, 1e-9)
+        if lookout.counts.looks == looks:
+            lost += 1
+    return waited, share, lost
+
+
+def _ice(place: tuple[FloatArray, FloatArray], *, raised: bool) -> Alert:
+    pose = ORIGIN._replace(latitude=float(place[0][0]), longitude=float(place[1][0]))
+    latitude, longitude = degrees(np.array([AHEAD_M]), np.zeros(1), pose)
+    cell = int(grid.cell_of(latitude, longitude)[0])
+    middle = grid.centre(cell)
+    return Alert(
+        cell, 0, raised, time.time_ns() - NS, 0.15, 0.1, 0.22, 0.98, 3, float(middle[0]), float(middle[1]), "made up"
+    )

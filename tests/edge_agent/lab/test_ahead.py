@@ -1,0 +1,62 @@
+"""The campaign of what lies ahead measures what it says, on a small scale."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edge_agent.lab.ahead import approaches, cost, entry, latency
+from edge_agent.lab.ahead.known_town import heard, places_of
+from edge_agent.lab.simulation import SimulatedFleet
+from schemas.mugrid import STEPS_PER_NAT
+
+
+def test_a_longer_way_costs_more_and_a_route_less_than_none() -> None:
+    known = cost.streets()
+    short, long = (cost.drive(np.random.default_rng(1), known, metres, routed=True)[0] for metres in (300.0, 1500.0))
+    assert 0.0 < short < long
+    figures = {figure.name: figure.value for figure in cost.figures(1, 1000.0)}
+    assert figures["ahead.mb_per_day"] < figures["ahead.mb_per_day.unrouted"]
+    assert figures["ahead.core_share"] > 0.0
+
+
+def test_cars_that_come_to_ice_are_counted_and_warned() -> None:
+    counts = approaches.Approaches()
+    approaches.drive(100, 60.0, 10, counts, routed=True)
+    assert counts.came > 0
+    assert counts.warned > 0
+    assert counts.metres > 1000.0
+    deaf = approaches.Approaches()
+    track = approaches._Track(metre=[10.0 * k for k in range(30)], speed=[10.0] * 30, mu=[0.9] * 20 + [0.15] * 10)
+    approaches._judge(track, deaf)
+    assert (deaf.came, deaf.warned) == (1, 0), "who is not told is not warned"
+    track.told = [(12, 80.0, 50.0), (2, 30.0, 20.0)]
+    approaches._judge(track, deaf)
+    assert (deaf.came, deaf.warned, deaf.false) == (2, 1, 1), "the first in time; the second of nothing"
+
+
+def test_warnings_are_timed_over_a_real_router() -> None:
+    figures = {figure.name: figure.value for figure in latency.figures(1, 5, 3)}
+    assert figures["ahead.latency.unwarned"] == 0
+    assert 0.0 < figures["ahead.latency_p50_ms"] < 1e4
+
+
+def test_a_map_that_is_right_helps_at_entry_and_nothing_of_it_is_published() -> None:
+    fleet = SimulatedFleet("hills-100", 2, 100, 100.0, rough=0.5)
+    said = entry.record(fleet, 20.0)
+    known = heard(places_of(fleet.scenario, 20.0), entry.START_NS)
+    with_, without = entry.entry_errors(said, known, entry.START_NS).mean(axis=0)
+    assert with_ < without
+    assert entry.published_change(fleet, said, 6.0) == 0.0
+    other = entry.Heading(said.place, said.own, said.visit, said.truth, [bytes(32)] * len(said.published))
+    assert entry.published_change(fleet, other, 6.0) > 1.0 / STEPS_PER_NAT, "a change would be seen"
+
+
+def test_places_hold_the_least_friction_of_their_lane_points() -> None:
+    scenario = SimulatedFleet("demo", 1, 1, 50.0).scenario
+    before, after = (places_of(scenario, t) for t in (0.0, 80.0))
+    assert np.array_equal(before.key, after.key)
+    assert (after.mu <= before.mu).all()
+    assert (after.mu < before.mu).any(), "the black ice has come"
+    found = heard(after, 1).look_up(after.key, 1)
+    assert found.mu == pytest.approx(np.clip(after.mu, 0.07, 1.18), abs=0.05)
