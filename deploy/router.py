@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import signal
 import sys
 import threading
@@ -18,6 +17,7 @@ from pathlib import Path
 import zenoh
 
 from schemas.errors import InputError
+from schemas.runtime.process import end_now
 
 CLOSE_S = 2.0
 CONFIG = Path(__file__).with_name("router.json5")
@@ -77,10 +77,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     closing = threading.Thread(target=session.close, daemon=True)
     closing.start()
     closing.join(CLOSE_S)
-    if closing.is_alive():
-        os._exit(0)  # Zenoh may hang where one of two connected routers is closed; nothing of a router is to be saved
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    # Zenoh may hang where one of two connected routers is closed, then or when the interpreter ends; a router has
+    # nothing to save.
+    end_now(main())
