@@ -5,7 +5,7 @@ STAMP := .venv/.installed
 
 TESTS := $(BIN)/python -m pytest -q --numprocesses auto --dist loadfile
 
-.PHONY: setup demo test test-all test-shuffled check package docs lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test usability figures
+.PHONY: setup demo test test-all test-shuffled check package docs lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test usability figures roads-bench
 
 setup: $(STAMP)  ## make .venv and install everything, pinned
 
@@ -50,6 +50,9 @@ faults: setup  ## the fault campaigns, half an hour; writes .faults/figures.json
 faults-quick: setup  ## the same mechanisms in two minutes
 	$(BIN)/python -m tests.faults --quick
 
+roads-bench: setup  ## how often cells are joined to the right link, against SUMO's traffic; writes .roads/figures.json
+	$(BIN)/python -m tests.benchmarks.roads
+
 usability: setup  ## the first hour of a new user as figures; wants chromium and unshare; writes .usability/figures.json
 	$(BIN)/python -m tests.usability
 
@@ -82,4 +85,4 @@ lock: setup  ## write the installed versions to constraints.txt
 	$(BIN)/python -m pip freeze --exclude-editable --exclude gripmap > constraints.txt
 
 clean:
-	rm -rf .venv .demo .docs dist .bench .analytics .evaluation .faults .usability build *.egg-info
+	rm -rf .venv .demo .docs dist .bench .analytics .evaluation .faults .usability .roads build *.egg-info

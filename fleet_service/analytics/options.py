@@ -17,6 +17,9 @@ class Options:
         least_vehicles: distinct vehicles behind a slippery stretch or spell.
         step_s: time between the frames of an animated replay; None for one map.
         lateness_s: of the service whose map is replayed.
+        roads: table of `fleet-service roads`.
+        level: of grip that was agreed.
+        within_s: in which it is to be restored.
         report: takes lines of progress.
     """
 
@@ -25,4 +28,7 @@ class Options:
     least_vehicles: int = 2
     step_s: float | None = None
     lateness_s: float = 120.0
+    roads: Path | None = None
+    level: float | None = None
+    within_s: float | None = None
     report: Callable[[str], None] = print

@@ -23,7 +23,7 @@ PLOTS: Final = (".png", ".svg", ".pdf")
 MAP_CELLS: Final = 200_000  # of a page; more make browsers slow
 PARTS: Final = "members"  # of a row that stands for several cells
 HIDDEN: Final = ("west", "south", "east", "north", "cell")  # of the page: who points at a place sees where it is
-TIMES: Final = ("onset", "last", "end", "time")  # seconds since 1970
+TIMES: Final = ("onset", "last", "end", "time", "begin")  # seconds since 1970
 
 
 def text(table: pa.Table, question: Question) -> str:

@@ -1,4 +1,4 @@
-"""`fleet-service`: run, query, watch, compact, retention, forget, export, analyze, certs,
+"""`fleet-service`: run, query, watch, compact, retention, forget, export, roads, analyze, certs,
 evaluate, completion.
 
 Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. What a command needs is imported when
@@ -37,9 +37,11 @@ COMMANDS: Final = (
             "fleet-service forget --archive archive --period 2026-01 --vehicle car-one --dry-run"),
     Command("export", "fleet_service.cli.export", "write a part as GeoParquet, GeoJSON or CSV",
             "fleet-service export map --archive archive --out map.parquet"),
+    Command("roads", "fleet_service.cli.roads", "which link of a road network each cell lies on, for analyze contract",
+            "fleet-service roads city.osm.pbf --out roads.parquet"),
     Command(
         "analyze", "fleet_service.cli.analyze",
-        "ask the archive: grip, worst, spells, before-after, vehicles, calibration, weather, change-rates, replay",
+        "ask the archive: grip, worst, spells, before-after, vehicles, calibration, weather, change-rates, contract, …",
         "fleet-service analyze worst --archive archive --from 2026-01-01 --out worst.html",
     ),
     Command("certs", "fleet_service.cli.certs", "certificates and router configurations for everyone on a list",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from pathlib import Path
 from typing import Final
@@ -10,6 +11,7 @@ from typing import Final
 from fleet_service.analytics.options import Options
 from fleet_service.analytics.questions import Question, known, question_of
 from fleet_service.cli.common import add_part, span
+from schemas import mugrid
 from schemas.config import moment
 from schemas.errors import InputError
 from schemas.runtime import commandline, talk
@@ -18,9 +20,11 @@ ENDINGS: Final = (".parquet", ".geo.parquet", ".geojson", ".csv", ".png", ".svg"
 # which questions an option is for; to the others it would be one that is passed over in silence
 FOR: Final = {
     "at": ("before-after", "replay"), "stations": ("weather", "change-rates"), "step": ("replay",),
-    "min_vehicles": ("worst", "spells"),
+    "min_vehicles": ("worst", "spells", "contract"), "roads": ("contract",), "level": ("contract",),
+    "within": ("contract",),
 }  # fmt: skip
 USUAL_VEHICLES: Final = 2
+UNITS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,7 +38,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--at", metavar="TIME", help="before-after: of the treatment; replay: of the map")
     parser.add_argument("--stations", metavar="FILE", type=Path, help="weather, change-rates: readings, CSV or Parquet")
     parser.add_argument("--step", metavar="SECONDS", type=float, help="replay: between frames")
-    parser.add_argument("--min-vehicles", metavar="K", type=int, help=f"worst, spells: default {USUAL_VEHICLES}")
+    vehicles = f"worst, spells, contract: default {USUAL_VEHICLES}"
+    parser.add_argument("--min-vehicles", metavar="K", type=int, help=vehicles)
+    parser.add_argument("--roads", metavar="FILE", type=Path, help="contract: what `fleet-service roads` wrote")
+    parser.add_argument("--level", metavar="MU", type=float, help="contract: grip that was agreed, e.g. .35")
+    parser.add_argument("--within", metavar="TIME", help="contract: in which it is to be restored, e.g. 4h or 90min")
     parser.add_argument("--as-it-lies", action="store_true", help="leave the log alone: only compacted files are read")
     parser.add_argument("--json", action="store_true", help="print the rows as JSON, one a line")
 
@@ -57,8 +65,9 @@ def run(arguments: argparse.Namespace) -> int:
     at = None if arguments.at is None else moment(arguments.at, "at")
     vehicles = USUAL_VEHICLES if arguments.min_vehicles is None else arguments.min_vehicles
     options = Options(
-        at=at, stations=arguments.stations, least_vehicles=vehicles, step_s=arguments.step, report=_report
-    )
+        at=at, stations=arguments.stations, least_vehicles=vehicles, step_s=arguments.step, roads=arguments.roads,
+        level=arguments.level, within_s=_seconds(arguments.within), report=_report,
+    )  # fmt: skip
     _report(f"{question.name}: {len(engine.files('observations'))} files, {engine.rows():,} observations")
     found = question.ask(engine, options)
     print(output.lines(found, question) if arguments.json else output.text(found, question))
@@ -66,6 +75,16 @@ def run(arguments: argparse.Namespace) -> int:
         output.write(found, question, arguments.out)
         _report(f"written: {arguments.out}")
     return 0
+
+
+def _seconds(text: str | None) -> float | None:
+    """A length of time as people write it."""
+    if text is None:
+        return None
+    found = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)(s|min|h|d)", text)
+    if found is None:
+        raise InputError("within", f"{text[:20]!r} is no length of time", "write it like 4h, 90min or 1d")
+    return float(found[1]) * UNITS[found[2]]
 
 
 def _checked(arguments: argparse.Namespace) -> Question:
@@ -78,6 +97,10 @@ def _checked(arguments: argparse.Namespace) -> Question:
     for name, takers in FOR.items():
         if getattr(arguments, name) is not None and question.name not in takers:
             raise InputError(name.replace("_", "-"), f"is not for {question.name}", f"it is for {', '.join(takers)}")
+    if arguments.level is not None and not mugrid.LOWER < arguments.level < mugrid.UPPER:
+        problem = f"{arguments.level} lies outside {mugrid.LOWER} to {mugrid.UPPER}"
+        raise InputError("level", problem, "give a friction, e.g. .35")
+    _seconds(arguments.within)
     if arguments.min_vehicles is not None and arguments.min_vehicles < 1:
         raise InputError("min-vehicles", f"{arguments.min_vehicles} is below 1", "give a whole number from 1")
     return question

@@ -92,6 +92,8 @@ SHOWN_BELOW: Final = {
     "certs": {"--renew-days", "--revoke", "--dry-run"},  # enrolment/test_certificates.py
     "run": {"--config", "--archive", "--weather"},
     "export": {"--country", "--supplier", "--status", "--follow", "--connect", "--config"},  # client/test_datex.py
+    "roads": {"extract", "--out", "--id", "--name"},  # analytics/roads/test_join.py
+    "analyze": {"--roads", "--level", "--within"},  # analytics/roads/test_contract.py
     "query": {"--bbox", "--route", "--min-vehicles", "--at", "--basis", "--format", "--out", "--connect", "--config"},
     "watch": {"--bbox", "--connect", "--config", "--alerts", "--json", "--webhook"},
 }

@@ -53,6 +53,7 @@ QUESTIONS: Final = {
         Question("calibration", "how often the published interval held", "age_h", None),
         Question("weather", "grip by temperature of the nearest station", "temperature", None),
         Question("change-rates", "how fast roads turn slippery or back, by temperature and hour", "by", None),
+        Question("contract", "whether agreed grip was kept on each link of a road network", "-least_s", None),
         Question("replay", "the map as of a moment, or a day of it", "-p_slippery", "mu"),
     )
 }

@@ -1,0 +1,186 @@
+"""`contract`: per link of a road network, whether an agreed grip was kept, and how long it was not at the worst.
+
+A link is looked at in pieces of PIECE_M, and is as good as the worst of them; ice on a tenth is not averaged away.
+Values are gathered in slots of SLOT_S, per vehicle first: a car that passes ten times is one witness. A slot is surely
+below the level when the 90 % interval of its mean lies below, surely kept when it lies above. A breach begins with a
+slot below and ends with the next one that is not. `least_s` is what was surely below; `most_s` runs from the last slot
+that was surely kept to the next one, between which nobody showed it. What was not measured is unknown, and never kept.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import ibis
+import numpy as np
+import pyarrow as pa
+from scipy.stats import t as student
+
+from fleet_service.analytics.engines import QueryEngine, Table, value
+from fleet_service.analytics.options import Options
+from fleet_service.analytics.roads.join import read_roads
+from schemas.errors import InputError
+from schemas.numeric import BoolArray, FloatArray, IntArray
+
+SLOT_S: Final = 1800
+PIECE_M: Final = 50.0  # as long as what a driver slides over before the car stands, in a town
+LEAST_SHARE: Final = 0.8  # of a link's length measured, below which nobody can say that it was kept
+GAP_S: Final = 7200  # two slots below that lie further apart are two breaches, surely: salt works, and it freezes again
+INTERVAL_STD: Final = 3.29  # of a 90 % interval of a Gaussian
+LEAST_STD: Final = 0.05  # of one vehicle's error that its own interval does not know: its tyres, its calibration
+KEPT, BROKEN, UNKNOWN = "kept", "broken", "unknown"
+_ROW: Final[dict[str, pa.DataType]] = {
+    "link": pa.string(), "direction": pa.string(), "name": pa.string(), "verdict": pa.string(),
+    "breach_s": pa.int64(), "least_s": pa.int64(), "most_s": pa.int64(), "begin": pa.int64(),
+    "mu_worst": pa.float64(), "mu_worst_lower": pa.float64(), "mu_worst_upper": pa.float64(),
+    "measured_share": pa.float64(), "length_m": pa.float64(), "vehicles": pa.int64(), "values": pa.int64(),
+}  # fmt: skip
+
+
+def expression(t: Table, places: Table) -> Table:
+    """Mean of each vehicle's values per piece of a link and slot, with the mean of the variances that it reported.
+
+    Args:
+        t: observations.
+        places: `cell`, `sector`, `link`, `direction`, `piece`.
+    """
+    t = t.filter(value(t)).mutate(slot=(t.time / SLOT_S).floor().cast("int64"))
+    std = (t.mu_upper.cast("float64") - t.mu_lower.cast("float64")) / INTERVAL_STD
+    t = t.mutate(y=t.mu.cast("float64"), variance=std * std)
+    rows = t.inner_join(places, [t.cell == places.cell, t.sector == places.sector], rname="place_{name}")
+    return rows.group_by(["link", "direction", "piece", "slot", "vehicle"]).aggregate(
+        y=rows.y.mean(), variance=rows.variance.mean(), values=rows.count()
+    )
+
+
+def ask(engine: QueryEngine, options: Options) -> pa.Table:
+    """One row per link and direction on which anybody measured anything, the worst first.
+
+    Raises:
+        InputError: there is no table of roads, no level, or no time within which it is to be restored.
+    """
+    if options.roads is None:
+        raise InputError("roads", "no table of roads", "make one: fleet-service roads EXTRACT --out roads.parquet")
+    if options.level is None or options.within_s is None:
+        missing = "level" if options.level is None else "within"
+        raise InputError(missing, "is missing for contract", "give e.g. --level .35 --within 4h")
+    roads = read_roads(Path(options.roads))
+    t = engine.observations()
+    middle = (roads["from_m"].to_numpy() + roads["to_m"].to_numpy()) / 2.0
+    roads = roads.append_column("piece", pa.array((middle // PIECE_M).astype(np.int64)))
+    places = roads.select(["cell", "sector", "link", "direction", "piece"])
+    found = engine.answer(expression(t, ibis.memtable(places)))
+    span = engine.answer(t.aggregate(begin=t.time.min(), end=t.time.max())).to_pylist()[0]
+    seen = engine.answer(t.filter(value(t)).select("cell", "sector").distinct())
+    return _judged(found, roads, seen, (span["begin"], span["end"]), options)
+
+
+def slots(found: pa.Table) -> dict[str, FloatArray]:
+    """Mean and 90 % interval per slot from those of its vehicles, as columns with the slot's first row.
+
+    The error of a mean is the larger of what the vehicles' spread and what their own intervals say.
+    """
+    y, variance, key = (found[name].to_numpy() for name in ("y", "variance", "key"))
+    first, which, n = np.unique(key, return_index=True, return_inverse=True, return_counts=True)[1:]
+    mean = np.bincount(which, y) / n
+    spread = np.bincount(which, (y - mean[which]) ** 2) / np.maximum(n - 1, 1)
+    reported = np.bincount(which, variance + LEAST_STD**2) / n
+    several = n > 2
+    factor = np.where(several, student.ppf(0.95, np.maximum(n - 1, 1)), INTERVAL_STD / 2.0)
+    error = np.maximum(factor * np.sqrt(np.where(several, spread, 0.0) / n), INTERVAL_STD / 2.0 * np.sqrt(reported / n))
+    return {"first": first, "mu": mean, "lower": mean - error, "upper": mean + error, "vehicles": n}
+
+
+def breach(
+    slot: IntArray, lower: FloatArray, mu: FloatArray, upper: FloatArray, level: float, span: tuple[int, int]
+) -> tuple[int, int, int, int]:
+    """The longest breach of one link [s]: by the means, surely, at the most; and when it began (0: none).
+
+    Args:
+        slot: (n,) numbers of slots, ascending.
+        lower, mu, upper: (n,) interval and mean of each.
+        level: that was agreed.
+        span: begin and end [s] of all that was measured: before and after it nobody knows.
+    """
+    begins = slot * SLOT_S
+    first, after = _runs(mu < level)
+    ends = np.where(after < len(slot), begins[np.minimum(after, len(slot) - 1)], begins[after - 1] + SLOT_S)
+    lasted = ends - begins[first]
+    far = np.append(False, np.diff(begins) > GAP_S)
+    sure, over = _runs(upper < level, far)
+    surely = begins[over - 1] + SLOT_S - begins[sure]
+    kept = begins[lower >= level]
+    unsure = np.append(kept, span[1]) - np.append(span[0], kept + SLOT_S)
+    begin = int(begins[first[lasted.argmax()]]) if len(first) else 0
+    return int(lasted.max(initial=0)), int(surely.max(initial=0)), int(unsure.max(initial=0)), begin
+
+
+def _runs(is_below: BoolArray, far: BoolArray | None = None) -> tuple[IntArray, IntArray]:
+    """First places of runs of true values, and the places after their last; a run ends where the next slot is far."""
+    number = np.cumsum(~is_below if far is None else ~is_below | far)
+    at = np.flatnonzero(is_below)
+    new = np.append(True, np.diff(number[at]) != 0)[: len(at)]
+    return at[new], at[np.append(new[1:], True)[: len(at)]] + 1
+
+
+class _Measured(NamedTuple):
+    """Of one link: rows of each piece, and who told what."""
+
+    pieces: dict[int, list[int]]
+    vehicles: set[str]
+    values: list[int]
+
+
+def _judged(found: pa.Table, roads: pa.Table, seen: pa.Table, span: tuple[int, int], options: Options) -> pa.Table:
+    level, within = options.level or 0.0, options.within_s or 0.0
+    about = {(row["link"], row["direction"]): row
+             for row in roads.group_by(["link", "direction"], use_threads=False).aggregate(
+                 [("name", "first"), ("length_m", "first")]).to_pylist()}  # fmt: skip
+    share = _measured(roads, seen)
+    names = [
+        (str(row["link"]), str(row["direction"]), int(row["piece"]), int(row["slot"])) for row in found.to_pylist()
+    ]
+    number = {key: k for k, key in enumerate(sorted(set(names)))}
+    found = found.append_column("key", pa.array([number[key] for key in names], pa.int64()))
+    each, keys = slots(found), sorted(number)
+    links: dict[tuple[str, str], _Measured] = {}
+    for (link, direction, _, _), row in zip(names, found.to_pylist(), strict=True):
+        own = links.setdefault((link, direction), _Measured({}, set(), []))
+        own.vehicles.add(row["vehicle"])
+        own.values.append(int(row["values"]))
+    for k, (link, direction, piece, _) in enumerate(keys):
+        links[link, direction].pieces.setdefault(piece, []).append(k)
+    out = []
+    for key, own in links.items():
+        found_breaches = []
+        for rows in own.pieces.values():
+            slot = np.array([keys[k][3] for k in rows], np.int64)
+            lower, mu, upper = (each[name][rows] for name in ("lower", "mu", "upper"))
+            found_breaches.append(breach(slot, lower, mu, upper, level, span))
+        by_mean, begin = max((one[0], one[3]) for one in found_breaches)
+        least, most = (max(one[k] for one in found_breaches) for k in (1, 2))
+        worst = min((k for rows in own.pieces.values() for k in rows), key=lambda k: float(each["mu"][k]))
+        enough = share[key] >= LEAST_SHARE and len(own.vehicles) >= options.least_vehicles
+        verdict = BROKEN if least > within else KEPT if most <= within and enough else UNKNOWN
+        out.append(
+            {"link": key[0], "direction": key[1], "name": about[key]["name_first"], "verdict": verdict,
+             "breach_s": by_mean, "least_s": least, "most_s": most, "begin": begin or None,
+             "mu_worst": each["mu"][worst], "mu_worst_lower": each["lower"][worst],
+             "mu_worst_upper": each["upper"][worst], "measured_share": share[key],
+             "length_m": about[key]["length_m_first"], "vehicles": len(own.vehicles), "values": sum(own.values)}
+        )  # fmt: skip
+    return pa.Table.from_pylist(out, schema=pa.schema(_ROW))
+
+
+def _measured(roads: pa.Table, seen: pa.Table) -> dict[tuple[str, str], float]:
+    """Share of each link's length that lies in cells with a value."""
+    rows = roads.join(seen, ["cell", "sector"], join_type="inner").sort_by("from_m")
+    total: dict[tuple[str, str], float] = {}
+    reached: dict[tuple[str, str], float] = {}
+    for row in rows.select(["link", "direction", "from_m", "to_m", "length_m"]).to_pylist():
+        key = (row["link"], row["direction"])
+        new = max(row["to_m"] - max(row["from_m"], reached.get(key, 0.0)), 0.0)
+        total[key] = total.get(key, 0.0) + new / max(row["length_m"], 1e-9)
+        reached[key] = max(reached.get(key, 0.0), row["to_m"])
+    return {key: min(share, 1.0) for key, share in total.items()}

@@ -1,0 +1,159 @@
+"""Which link a cell and sector of the map lies on: no matching of trips, a join that is made once per network.
+
+A place is on the link that it is nearest to, in metres and in heading. A cell in which one link ends and the next
+begins is of both: no join could tell them apart. `make roads-bench` measures how often it is right.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from scipy.spatial import cKDTree
+
+from fleet_service.analytics.roads.network import DirectedLink, RoadNetwork
+from schemas import grid
+from schemas.errors import InputError
+from schemas.numeric import FloatArray, IntArray
+from schemas.thresholds import METRES_PER_DEGREE
+
+REACH_M: Final = 25.0  # from a cell's centre to a road: half a cell, lanes beside the drawn line, a receiver's error
+TURN_M: Final = 8.0  # per radian between the road and the sector's axis: a parallel road a lane away is nearer
+MOST_TURN: Final = np.radians(60.0)  # 45 to a sector's edge, 15 beyond, within which a vehicle reports to both
+SERVICE_M: Final = 6.0  # a yard's entrance beside a street is driven far less
+STEP_M: Final = 2.0
+PIECE: Final = 4096  # cells at once
+_TYPES: Final[dict[str, pa.DataType]] = {
+    "cell": pa.int64(), "sector": pa.int8(), "link": pa.string(), "direction": pa.string(), "from_m": pa.float64(),
+    "to_m": pa.float64(), "length_m": pa.float64(), "name": pa.string(), "kind": pa.string(),
+    "distance_m": pa.float64(), "ambiguous_m": pa.float64(), "shared": pa.bool_(),
+}  # fmt: skip
+SCHEMA: Final = pa.schema(_TYPES)
+
+
+class _Marks(NamedTuple):
+    """Points every STEP_M along all links, each (n,)."""
+
+    link: IntArray
+    run: FloatArray
+    latitude: FloatArray
+    longitude: FloatArray
+    yaw: FloatArray
+
+
+def joined(network: RoadNetwork) -> pa.Table:
+    """One row per cell and sector that lies on a link; see README for the columns."""
+    lengths, marks = _marks(network.links)
+    tree, scale = cKDTree(_conformal(marks.latitude, marks.longitude)), np.cos(np.radians(marks.latitude))
+    reach = REACH_M / scale.min()
+    side = scale.mean() * METRES_PER_DEGREE * 360.0 / 2**grid.CELL_ZOOM
+    cells = _near(marks, float(side))
+    service = np.array([SERVICE_M if link.kind == "service" else 0.0 for link in network.links])
+    start, end = (np.unique(_ends(network.links), axis=0, return_inverse=True)[1].reshape(-1, 2)).T
+    parts = []
+    for first in range(0, len(cells), PIECE):
+        piece = cells[first : first + PIECE]
+        pairs = cKDTree(_conformal(*grid.centre(piece))).sparse_distance_matrix(tree, reach, output_type="ndarray")
+        metres = pairs["v"] * scale[pairs["j"]]
+        for axis in range(grid.SECTORS):
+            turn = _apart(marks.yaw[pairs["j"]], axis * np.pi / 2.0)
+            fits = (turn <= MOST_TURN) & (metres <= REACH_M)
+            row, mark, metre = pairs["i"][fits], pairs["j"][fits], metres[fits]
+            link = marks.link[mark]
+            cost = metre + TURN_M * turn[fits] + service[link]
+            each = _first_of(np.lexsort((cost, link, row)), row, link)  # the best mark of each cell and link
+            row, link, mark, metre, cost = (column[each] for column in (row, link, mark, metre, cost))
+            best = _first_of(np.lexsort((cost, row)), row)[np.cumsum(np.append(0, row[1:] != row[:-1]))[: len(row)]]
+            goes_on = (end[link] == start[link[best]]) | (end[link[best]] == start[link])
+            mine, more = link == link[best], cost - cost[best]
+            kept = mine | (goes_on & (more <= side / 2.0))  # the next link begins within the cell
+            other = np.full(len(piece), np.inf)
+            np.minimum.at(other, row, np.where(kept, np.inf, more))
+            other[np.isinf(other)] = np.nan
+            columns = (piece[row], np.full(len(row), axis), mark, metre, other[row], ~mine)
+            parts.append([column[kept] for column in columns])
+    cell, sector, mark, distance, ambiguous, second = (np.concatenate(column) for column in zip(*parts, strict=True))
+    link = marks.link[mark]
+    middle, length = marks.run[mark], lengths[link]
+    texts = {
+        name: pa.array([getattr(network.links[k], field) for k in link.tolist()], pa.string())
+        for name, field in (("link", "id"), ("direction", "direction"), ("name", "name"), ("kind", "kind"))
+    }
+    numbers = {
+        "cell": cell, "sector": sector.astype(np.int8), "from_m": np.maximum(middle - side / 2.0, 0.0),
+        "to_m": np.minimum(middle + side / 2.0, length), "length_m": length, "distance_m": distance, "shared": second,
+    }  # fmt: skip
+    arrays: dict[str, Any] = {name: pa.array(column) for name, column in numbers.items()} | texts
+    arrays["ambiguous_m"] = pa.array(ambiguous, from_pandas=True)
+    found = pa.table([arrays[name] for name in SCHEMA.names], schema=SCHEMA)
+    found = found.sort_by([("cell", "ascending"), ("sector", "ascending"), ("shared", "ascending")])
+    return found.replace_schema_metadata({f"roads.{key}": value for key, value in network.source.items()})
+
+
+def read_roads(path: Path) -> pa.Table:
+    """A file that `joined` made.
+
+    Raises:
+        InputError: it is none.
+    """
+    try:
+        table = pq.read_table(path)
+        return table.select(SCHEMA.names).cast(SCHEMA)
+    except (OSError, pa.ArrowInvalid, pa.ArrowTypeError, KeyError) as error:
+        reason = str(error).splitlines()[0][:100]
+        raise InputError("roads", f"{path} is no such file ({reason})", "make it with fleet-service roads") from error
+
+
+def _marks(links: list[DirectedLink]) -> tuple[FloatArray, _Marks]:
+    """Lengths [m] of the links, and their marks."""
+    lengths, parts = np.empty(len(links)), []
+    for k, link in enumerate(links):
+        east = METRES_PER_DEGREE * np.cos(np.radians(float(np.mean(link.latitude))))
+        dx, dy = np.diff(link.longitude) * east, np.diff(link.latitude) * METRES_PER_DEGREE
+        run = np.concatenate([[0.0], np.cumsum(np.hypot(dx, dy))])
+        lengths[k] = run[-1]
+        at = (np.arange(max(int(run[-1] / STEP_M), 1)) + 0.5) * run[-1] / max(int(run[-1] / STEP_M), 1)
+        piece = np.minimum(np.searchsorted(run, at, side="right") - 1, len(dx) - 1)
+        parts.append(
+            (np.full(len(at), k), at, np.interp(at, run, link.latitude), np.interp(at, run, link.longitude),
+             np.arctan2(dy, dx)[piece])
+        )  # fmt: skip
+    return lengths, _Marks._make(np.concatenate(column) for column in zip(*parts, strict=True))
+
+
+def _near(marks: _Marks, side: float) -> IntArray:
+    """Cells that may lie on a link: those within REACH_M of a mark, and some beyond."""
+    x, y = grid.deinterleave(np.unique(grid.cell_of(marks.latitude, marks.longitude)))
+    wide = int(np.ceil(REACH_M / side))
+    offsets = np.arange(-wide, wide + 1)
+    found = [grid.interleave(x + i, y + j) for i in offsets for j in offsets]
+    return np.unique(np.concatenate(found))
+
+
+def _first_of(order: IntArray, *groups: IntArray) -> IntArray:
+    """The first of each group in an order that sorts by the groups first."""
+    new = np.zeros(len(order), np.bool_)
+    new[:1] = True
+    for group in groups:
+        new[1:] |= group[order][1:] != group[order][:-1]
+    return order[new]
+
+
+def _ends(links: list[DirectedLink]) -> FloatArray:
+    """First and last points of the links in turn, (2 n, 2) [deg], to a tenth of a metre."""
+    ends = [(at.latitude[k], at.longitude[k]) for at in links for k in (0, -1)]
+    return np.asarray(np.round(np.array(ends), 6), np.float64)
+
+
+def _conformal(latitude: FloatArray, longitude: FloatArray) -> FloatArray:
+    """Mercator's plane (n, 2) [m]: a metre is 1 / cos(latitude) of it, the same in all directions."""
+    radius = np.degrees(METRES_PER_DEGREE)
+    y = np.arcsinh(np.tan(np.radians(latitude)))
+    return np.asarray(radius * np.column_stack([np.radians(longitude), y]))
+
+
+def _apart(yaw: FloatArray, axis: float) -> FloatArray:
+    return np.asarray(np.abs((yaw - axis + np.pi) % (2.0 * np.pi) - np.pi))

@@ -1,0 +1,137 @@
+"""Directed links of a road network: from an extract of OpenStreetMap, or from any file of lines with ids."""
+
+from __future__ import annotations
+
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from schemas.errors import InputError
+from schemas.numeric import FloatArray
+
+EXTRACT: Final = (".pbf", ".osm", ".osm.gz", ".osm.bz2")
+LINES: Final = (".gpkg", ".geojson", ".shp", ".fgb", ".parquet")
+CLASSES: Final = (
+    "motorway", "motorway_link", "trunk", "trunk_link", "primary", "primary_link", "secondary", "secondary_link",
+    "tertiary", "tertiary_link", "unclassified", "residential", "living_street", "service",
+)  # fmt: skip  # of OpenStreetMap's highways, those that cars may drive
+FORWARD, BACKWARD = "forward", "backward"
+_ONLY_FORWARD: Final = frozenset({"yes", "true", "1", FORWARD})
+_ONLY_BACKWARD: Final = frozenset({"-1", "reverse", BACKWARD})
+
+
+class DirectedLink(NamedTuple):
+    """One direction of a road.
+
+    Attributes:
+        id: of the road in its network; the same for both directions.
+        direction: forward, as it is drawn, or backward.
+        name, kind: of the road; empty where the network has none.
+        latitude, longitude: (n,) [deg] in the order of travel.
+    """
+
+    id: str
+    direction: str
+    name: str
+    kind: str
+    latitude: FloatArray
+    longitude: FloatArray
+
+
+class RoadNetwork(NamedTuple):
+    """The links of a file, and what the file says of itself: name, digest, date, licence."""
+
+    links: list[DirectedLink]
+    source: dict[str, str]
+
+
+def read_network(path: Path, identity: str = "id", name: str = "name") -> RoadNetwork:
+    """The links of an extract of OpenStreetMap (.osm.pbf, .osm), or of the lines of a file (GeoPackage, GeoJSON …).
+
+    Args:
+        path: of the file.
+        identity: column of the id, of a file of lines.
+        name: column of the road's name there; may be missing, like `oneway` (forward, backward, yes, no) and `kind`.
+
+    Raises:
+        InputError: it cannot be read, has no such column, or holds no road; or a reader is not installed.
+    """
+    if not path.is_file():
+        raise InputError("extract", f"{path} is no file", "name an .osm.pbf, or a GeoPackage of lines")
+    source = {"extract": path.name, "sha256": sha256(path.read_bytes()).hexdigest()}
+    if path.name.endswith(EXTRACT):
+        links, about = _openstreetmap(path)
+    elif path.name.endswith(LINES):
+        links, about = _lines(path, identity, name), {}
+    else:
+        known = ", ".join((*EXTRACT, *LINES))
+        raise InputError("extract", f"{path.name} has an ending that is not known", f"give one of {known}")
+    if not links:
+        raise InputError("extract", f"{path.name} holds no road that cars may drive", "name another extract")
+    return RoadNetwork(links, source | about)
+
+
+def _openstreetmap(path: Path) -> tuple[list[DirectedLink], dict[str, str]]:
+    try:
+        import osmium
+    except ImportError as error:
+        raise InputError("extract", "osmium is not installed", "pip install 'gripmap[roads]'") from error
+    links: list[DirectedLink] = []
+    try:
+        date = osmium.io.Reader(str(path)).header().get("osmosis_replication_timestamp", "")
+        found = osmium.FileProcessor(str(path)).with_locations().with_filter(osmium.filter.KeyFilter("highway"))
+        for way in found:
+            if not isinstance(way, osmium.osm.Way) or way.tags.get("highway") not in CLASSES:
+                continue
+            points = np.array([(node.lat, node.lon) for node in way.nodes if node.location.valid()]).reshape(-1, 2)
+            tags = dict(way.tags)
+            kind, name = tags["highway"], tags.get("name", tags.get("ref", ""))
+            by_rule = tags.get("junction") in ("roundabout", "circular") or kind.startswith("motorway")
+            oneway = tags.get("oneway", "yes" if by_rule else "no")
+            links += _directions(str(way.id), name, kind, oneway, points)
+    except (RuntimeError, ValueError, OSError) as error:
+        problem = f"{path.name} cannot be read ({str(error).splitlines()[0][:100]})"
+        raise InputError("extract", problem, "name a whole extract") from error
+    return links, {"date": date, "licence": "ODbL 1.0, © OpenStreetMap contributors"}
+
+
+def _lines(path: Path, identity: str, name: str) -> list[DirectedLink]:
+    try:
+        import geopandas
+    except ImportError as error:
+        raise InputError("extract", "geopandas is not installed", "pip install 'gripmap[roads]'") from error
+    try:
+        frame: Any = geopandas.read_parquet(path) if path.suffix == ".parquet" else geopandas.read_file(path)
+    except Exception as error:  # each of its readers raises its own
+        problem = f"{path.name} cannot be read ({(str(error) or 'no reason given').splitlines()[0][:100]})"
+        raise InputError("extract", problem, "name a file of lines") from error
+    if identity not in frame.columns:
+        raise InputError("id", f"{path.name} has no column {identity!r}", f"use one of {', '.join(frame.columns)}")
+    if frame.crs is not None:
+        frame = frame.to_crs(4326)
+    links: list[DirectedLink] = []
+    for row in frame.explode(index_parts=False).itertuples():
+        about = row._asdict()
+        if about["geometry"] is None or about["geometry"].geom_type != "LineString":
+            continue
+        points = np.asarray(about["geometry"].coords)[:, [1, 0]]
+        if not (np.isfinite(points).all() and (np.abs(points) <= (90.0, 180.0)).all()):
+            raise InputError("extract", f"{path.name} has points that are no degrees", "give the file its CRS")
+        called, kind, oneway = (str(about.get(column) or "") for column in (name, "kind", "oneway"))
+        links += _directions(str(about[identity]), called, kind, oneway, points)
+    return links
+
+
+def _directions(identity: str, name: str, kind: str, oneway: str, points: FloatArray) -> list[DirectedLink]:
+    """The directions in which a line may be driven."""
+    apart = np.append(True, (np.diff(points, axis=0) != 0.0).any(axis=1))
+    points = points[apart[: len(points)]]
+    if len(points) < 2:
+        return []
+    there = DirectedLink(identity, FORWARD, name, kind, points[:, 0], points[:, 1])
+    back = DirectedLink(identity, BACKWARD, name, kind, points[::-1, 0], points[::-1, 1])
+    if oneway.lower() in _ONLY_FORWARD:
+        return [there]
+    return [back] if oneway.lower() in _ONLY_BACKWARD else [there, back]

@@ -1,0 +1,46 @@
+"""`fleet-service roads`: which link of a road network each cell and sector lies on; for `analyze contract`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from schemas.runtime import commandline, talk
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("extract", metavar="EXTRACT", type=Path, help=".osm.pbf, .osm, or lines: .gpkg, .geojson, .shp")
+    parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="ends in .parquet")
+    parser.add_argument("--id", metavar="COLUMN", default="id", help="of lines: the link's id; default %(default)s")
+    parser.add_argument("--name", metavar="COLUMN", default="name", help="of lines: its name; default %(default)s")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Read the network, join, write.
+
+    Raises:
+        InputError: the extract cannot be read, or the file cannot be written.
+    """
+    import pyarrow.parquet as pq
+
+    from fleet_service.analytics.roads.join import joined
+    from fleet_service.analytics.roads.network import read_network
+    from schemas.errors import InputError
+    from schemas.runtime.durable import written
+
+    commandline.ending("out", commandline.out_folder("out", arguments.out), (".parquet",))
+    talk.doing(f"reading {arguments.extract}")
+    network = read_network(arguments.extract, arguments.id, arguments.name)
+    talk.doing(f"joining {len(network.links)} directed links")
+    table = joined(network)
+    try:
+        with written(arguments.out) as file:
+            pq.write_table(table, file, compression="zstd")
+    except OSError as error:
+        problem = f"cannot write {arguments.out} ({error.strerror})"
+        raise InputError("out", problem, "name a file you may write") from error
+    licence = network.source.get("licence")
+    print(f"{table.num_rows} places on {len(network.links)} directed links in {arguments.out}"
+          + (f"; {licence}" if licence else ""))  # fmt: skip
+    return 0
