@@ -34,7 +34,7 @@ def drive(folder: Path, endpoint: str, args: argparse.Namespace) -> tuple[Listen
     if session is None:
         raise processes.DemoError(f"no session to {endpoint}")
     listener = Listener(session)
-    fleet = processes.fleet(folder, args.vehicles, args.duration, args.seed)
+    fleet = processes.fleet(folder, args.vehicles, args.duration, args.seed, args.warned)
     began = time.monotonic()
 
     def tick() -> None:
@@ -65,6 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--vehicles", type=int, default=36, help="simulated vehicles (default 36)")
     parser.add_argument("--duration", type=float, default=150.0, help="seconds of driving (default 150)")
     parser.add_argument("--seed", type=int, default=1, help="of vehicles, sensors and routes (default 1)")
+    parser.add_argument("--warned", type=float, default=0.5, help="share of the drivers who hear the map (default 0.5)")
     args = parser.parse_args(argv)
     began = time.monotonic()
     shutil.rmtree(FOLDER, ignore_errors=True)
@@ -80,10 +81,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         listener.close()
     wall_s = time.monotonic() - began
     found = compare.figures(comparison, visits, listener.alerts, changed_ns, counts, FOLDER / "archive", wall_s)
+    grip = compare.lost_grip(visits, listener.alerts, changed_ns, args.warned)
+    found += grip.figures()
     figures.write(FOLDER / "figures.json", "demo", [args.seed], found)
     table = figures.markdown(found)
-    picture.draw(comparison, FOLDER / "map.png")
+    picture.draw(comparison, FOLDER / "map.png", grip)
     page.write(comparison, found, FOLDER / "map.html")
+    print(f"\n{grip.line()}")
     print(f"\n{table}\n\npicture {FOLDER}/map.png, page {FOLDER}/map.html, figures {FOLDER}/figures.json")
     return 0 if all(figure.holds for figure in found) else 1
 

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from edge_agent.lab.simulation.listeners import warned_ones
 from fleet_service.archive import reading
 from fleet_service.client.stretches import Stretches, linked
 from fleet_service.lab.end_to_end import false_ice
@@ -20,6 +22,9 @@ from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.figures import Figure
 from schemas.thresholds import EXCITED_SHARE, SLIPPERY_MU
 from schemas.wire import Alert, Kind
+
+PASS_GAP_NS: Final = 10_000_000_000  # visits of a vehicle that are further apart are of two passes
+LOST: Final = 0.98  # of the grip: a wheel was at its peak or past it
 
 
 @dataclass(frozen=True)
@@ -97,8 +102,7 @@ def passes(rows: pa.Table) -> int:
     enter, left = (order[name].cast(pa.int64()).to_numpy() for name in ("enter_time", "leave_time"))
     if not len(order):
         return 0
-    gap_ns = 10_000_000_000
-    return 1 + int(np.sum((vehicle[1:] != vehicle[:-1]) | (enter[1:] - left[:-1] > gap_ns)))
+    return 1 + int(np.sum((vehicle[1:] != vehicle[:-1]) | (enter[1:] - left[:-1] > PASS_GAP_NS)))
 
 
 def figures(
@@ -125,6 +129,61 @@ def figures(
         Figure("demo.map.cells", len(comparison.cells), ""),
         Figure("demo.map.cells_measured", int(value.sum()), "with two or more vehicles"),
     ]
+
+
+@dataclass(frozen=True)
+class LostGrip:
+    """Passes over the new ice since its first alert, one row each: was the driver warned, did a wheel lose its grip.
+
+    `cell` is where it was lost, or the first of the pass.
+    """
+
+    warned: BoolArray
+    lost: BoolArray
+    cell: IntArray
+
+    def figures(self) -> list[Figure]:
+        """Shares of passes that lost grip, and how many there were."""
+        kinds = (("warned", self.warned), ("unwarned", ~self.warned))
+        shares = [Figure(f"demo.lost_grip.{name}", _mean(self.lost[rows]), "of passes") for name, rows in kinds]
+        return shares + [Figure(f"demo.passes.{name}", int(rows.sum()), "over new ice") for name, rows in kinds]
+
+    def line(self) -> str:
+        """In words."""
+        told = [f"{int(self.lost[rows].sum())} of {int(rows.sum())}" for rows in (self.warned, ~self.warned)]
+        return (
+            f"Over the new ice, once it was known: {told[0]} warned drivers lost grip, {told[1]} who were not warned."
+        )
+
+
+def lost_grip(visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int, share: float) -> LostGrip:
+    """Who lost grip on the new ice since its first alert; `share` of the drivers is warned."""
+    on = (visits["mu"].to_numpy() < SLIPPERY_MU) & newly_slippery(visits, changed_ns)
+    cells = set(visits["cell"].filter(pa.array(on)).to_pylist())
+    known = min((at for at, a in alerts if a.raised and a.cell in cells and at >= changed_ns), default=None)
+    vehicles = [str(name) for name in visits["vehicle"].to_pylist()]
+    count = max((_number(name) for name in vehicles), default=0)
+    warned = warned_ones(count, share)
+    rows: dict[tuple[str, int], tuple[bool, int]] = {}
+    enter, left = (visits[name].cast(pa.int64()).to_numpy() for name in ("enter_time", "leave_time"))
+    last: dict[str, tuple[int, int]] = {}
+    order = np.argsort(enter, kind="stable")
+    for k in order[on[order] & (enter[order] >= (known if known is not None else np.iinfo(np.int64).max))].tolist():
+        name, cell = vehicles[k], int(visits["cell"][k].as_py())
+        number, at = last.get(name, (0, -PASS_GAP_NS))
+        number += enter[k] - at > PASS_GAP_NS
+        last[name] = (number, int(left[k]))
+        lost = bool(visits["utilisation"][k].as_py() >= LOST)
+        before = rows.get((name, number))
+        if before is None or (lost and not before[0]):
+            rows[name, number] = (lost, cell)
+    told = np.array([warned[_number(name) - 1] for name, _ in rows], np.bool_)
+    lost_, cell_ = (np.array([row[k] for row in rows.values()]) for k in (0, 1))
+    return LostGrip(told, lost_.astype(np.bool_), cell_.astype(np.int64))
+
+
+def _number(vehicle: str) -> int:
+    return int(vehicle.rpartition("-")[2])
 
 
 def newly_slippery(visits: pa.Table, changed_ns: int) -> BoolArray:

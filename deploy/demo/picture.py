@@ -5,15 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from deploy.demo.compare import MapComparison
+from deploy.demo.compare import LostGrip, MapComparison
 from fleet_service.analytics.plots import MU, cell_shapes, paint
+from schemas.numeric import IntArray
 from schemas.runtime.palette import SURFACES, UNKNOWN
 
 
-def draw(comparison: MapComparison, path: Path) -> None:
-    """Three panels: the truth, the map (median), and how wide the map's interval is."""
+def draw(comparison: MapComparison, path: Path, grip: LostGrip | None = None) -> None:
+    """Three panels: the truth, the map (median), and how wide the map's interval is.
+
+    On the truth, where drivers lost their grip on the new ice and where they kept it, warned and not.
+    """
     cells = comparison.cells
     shapes = cell_shapes(cells["cell"].to_numpy(), cells["sector"].to_numpy().astype(np.int64))
     lower, upper = (cells[name].to_numpy() for name in ("mu_lower", "mu_upper"))
@@ -23,6 +28,8 @@ def draw(comparison: MapComparison, path: Path) -> None:
     colours = paint(found, shapes, comparison.values)
     wide = paint(width, shapes, upper - lower, (0.0, 1.1))
     truth.set_title("truth")
+    if grip is not None and len(grip.cell):
+        _mark(truth, grip, cells["cell"].to_numpy())
     found.set_title(f"map: median (hatched: {UNKNOWN})")
     width.set_title("map: width of the 90 % interval")
     bar = figure.colorbar(colours, ax=found, label=f"{MU}, the darker the more slippery", shrink=0.8)
@@ -33,3 +40,16 @@ def draw(comparison: MapComparison, path: Path) -> None:
         f"{comparison.several.sum()} of them seen by two or more vehicles"
     )
     figure.savefig(path, dpi=130)
+
+
+def _mark(axes: Axes, grip: LostGrip, drawn: IntArray) -> None:
+    """Passes over the new ice: warned drivers left of their cell's middle, others right of it; crossed where lost."""
+    shapes = cell_shapes(np.concatenate([drawn, grip.cell]))[len(drawn) :]  # in the axes of what is drawn
+    x, y = shapes.mean(axis=1).T
+    side = np.ptp(shapes[0, :, 0])
+    for warned, name, beside in ((True, "warned", -0.25), (False, "not warned", 0.25)):
+        for lost, word, mark in ((True, "lost grip", "x"), (False, "kept it", "o")):
+            rows = (grip.warned == warned) & (grip.lost == lost)
+            label = f"{name}, {word}: {int(rows.sum())}"
+            axes.scatter(x[rows] + beside * side, y[rows], marker=mark, s=30, color="black", label=label)
+    axes.legend(loc="lower right", fontsize=7)

@@ -103,13 +103,14 @@ def system(folder: Path) -> Iterator[tuple[str, ManagedProcess]]:
         router.stop()
 
 
-def fleet(folder: Path, vehicles: int, duration_s: float, seed: int) -> ManagedProcess:
-    """The simulated vehicles: one process, a Zenoh session and an identity for each."""
+def fleet(folder: Path, vehicles: int, duration_s: float, seed: int, warned: float) -> ManagedProcess:
+    """The simulated vehicles: one process, a session and an identity for each; a share of the drivers is warned."""
     scripts = Path(sys.executable).parent
     options = {
         "--vehicles": vehicles,
         "--scenario": SCENARIO,
         "--rough": 0.5,  # half of them as real cars are
+        "--warned": warned,
         "--duration": duration_s,
         "--seed": seed,
         "--config": folder / "agent.json",

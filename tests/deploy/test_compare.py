@@ -115,3 +115,25 @@ def test_the_page_of_the_demo_opens_in_a_browser_with_both_maps_and_its_figures(
         assert len(shown.colours(1)) > 2, "a colour, and the hatching with its white"
         assert shown.page.locator("#unknown").is_visible()
         assert "demo.map.rmse" in shown.page.locator("#table").inner_text()
+
+
+def test_who_was_warned_and_lost_grip_on_the_new_ice_is_counted_by_passes(tmp_path: Path) -> None:
+    """Of two warned and one unwarned pass since the first alert; what was before it counts for nobody."""
+    driven = visits(
+        ("sim-001", 1.0, 7, 0.9, 0.5), ("sim-002", 11.0, 7, 0.2, 1.0), ("sim-001", 31.0, 7, 0.2, 0.6),
+        ("sim-001", 32.0, 7, 0.2, 0.99), ("sim-002", 33.0, 7, 0.2, 1.0), ("sim-004", 40.0, 7, 0.2, 0.7),
+    )  # fmt: skip
+    alerts = [(20 * S, Alert(7, 0, True, 20 * S, 0.2, 0.1, 0.3, 0.95, 2, 0.0, 0.0, "ice"))]
+    grip = compare.lost_grip(driven, alerts, 10 * S, 0.5)
+    assert sorted(zip(grip.warned.tolist(), grip.lost.tolist(), strict=True)) == [
+        (False, True), (True, False), (True, True),
+    ]  # fmt: skip
+    assert (
+        grip.line()
+        == "Over the new ice, once it was known: 1 of 2 warned drivers lost grip, 1 of 1 who were not warned."
+    )
+    assert not len(compare.lost_grip(driven, [], 10 * S, 0.5).lost), "nobody knew of it"
+    found = compare.MapComparison(tile([7, 8], 0.1, 0.3), np.array([0.2, 0.2]))
+    picture.draw(found, tmp_path / "a.png", grip)
+    picture.draw(found, tmp_path / "b.png")
+    assert (tmp_path / "a.png").read_bytes() != (tmp_path / "b.png").read_bytes()

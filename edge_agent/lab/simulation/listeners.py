@@ -6,15 +6,29 @@ import queue
 from collections.abc import Callable, Iterator
 from typing import Final
 
+import numpy as np
+
 from edge_agent.ahead.path import GivenRoute
 from edge_agent.inputs.block import Block
-from edge_agent.lab.simulation.fleet import SimulatedFleet, rough_ones
+from edge_agent.lab.simulation.fleet import GOLDEN, SimulatedFleet
 from schemas.errors import InputError
 from schemas.numeric import BoolArray
 from schemas.wire.ahead import GripWarning
 
 ROUTE_M: Final = 600.0
+AROUND_M: Final = 25.0  # in which a driver stays careful: alerts are of single cells, and ice seldom ends with them
 EVERY: Final = 10  # blocks between two looks at the route
+
+
+def warned_ones(vehicles: int, share: float) -> BoolArray:
+    """Which drivers are warned, (N,): spread evenly over those of smooth and of rough vehicles.
+
+    Raises:
+        InputError: no share.
+    """
+    if not 0.0 <= share <= 1.0:
+        raise InputError("warned", f"{share} is not a share", "give a number from 0 to 1")
+    return np.asarray((np.arange(vehicles) + 0.5) * GOLDEN % 1.0 < share)
 
 
 class WarnedDrivers:
@@ -29,10 +43,8 @@ class WarnedDrivers:
     """
 
     def __init__(self, fleet: SimulatedFleet, share: float) -> None:
-        if not 0.0 <= share <= 1.0:
-            raise InputError("warned", f"{share} is not a share", "give a number from 0 to 1")
         self._fleet = fleet
-        self.warned: BoolArray = rough_ones(len(fleet.names), share)
+        self.warned = warned_ones(len(fleet.names), share)
         self._number = {name: k for k, name in enumerate(fleet.names)}
         self._routes: dict[int, GivenRoute] = {}
         self._told: queue.SimpleQueue[tuple[int, GripWarning]] = queue.SimpleQueue()
@@ -67,8 +79,6 @@ class WarnedDrivers:
         """Hand the drivers what was heard for them."""
         while not self._told.empty():
             k, warning = self._told.get()
-            if warning.state == "ended":
-                self._fleet.warn(k, (0.0, 0.0), 0.0, 0.0)
-            else:
-                end = warning.distance_m + warning.length_m
-                self._fleet.warn(k, (warning.distance_m, end), warning.safe_speed, warning.mu_lower)
+            if warning.state != "ended":  # one that is passed he leaves behind by himself
+                start, end = warning.distance_m - AROUND_M, warning.distance_m + warning.length_m + AROUND_M
+                self._fleet.warn(k, (start, end), warning.safe_speed, warning.mu_lower)

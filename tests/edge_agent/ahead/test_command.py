@@ -72,6 +72,6 @@ def test_of_a_fleet_the_share_that_is_warned_hears_and_the_others_do_not(
         assert main([*words, *settings(tmp_path, router), "--warned", "0.5"]) == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     warned = {one["vehicle"] for one in lines if one.get("event") == "warning"}
-    assert warned == {"sim-002", "sim-004"}
+    assert warned == {"sim-001", "sim-004"}
     assert {one["way"] for one in lines if one.get("event") == "warning"} == {"route"}
     assert main([*words, "--warned", "2"]) == 2
