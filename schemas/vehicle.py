@@ -38,6 +38,10 @@ class Calibration(BaseModel):
         Learned | None,
         Field(description="torque over radius, over what moves the file's mass [1]"),
     ] = None
+    wheel_lag: Annotated[
+        Learned | None, Field(description="[s] by which wheel speeds speak later than the inertial unit")
+    ] = None
+    steer_lag: Annotated[Learned | None, Field(description="[s] likewise, the steering angle")] = None
     understeer: Annotated[Learned | None, Field(description="[rad per m/s^2], told and not yet used")] = None
 
 

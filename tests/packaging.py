@@ -1,12 +1,13 @@
 """`make package`: builds sdist and wheel, tries the wheel in a fresh environment, far from here.
 
-The wheel is built from the sdist, so that what is missing in the one is missed in the other. `--python` names other
-interpreters to try it with.
+The wheel is built from the sdist, so that what is missing in the one is missed in the other. It is tried with each
+Python of VERSIONS that this machine has; for those that it has not, a line says so. `--python` names others.
 """
 
 from __future__ import annotations
 
 import argparse
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -27,18 +28,43 @@ for package in (schemas, edge_agent, fleet_service):
     assert (Path(package.__file__).parent / "py.typed").is_file(), package
 """
 HIDING = "import gripmap"
+VERSIONS = ("3.11", "3.12", "3.13")
+WORKS = "import ensurepip, sys, venv; print('%d.%d' % sys.version_info[:2])"
+
+
+def interpreters() -> list[str]:
+    """Commands of the VERSIONS that work here; says which are left out, and why."""
+    found = []
+    for version in VERSIONS:
+        here = (
+            sys.executable if version == ".".join(map(str, sys.version_info[:2])) else shutil.which(f"python{version}")
+        )
+        if here is None:
+            print(f"python{version} skipped: no such command on this machine", flush=True)
+            continue
+        said = subprocess.run([here, "-c", WORKS], capture_output=True, text=True, check=False, timeout=60)
+        if said.stdout.strip() == version:
+            found.append(here)
+        else:
+            why = (said.stderr or said.stdout or "says nothing").strip().splitlines()[-1]
+            print(f"python{version} skipped: {here} does not work ({why[:100]})", flush=True)
+    return found
 
 
 def main() -> int:
     """Build, install, use; exit code 1 with what went wrong."""
     parser = argparse.ArgumentParser(prog="python -m tests.packaging", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--python", nargs="*", default=[sys.executable], help="interpreters (default: this one)")
-    args = parser.parse_args()
+    parser.add_argument(
+        "--python", nargs="*", help=f"interpreters (default: {', '.join(VERSIONS)} where there are such)"
+    )
+    pythons = parser.parse_args().python or interpreters()
+    if not pythons:
+        raise SystemExit(f"none of {', '.join(VERSIONS)} works here")
     with tempfile.TemporaryDirectory() as folder:
         built = Path(folder) / "dist"
         run([sys.executable, "-m", "build", "--outdir", built, ROOT], ROOT)
         (wheel,) = built.glob("*.whl")
-        for number, python in enumerate(args.python):
+        for number, python in enumerate(pythons):
             use(python, wheel, Path(folder) / f"use{number}")
     return 0
 

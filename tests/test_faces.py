@@ -101,10 +101,22 @@ def blocks(address):
         yield block
 
 
+def brush(theta):
+    left = np.maximum(1.0 - theta / 3.0, 0.0)
+    return 1.0 - left**3
+
+
+def steep(theta):
+    return np.minimum(2.0 * theta, 1.0)
+
+
 busiest = Question("busiest", "rows", "rows", None, lambda engine, options: pa.table({"rows": [engine.rows()]}))
 """
 POINTS = """[gripmap.estimators]
 at-least = their_plugin:bank
+[gripmap.tyre_curves]
+brush = their_plugin:brush
+steep = their_plugin:steep
 [gripmap.sources]
 mine = their_plugin:blocks
 [gripmap.questions]
@@ -113,6 +125,7 @@ busiest = their_plugin:busiest
 
 
 @pytest.mark.campaign
+@pytest.mark.timeout(600)  # the kernels of the default estimator may have to be compiled
 def test_estimator_source_and_question_of_another_distribution_are_found(tmp_path: Path) -> None:
     from tests.fleet_service.archive.kept import DATA
 
@@ -137,6 +150,19 @@ def test_estimator_source_and_question_of_another_distribution_are_found(tmp_pat
     assert pq.read_table(tmp_path / "e.parquet")["mu_lower"].to_numpy().max() > 0.11
     done = command("edge_agent", "replay", str(log), "--estimator", "no", "--out", str(tmp_path / "e.parquet"))
     assert "at-least" in done.stderr
+    said = []
+    for estimator in ("ckf", "ckf@brush"):
+        out = tmp_path / "e.parquet"
+        done = command("edge_agent", "replay", str(log), "--estimator", estimator, "--out", str(out))
+        assert done.returncode in (0, 3), done.stderr
+        said.append(pq.read_table(out))
+    assert not said[0].equals(said[1])
+    for estimator, problem in (
+        ("ckf@steep", "tyre-curve: begins with slope 2"), ("ckf@no", "tyre-curve: 'no' is unknown"),
+        ("sr-ukf@brush", "tyre-curve: sr-ukf has its own"),
+    ):  # fmt: skip
+        done = command("edge_agent", "replay", str(log), "--estimator", estimator, "--out", str(tmp_path / "e.parquet"))
+        assert problem in done.stderr, done.stderr
     archive = DATA / "v1.0" / "archive"
     done = command("fleet_service", "analyze", "busiest", "--archive", str(archive), "--as-it-lies", "--json")
     assert json.loads(done.stdout)["rows"] > 0, done.stderr

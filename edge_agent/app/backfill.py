@@ -77,7 +77,7 @@ def estimate(task: Task, estimator: str, memberships: Memberships | None = None)
     try:
         vehicle = load_vehicle(task.vehicle)
         bank, log = bank_of(estimator, [vehicle], memberships), read_log(task.log)
-        log = replace(log, signals=corrected(log.signals, vehicle))
+        log = replace(log, signals=corrected(log.t, log.signals, vehicle))
         with EstimatesFile(task.out) as file:
             for block in log.blocks(0):
                 file.write(block.t, bank.advance(block.t, block.signals))

@@ -22,7 +22,7 @@ def bank_of(estimator: str, vehicles: Sequence[Vehicle], memberships: Membership
     """A bank of estimators by name, one per vehicle.
 
     Args:
-        estimator: a key of `known()`.
+        estimator: a key of `known()`; NAME@CURVE with the tyre curve of another package.
         vehicles: nominal vehicles, N of them.
         memberships: fuzzy sets in place of the shipped ones.
 
@@ -30,6 +30,11 @@ def bank_of(estimator: str, vehicles: Sequence[Vehicle], memberships: Membership
         InputError: no such estimator, no vehicle, memberships for an estimator that has none, or its tuned ones cannot
             be read.
     """
+    estimator, _, own = estimator.partition("@")
+    if own and own not in plugins.found(plugins.TYRE_CURVES):
+        others = ", ".join(plugins.found(plugins.TYRE_CURVES)) or "none is installed"
+        raise InputError("tyre-curve", f"{own!r} is unknown", f"choose one of these: {others}")
+    curve = plugins.loaded(plugins.TYRE_CURVES, own) if own else None
     if estimator not in ESTIMATORS and estimator in plugins.found(plugins.ESTIMATORS):
         if memberships is not None:
             raise InputError("memberships", f"{estimator} has no fuzzy sets to replace", "leave them out")
@@ -39,4 +44,4 @@ def bank_of(estimator: str, vehicles: Sequence[Vehicle], memberships: Membership
         raise InputError("estimator", f"{estimator!r} is unknown", f"choose one of {', '.join(known())}")
     if memberships is None and estimator in TUNED:
         memberships = shipped(TUNED[estimator])
-    return create(estimator, vehicles, memberships=memberships)
+    return create(estimator, vehicles, memberships=memberships, curve=curve)

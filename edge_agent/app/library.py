@@ -67,7 +67,7 @@ def estimate(
     What a calibrated vehicle file knows of its devices is taken off the signals first, as `edge-agent replay` does.
     """
     bank = bank_of(estimator, [vehicle], memberships)
-    log = replace(log, signals=corrected(log.signals, vehicle))
+    log = replace(log, signals=corrected(log.t, log.signals, vehicle))
     parts = [table(block.t, bank.advance(block.t, block.signals)) for block in log.blocks(0)]
     return pa.concat_tables([*parts, ESTIMATES_SCHEMA.empty_table()]).combine_chunks()
 

@@ -22,8 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from edge_agent.calibration.learn import DriveEstimates, one_drive, surer, weighed
 from edge_agent.inputs.block import Block
-from edge_agent.inputs.correct import corrected
-from edge_agent.inputs.doctor.drive import prepare
+from edge_agent.inputs.correct import Corrector
 from edge_agent.inputs.doctor.findings import diagnose
 from edge_agent.inputs.profile import Profile
 from schemas.numeric import FloatArray
@@ -88,10 +87,12 @@ class Trip:
         """
         if not self.admitted():
             log.info("nothing is published until the signal doctor has passed half a minute of turns and braking")
+        corrector = Corrector(self.vehicle)
         with closing(source):
             for block in source:
                 self._keep(block, ground())
-                yield replace(block, signals=corrected(block.signals, self.vehicle))
+                mended = corrector.advance(block.t[:, 0], block.signals[:, 0])
+                yield replace(block, signals=mended[:, None])
 
     def end(self) -> None:
         """Begin to learn from what is left."""
@@ -137,7 +138,7 @@ class Trip:
                 log.warning("the signal doctor: %s", ", ".join(self._faults))
             estimates: DriveEstimates = {}
             if said.passed and final and t[-1] - t[0] >= LEAST_S:
-                estimates = one_drive(prepare(t, signals, self._plain), self._plain)
+                estimates = one_drive(t, signals, self._plain)
         except (ValueError, FloatingPointError, np.linalg.LinAlgError) as error:
             log.warning("a part of this trip cannot be examined: %s", error)
             return

@@ -7,6 +7,7 @@
     steer_offset      intercept of δ over L·r/v with understeer beside it
     steer_gain        gain of the same
     force_gain        torque over radius, over mass times acceleration: torque gain and mass, where torque is recorded
+    wheel_lag, steer_lag    by which they speak later than the inertial unit: lags.py
     understeer        δ beyond L·r/v per v·r [rad per m/s²]
 
 Wheels under force slip: what the driven axle turns faster for it, and the dragged one slower, is taken off a radius by
@@ -27,6 +28,7 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
+from edge_agent.calibration.lags import lags
 from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, prepare
 from edge_agent.inputs.doctor.identities import fits, robust
 from schemas.errors import InputError
@@ -41,11 +43,13 @@ STRAIGHT: Final = 1.0  # [m/s^2] of v·r
 LEAST_S: Final = 10.0  # of moments that count
 # spread among drives that is always allowed for; what drives have in common; and spread among cars
 FLOOR: Final = {"radius": 0.0004, "ax": 0.10, "ay": 0.05, "yaw_rate": 0.0015, "steer_offset": 0.0006,
-                "steer_gain": 0.03, "force_gain": 0.02, "understeer": 0.0015}  # fmt: skip
+                "steer_gain": 0.03, "force_gain": 0.02, "understeer": 0.0015, "wheel_lag": 0.012,
+                "steer_lag": 0.012}  # fmt: skip
 BIAS: Final = {"radius": 0.0001, "ax": 0.02, "ay": 0.25, "yaw_rate": 0.0005, "steer_offset": 0.0004,
-               "steer_gain": 0.03, "force_gain": 0.002, "understeer": 0.0005}  # fmt: skip
+               "steer_gain": 0.03, "force_gain": 0.002, "understeer": 0.0005, "wheel_lag": 0.003,
+               "steer_lag": 0.009}  # fmt: skip
 USUAL: Final = {"radius": 0.006, "ax": 0.4, "ay": 0.2, "yaw_rate": 0.004, "steer_offset": 0.005, "steer_gain": 0.04,
-                "force_gain": 0.08, "understeer": 0.01}  # fmt: skip
+                "force_gain": 0.08, "understeer": 0.01, "wheel_lag": 0.04, "steer_lag": 0.04}  # fmt: skip
 ROBUST: Final = 1.4826  # standard deviations in the median of absolute deviations
 UNKNOWN_SPLIT: Final = 0.0008  # BIAS of radii where the file does not say which axle drives
 DRAG: Final = 0.4  # [kg/m] half of 1.2 kg/m^3 x .3 x 2.2 m^2
@@ -62,7 +66,7 @@ def learn(drives: Sequence[tuple[FloatArray, FloatArray]], vehicle: Vehicle) -> 
     Raises:
         InputError: none of them is excited enough.
     """
-    estimates = [one_drive(prepare(t, signals, vehicle), vehicle) for t, signals in drives]
+    estimates = [one_drive(t, signals, vehicle) for t, signals in drives]
     calibration = weighed(estimates, vehicle)
     if calibration is None:
         raise InputError(
@@ -110,8 +114,12 @@ def _posterior(kind: str, values: FloatArray, bias: float) -> tuple[float, float
     return round(sound + share * (centre - sound), 6), round(float(np.sqrt(share)) * std, 6)
 
 
-def one_drive(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
-    """Estimates of one drive, by quantity; those it was not excited for are left out."""
+def one_drive(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> DriveEstimates:
+    """Estimates of one drive, t (T,) [s] and signals (T, 18), by quantity; what it was not excited for is left out."""
+    return _quantities(prepare(t, signals, vehicle), vehicle) | lags(t, signals, vehicle)
+
+
+def _quantities(drive: EvenDrive, vehicle: Vehicle) -> DriveEstimates:
     moving, axle = drive.moving > 0, fits(drive)["axle"]
     quantities: DriveEstimates = {}
     if axle.known and axle.error < 0.1:

@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     bank = bank_of(estimator, [vehicle], memberships)
     log = read_log(path)
     start_ns = _start(args.start, log)
-    log = replace(log, signals=corrected(log.signals, vehicle))
+    log = replace(log, signals=corrected(log.t, log.signals, vehicle))
     plausibility = Plausibility(vehicle.wheel_radius)
     if args.publish and not args.trust:
         insist_on_sound(log, vehicle)

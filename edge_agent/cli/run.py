@@ -136,7 +136,7 @@ def _logged(args: argparse.Namespace, source: Path) -> tuple[Vehicle, str, Itera
 
     vehicle = load_vehicle(_vehicle_file(args))
     log = read_log(source)
-    log = replace(log, signals=corrected(log.signals, vehicle))
+    log = replace(log, signals=corrected(log.t, log.signals, vehicle))
     if not args.trust:
         insist_on_sound(log, vehicle)
     first_ns = time.time_ns() - round(float(log.t[0]) * NS)

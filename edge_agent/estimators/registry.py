@@ -19,6 +19,7 @@ from edge_agent.estimators.bank import EstimatorBank
 from edge_agent.estimators.friction_mixture.bank import mixture_bank
 from edge_agent.estimators.friction_mixture.calibrated import spreads_of
 from edge_agent.estimators.friction_mixture.design import design_of
+from edge_agent.estimators.friction_mixture.tyre_curve import Curve, proven
 from schemas.errors import InputError
 from schemas.vehicle import Vehicle
 
@@ -44,22 +45,34 @@ PLAIN: Final[dict[str, Callable[[Sequence[Vehicle]], EstimatorBank]]] = {
 }
 
 
-def create(name: str, vehicles: Sequence[Vehicle], *, memberships: Memberships | None = None) -> EstimatorBank:
+def create(
+    name: str, vehicles: Sequence[Vehicle], *, memberships: Memberships | None = None, curve: Curve | None = None
+) -> EstimatorBank:
     """A bank of estimators `name`, one per vehicle.
 
     Args:
         name: a key of ESTIMATORS.
         vehicles: nominal vehicles, N of them.
         memberships: the fuzzy sets; needed by the estimators in TUNED, and replacing the untuned ones of others.
+        curve: of the tyres, in place of the usual one; for the default estimator and its two ablations.
 
     Raises:
-        InputError: the name is unknown, no vehicle is given, tuned memberships are missing, or memberships are given
-            to an estimator that has none.
+        InputError: the name is unknown, no vehicle is given, tuned memberships are missing, memberships are given to an
+            estimator that has none, or a curve that is none, or to one that has its own.
     """
     if name not in ESTIMATORS:
         raise InputError("estimator", f"{name!r} is unknown", f"choose one of {', '.join(ESTIMATORS)}")
     if not vehicles:
         raise InputError("vehicles", "none given", "give at least one vehicle")
+    if curve is not None:
+        if name in PLAIN or name == "paper-aco-fckf":
+            raise InputError("tyre-curve", f"{name} has its own", "leave it out")
+        try:
+            proven(curve)
+        except (ValueError, TypeError) as error:
+            raise InputError(
+                "tyre-curve", str(error), "give force over peak force, of slip times stiffness over peak force"
+            ) from error
     if name in PLAIN:
         if memberships is not None:
             raise InputError("memberships", f"{name} has no fuzzy sets to replace", "leave them out")
@@ -70,5 +83,5 @@ def create(name: str, vehicles: Sequence[Vehicle], *, memberships: Memberships |
         memberships = Memberships()
     if name == "paper-aco-fckf":
         return paper_aco_fckf.bank(vehicles, memberships)
-    design = design_of(memberships, adaptive=name != "ckf")
+    design = design_of(memberships, adaptive=name != "ckf", curve=curve)
     return mixture_bank(parameter_table(vehicles), design, spreads_of(vehicles, design.nominal.std))

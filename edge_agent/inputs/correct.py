@@ -1,21 +1,58 @@
-"""Signals as a calibrated vehicle means them: offsets off, wheels alike, steering by its true map."""
+"""Signals as a calibrated vehicle means them: offsets off, wheels alike, steering by its true map, devices together.
+
+What was not learned is taken as sound; what was is a posterior mean, drawn to it. Rear steering stays. So does a_y:
+what it reads straight on is crossfall too, which tyres truly hold, and no drive tells them apart.
+"""
 
 from __future__ import annotations
 
+import numpy as np
+
 from schemas.numeric import FloatArray
-from schemas.signals import WHEELS, S
-from schemas.vehicle import Vehicle
+from schemas.signals import CHANNELS, WHEELS, S
+from schemas.vehicle import Calibration, Vehicle
+
+# first channel of a device, and the first behind it
+INERTIAL, STEERING, TURNING = (S.AX, S.YAW_RATE + 1), (S.DELTA, S.DELTA + 4), (S.OMEGA, S.OMEGA + 4)
 
 
-def corrected(signals: FloatArray, vehicle: Vehicle) -> FloatArray:
-    """Signals (…, 18) less what the vehicle's calibration knows of their errors; the same array where there is none.
+class Corrector:
+    """One vehicle's signals, less what its calibration knows of their errors; blocks may be cut anywhere.
 
-    What was not learned is taken as sound; what was is a posterior mean, drawn to it. Rear steering stays.
-    So does a_y: what it reads straight on is crossfall too, which tyres truly hold, and no drive tells them apart.
+    Devices that speak early wait for the latest one: of each the reading is taken that is nearest to the moment that
+    the latest tells of, as it came. So a row is of a moment up to a tenth of a second before its time.
     """
-    known = vehicle.calibration
-    if known is None:
-        return signals
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self._known = vehicle.calibration
+        self._waits = _waits(self._known)
+        self._t, self._rows = np.empty(0), np.empty((0, len(CHANNELS)))
+
+    def advance(self, t: FloatArray, signals: FloatArray) -> FloatArray:
+        """The next rows: times t (T,) [s] and signals (T, 18); the same array where nothing is known."""
+        if self._known is None:
+            return signals
+        signals = _mended(signals, self._known)
+        if not self._waits:
+            return signals
+        times, rows = np.concatenate([self._t, t]), np.concatenate([self._rows, signals])
+        together = signals.copy()
+        for channels, wait in self._waits.items():
+            at = t - wait
+            after = np.clip(np.searchsorted(times, at), 1, max(len(times) - 1, 1))
+            near = np.where(times[np.minimum(after, len(times) - 1)] - at < at - times[after - 1], after, after - 1)
+            together[:, slice(*channels)] = rows[np.minimum(near, len(times) - 1), slice(*channels)]
+        kept = max(0, int(np.searchsorted(times, times[-1] - max(self._waits.values()))) - 2) if len(times) else 0
+        self._t, self._rows = times[kept:], rows[kept:]
+        return together
+
+
+def corrected(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> FloatArray:
+    """A whole log, times t (T,) [s] and signals (T, 18), as a `Corrector` makes it."""
+    return Corrector(vehicle).advance(t, signals)
+
+
+def _mended(signals: FloatArray, known: Calibration) -> FloatArray:
     signals = signals.copy()
     for channel, estimate in ((S.AX, known.ax), (S.YAW_RATE, known.yaw_rate)):
         signals[..., channel] -= _value(estimate, 0.0)
@@ -26,6 +63,15 @@ def corrected(signals: FloatArray, vehicle: Vehicle) -> FloatArray:
     signals[..., front] -= _value(known.steer_offset, 0.0)
     signals[..., front] /= _value(known.steer_gain, 1.0)
     return signals
+
+
+def _waits(known: Calibration | None) -> dict[tuple[int, int], float]:
+    """How long the readings of a device's channels wait for the latest device [s]; the latest is left out."""
+    if known is None or (known.wheel_lag is None and known.steer_lag is None):
+        return {}
+    late = {INERTIAL: 0.0, STEERING: _value(known.steer_lag, 0.0), TURNING: _value(known.wheel_lag, 0.0)}
+    latest = max(late.values())
+    return {channels: latest - lag for channels, lag in late.items() if lag < latest}
 
 
 def _value(estimate: tuple[float, float] | None, sound: float) -> float:

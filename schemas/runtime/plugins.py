@@ -5,6 +5,7 @@
 
 group                   what stands behind a name
 gripmap.estimators      bank(vehicles) with `advance` as EstimatorBank has it
+gripmap.tyre_curves     curve(theta): force over its peak of normalised slips, an array; `--estimator aco-fckf@name`
 gripmap.sources         blocks(address), an iterator of edge_agent.Block; asked for as `--source name:address`
 gripmap.questions       a fleet_service.analytics.questions.Question
 """
@@ -18,6 +19,7 @@ from typing import Any, Final
 from schemas.errors import InputError
 
 ESTIMATORS: Final = "gripmap.estimators"
+TYRE_CURVES: Final = "gripmap.tyre_curves"
 SOURCES: Final = "gripmap.sources"
 QUESTIONS: Final = "gripmap.questions"
 

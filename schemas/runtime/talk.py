@@ -84,6 +84,8 @@ def _hide() -> None:
 
 
 def _show() -> None:
+    with suppress(OSError):  # at once: the library that draws takes a second to load beside the command's own
+        print(f"{_voice.words} …", end="\r", file=sys.stderr, flush=True)
     from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 

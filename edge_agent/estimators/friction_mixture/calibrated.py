@@ -13,13 +13,16 @@ from schemas.signals import WHEELS
 from schemas.vehicle import Vehicle
 
 # state -> (quantity of the calibration, what the state carries beside it: the pitch and slope that a_x feels, toe and
-# crossfall that steering holds against, another load, slip that the nominal stiffness leaves on a driven wheel).
+# crossfall that steering holds against, another load, slip that the nominal stiffness leaves on a driven wheel,
+# half a sample).
 # Tighter ones (.03, .0003, .0005) made intervals wider on six towns of rough cars: what a state may not carry reads as
 # a contradiction.
 LEARNED: Final[dict[int, tuple[str, float]]] = {
     NodeState.BIAS_X: ("ax", 0.12),
     NodeState.STEER: ("steer_offset", 0.0015),
     NodeState.GAIN: ("force_gain", 0.02),
+    NodeState.LAG_WHEEL: ("wheel_lag", 0.006),
+    NodeState.LAG_STEER: ("steer_lag", 0.006),
     **{NodeState.RADIUS + i: (f"radius_{wheel}", 0.0015) for i, wheel in enumerate(WHEELS)},
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from edge_agent.adaptation.rule_base import RuleBase, rule_base
 from edge_agent.estimators.friction_mixture.constants import NODES, STATES, Constants, NodeState
 from edge_agent.estimators.friction_mixture.friction_grid import node_table
 from edge_agent.estimators.friction_mixture.split_sides import Sides, side_table
-from edge_agent.estimators.friction_mixture.tyre_curve import TyreCurve, curve_tables
+from edge_agent.estimators.friction_mixture.tyre_curve import Curve, TyreCurve, curve_tables, magic_formulas
 from schemas.numeric import FloatArray
 
 
@@ -63,8 +64,10 @@ def nominal_states(constants: Constants) -> Nominal:
     return Nominal(mean, std, time)
 
 
-def design_of(memberships: Memberships, *, adaptive: bool, constants: Constants | None = None) -> MixtureDesign:
-    """The tables of a filter; other `constants` are for studies."""
+def design_of(
+    memberships: Memberships, *, adaptive: bool, constants: Constants | None = None, curve: Curve | None = None
+) -> MixtureDesign:
+    """The tables of a filter; other `constants` are for studies, another `curve` for other tyres."""
     mu, prior = node_table(NODES)
     constants = constants or Constants()
     return MixtureDesign(
@@ -72,7 +75,7 @@ def design_of(memberships: Memberships, *, adaptive: bool, constants: Constants 
         mu=mu,
         prior=prior,
         sides=side_table(mu, prior, constants.split_prior),
-        curve=curve_tables(constants.curve_c, constants.curve_e),
+        curve=curve_tables(curve or partial(magic_formulas, c=constants.curve_c, e=constants.curve_e)),
         nominal=nominal_states(constants),
         fuzzy_inputs=np.array(memberships.inputs),
         fuzzy_outputs=np.array(memberships.outputs),

@@ -12,7 +12,8 @@ Legend
 from __future__ import annotations
 
 import math
-from typing import Annotated, Final, NamedTuple
+from collections.abc import Callable
+from typing import Annotated, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -40,19 +41,38 @@ def magic_formulas(theta: FloatArray, c: float, e: float) -> FloatArray:
     return np.asarray(np.sin(c * np.arctan(b - e * (b - np.arctan(b)))))
 
 
-def curve_tables(c: float, e: float) -> TyreCurve:
-    """Tables of the Magic Formula with shape c and curvature e, and of the spread of tyres about it."""
+Curve: TypeAlias = Callable[[FloatArray], FloatArray]
+"""Force over mu*F_z of normalised slips theta >= 0: slope 1 at none, peak 1, and level or falling beyond."""
+
+
+def proven(curve: Curve) -> Curve:
+    """A curve that is one: ValueError says what is wrong with it."""
+    theta = np.linspace(0.0, 10.0, 10_001)
+    f = np.asarray(curve(theta), dtype=np.float64)
+    if f.shape != theta.shape or not np.isfinite(f).all():
+        raise ValueError("is not a finite force for each slip")
+    if abs(f[0]) > 1e-9 or abs(f[1] / theta[1] - 1.0) > 0.01:
+        raise ValueError(f"begins with slope {f[1] / theta[1]:.3g} at {f[0]:.3g}, not with 1 at 0")
+    if abs(f.max() - 1.0) > 1e-3 or f.min() < 0.0:
+        raise ValueError(f"goes from {f.min():.3g} to {f.max():.3g}, not from 0 to 1")
+    if (np.diff(f[: int(np.argmax(f)) + 1]) <= 0.0).any():
+        raise ValueError("does not rise up to its peak")
+    return curve
+
+
+def curve_tables(curve: Curve) -> TyreCurve:
+    """Tables of a curve, and of the spread of tyres about it."""
     u = np.linspace(0.0, 1.0, CELLS + 1)
     theta = u / np.maximum(1.0 - u, 1e-9)
-    f = magic_formulas(theta, c, e)
+    f = curve(theta)
     step = 1e-4 * (1.0 + theta)
     fine = np.linspace(0.0, 10.0, 200_001)
-    rising = magic_formulas(fine, c, e)
+    rising = curve(fine)
     peak = int(np.argmax(rising))
     t = np.linspace(0.0, 1.0, CELLS + 1)
     return TyreCurve(
         ratio=np.divide(f, theta, out=np.ones_like(f), where=theta > 0.0),
-        slope=(magic_formulas(theta + step, c, e) - magic_formulas(theta - step, c, e)) / (2.0 * step),
+        slope=(curve(theta + step) - curve(theta - step)) / (2.0 * step),
         shape=0.5 * (magic_formulas(theta, *SHARP) - magic_formulas(theta, *ROUND)),
         inverse=np.interp(1.0 - t * t, rising[: peak + 1], fine[: peak + 1]),
     )

@@ -43,6 +43,10 @@ def truth(seed: int, car: int) -> dict[str, float]:
         "yaw_rate": float(offset[S.YAW_RATE]),
         "steer_offset": float(mounted[Misaligned.ZERO] + offset[S.DELTA]),
         "steer_gain": float(1.0 + mounted[Misaligned.GAIN]),
+        **{
+            f"{name}_lag": float(mounted[Misaligned.LAG + device] - mounted[Misaligned.LAG])
+            for name, device in (("steer", 1), ("wheel", 2))
+        },
         "understeer": 0.0,  # front and rear tyres of the simulated cars have one stiffness over load
         "force_gain": float(error[ErrorColumn.GAIN + S.TORQUE]) * _heavier(seed, car),
     }
@@ -79,7 +83,7 @@ def narrowed(cars: int, seed: int, judged_s: int = JUDGED_S) -> Narrowed:
     judged = slice(round(SETTLED_S * RATE_HZ), None)
     found = []
     for vehicles in (fleet.vehicles, learned):
-        mended = np.stack([corrected(signals[:, n], vehicle) for n, vehicle in enumerate(vehicles)], axis=1)
+        mended = np.stack([corrected(t[:, n], signals[:, n], vehicle) for n, vehicle in enumerate(vehicles)], axis=1)
         told = bank_of(ESTIMATOR, vehicles).advance(t, mended)
         inside = (told.mu_lower <= mu) & (mu <= told.mu_upper)
         found += [float((told.mu_upper - told.mu_lower)[judged].mean()), float(inside[judged].mean())]

@@ -40,6 +40,10 @@ def own_drives(logs: Sequence[tuple[SignalLog, Vehicle]], duration_s: float) -> 
 def _side_by_side(parts: Sequence[tuple[SignalLog, Vehicle, int]], samples: int) -> TuningSet:
     t = np.stack([log.t[first : first + samples] - log.t[first] for log, _, first in parts], axis=1)
     signals = np.stack(
-        [corrected(log.signals[first : first + samples], vehicle) for log, vehicle, first in parts], axis=1
+        [
+            corrected(t[:, n], log.signals[first : first + samples], vehicle)
+            for n, (log, vehicle, first) in enumerate(parts)
+        ],
+        axis=1,
     )
     return TuningSet(tuple(vehicle for _, vehicle, _ in parts), t, signals, np.full(t.shape, np.nan))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import pytest
 
 from edge_agent.calibration.learn import USUAL, learn, surer, weighed
 from edge_agent.cli import main
-from edge_agent.inputs.correct import corrected
+from edge_agent.inputs.correct import Corrector, corrected
 from edge_agent.lab.evaluation.planted import Recorded, drives, moved, scaled
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
@@ -65,11 +66,11 @@ def test_more_drives_are_surer(smooth: Recorded) -> None:
 def test_a_correction_takes_off_what_was_learned(smooth: Recorded) -> None:
     bad = spoiled(smooth)
     calibration = learn(parts(bad, 3), bad.vehicle)
-    mended = corrected(bad.signals, bad.vehicle.model_copy(update={"calibration": calibration}))
+    mended = corrected(bad.t, bad.signals, bad.vehicle.model_copy(update={"calibration": calibration}))
     for channel, off in ((S.AX, OFF["ax"]), (S.YAW_RATE, OFF["yaw_rate"]), (S.DELTA, OFF["steer_offset"])):
         left = np.nanmedian(mended[:, channel] - smooth.signals[:, channel])
         assert abs(left) < 0.35 * off
-    assert corrected(bad.signals, bad.vehicle) is bad.signals
+    assert corrected(bad.t, bad.signals, bad.vehicle) is bad.signals
 
 
 def test_what_is_hardly_known_is_drawn_to_what_cars_usually_have(smooth: Recorded) -> None:
@@ -110,11 +111,49 @@ def test_torque_tells_its_gain_times_the_mass() -> None:
     for gained in (more, heavy):
         assert gained[0] - plain[0] == pytest.approx(0.1, abs=0.02)
     vehicle = drive.vehicle.model_copy(update={"calibration": Calibration(drives=1, force_gain=(1.1, 0.01))})
-    mended = corrected(scaled(torques, 1.1)(drive).signals, vehicle)
+    mended = corrected(drive.t, scaled(torques, 1.1)(drive).signals, vehicle)
     assert np.allclose(mended[:, torques], drive.signals[:, torques], equal_nan=True)
     unsaid = drive.signals.copy()
     unsaid[:, torques] = np.nan
     assert learn([(drive.t, unsaid)], drive.vehicle).force_gain is None
+
+
+WHEELS_AND_STEERING = {"wheel_lag": range(S.OMEGA, S.OMEGA + 4), "steer_lag": range(S.DELTA, S.DELTA + 4)}
+LATE = 8  # samples
+
+
+def late(drive: Recorded, channels: range) -> Recorded:
+    signals = drive.signals.copy()
+    signals[LATE:, channels] = drive.signals[:-LATE, channels]
+    return drive._replace(signals=signals)
+
+
+@pytest.mark.parametrize("name", WHEELS_AND_STEERING)
+def test_a_late_device_is_known_by_its_turns_and_the_others_wait_for_it(smooth: Recorded, name: str) -> None:
+    seconds = float(smooth.t[LATE] - smooth.t[0])
+    bad = late(smooth, WHEELS_AND_STEERING[name])
+    before, after = (learn(parts(one, 3), smooth.vehicle) for one in (smooth, bad))
+    one, other = getattr(before, name), getattr(after, name)
+    assert other[0] - one[0] == pytest.approx(seconds, abs=2.0 * other[1])
+    assert abs(one[0]) < 3.0 * one[1]
+    known = Calibration.model_validate({"drives": 1, name: (seconds, 0.001)})
+    vehicle = bad.vehicle.model_copy(update={"calibration": known})
+    mended = corrected(bad.t, bad.signals, vehicle)
+    both = [*WHEELS_AND_STEERING["wheel_lag"], *WHEELS_AND_STEERING["steer_lag"], S.AX, S.AY, S.YAW_RATE]
+    assert np.array_equal(mended[LATE:, both], smooth.signals[:-LATE, both], equal_nan=True)
+
+
+def test_waiting_is_causal_and_blocks_may_be_cut_anywhere(smooth: Recorded) -> None:
+    known = Calibration(drives=1, wheel_lag=(0.013, 0.001), steer_lag=(-0.041, 0.001), ax=(0.2, 0.01))
+    vehicle = smooth.vehicle.model_copy(update={"calibration": known})
+    t, signals = smooth.t[:300], smooth.signals[:300]
+    whole = corrected(t, signals, vehicle)
+    assert not np.array_equal(whole[50:, S.AX], signals[50:, S.AX] - 0.2)
+    assert np.array_equal(corrected(t[:150], signals[:150], vehicle), whole[:150], equal_nan=True)
+    corrector = Corrector(vehicle)
+    cuts = [0, 1, 2, 9, 10, 150, 300]
+    parted = [corrector.advance(t[a:b], signals[a:b]) for a, b in itertools.pairwise(cuts)]
+    assert np.array_equal(np.concatenate(parted), whole, equal_nan=True)
 
 
 def test_of_two_calibrations_the_surer_value_holds() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +13,7 @@ from edge_agent.estimators.friction_mixture.constants import ACTIVE, NODES, ROWS
 from edge_agent.estimators.friction_mixture.friction_grid import node_table
 from edge_agent.estimators.friction_mixture.node_filter import take_rows, unfelt
 from edge_agent.estimators.friction_mixture.split_sides import project, side_table
-from edge_agent.estimators.friction_mixture.tyre_curve import curve_tables, ratio_at, theta_at
+from edge_agent.estimators.friction_mixture.tyre_curve import curve_tables, magic_formulas, ratio_at, theta_at
 from edge_agent.estimators.friction_mixture.workspace import NodeWorkspace
 from schemas.runtime.records import records
 
@@ -48,7 +49,7 @@ def test_rows_taken_in_one_by_one_are_the_textbook_s_update(seed: int, missing: 
 
 def test_the_tables_are_the_magic_formula_and_its_inverse() -> None:
     c, e = Constants().curve_c, Constants().curve_e
-    curve = curve_tables(c, e)
+    curve = curve_tables(partial(magic_formulas, c=c, e=e))
     for theta in (0.01, 0.3, 1.0, 1.7, 4.0, 30.0, 900.0):
         assert ratio_at(curve, theta) * theta == pytest.approx(magic_formula(theta, c, e), abs=5e-4)
     for force in (0.05, 0.5, 0.9, 0.99):
@@ -57,7 +58,7 @@ def test_the_tables_are_the_magic_formula_and_its_inverse() -> None:
 
 
 def test_far_beyond_the_table_a_spinning_wheel_still_has_the_force_of_sliding() -> None:
-    curve = curve_tables(1.45, -0.1)
+    curve = curve_tables(partial(magic_formulas, c=1.45, e=-0.1))
     assert ratio_at(curve, 1e4) * 1e4 == pytest.approx(magic_formula(1e4, 1.45, -0.1), abs=2e-3)
 
 

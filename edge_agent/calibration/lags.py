@@ -1,0 +1,96 @@
+"""How late devices speak against the inertial unit, each from two ways to the yaw rate.
+
+    wheel_lag   wheels' yaw rate, mean of the axles, behind the gyro's
+    steer_lag   yaw rate of a bicycle model on the measured angle behind the gyro's (Rajamani 2012, section 2.3)
+
+    m (v̇_y + v r) = F_f + F_r,   I ṙ = a F_f − b F_r,   F_f = C_f (δ − (v_y + a r)/v),   F_r = −C_r (v_y − b r)/v
+
+The lag is where the correlation of both sides is largest; the peak is a parabola through three samples. A side force
+builds up behind its slip (LEAD), so that wheels and steering move a little before the body turns.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from edge_agent.inputs.doctor.drive import RATE_HZ, even, smooth
+from schemas.numeric import BoolArray, FloatArray
+from schemas.signals import S
+from schemas.vehicle import Vehicle
+
+LONGEST_S: Final = 0.3
+LEAST_S: Final = 10.0  # of driving
+SLOW_S: Final = 5.0  # what changes more slowly is offset and bank
+LEAST_LIKE: Final = 0.9  # correlation from which on a lag is believed
+SMOOTH_S: Final = 0.1  # of a running mean, taken twice
+LONGEST_DRIVE_S: Final = 1800.0
+DRIVEN: Final = 4.0  # [m/s]
+SLOWEST: Final = 3.0  # [m/s] for which the model's slip has a meaning
+# How fast a body answers to its wheels goes with the file's stiffness: .01 s at 10 % (BIAS of steer_lag in learn.py).
+# [s] that wheels and steering are ahead of the gyro where no device is late: force behind slip. Both are what twenty
+# simulated rough cars showed, with other seeds than those of the figures
+LEAD: Final = {"wheel_lag": 0.013, "steer_lag": 0.017}
+
+
+def lags(t: FloatArray, signals: FloatArray, vehicle: Vehicle) -> dict[str, float]:
+    """Lags [s] of a drive, t (T,) [s] and signals (T, 18), by quantity; those that its turns do not tell are left out.
+
+    Signals are smoothed less than the doctor's: over half a second the peak is too round to tell milliseconds.
+    """
+    at = np.arange(t[0], min(t[-1], t[0] + LONGEST_DRIVE_S), 1.0 / RATE_HZ)
+
+    def column(index: int) -> FloatArray:
+        return smooth(even(t, signals[:, index], at), SMOOTH_S)
+
+    rims = [column(S.OMEGA + wheel) * vehicle.wheel_radius for wheel in range(4)]
+    v = np.mean(rims, axis=0)
+    gyro, left = column(S.YAW_RATE), signals[:, S.DELTA]
+    wheels = 0.5 * ((rims[1] - rims[0]) / vehicle.track_front + (rims[3] - rims[2]) / vehicle.track_rear)
+    delta = smooth(even(t, np.where(np.isfinite(left), left, signals[:, S.DELTA + 1]), at), SMOOTH_S)
+    driven = (v > DRIVEN) & np.isfinite(gyro)
+    ways = {"wheel_lag": wheels, "steer_lag": _bicycle(v, delta, vehicle)}
+    found = {name: _behind(way, gyro, driven & np.isfinite(way)) for name, way in ways.items()}
+    return {name: lag + LEAD[name] for name, lag in found.items() if lag is not None}
+
+
+def _behind(left: FloatArray, right: FloatArray, among: BoolArray) -> float | None:
+    """Seconds that `left` is behind `right`; None where the drive does not tell."""
+    most = round(LONGEST_S * RATE_HZ)
+    among = among.copy()
+    among[: most + 1] = among[len(among) - most - 1 :] = False
+    if among.sum() < LEAST_S * RATE_HZ:
+        return None
+    left, right = ((x - smooth(x, SLOW_S)) for x in (left, right))
+    like = np.zeros(2 * most + 1)
+    for k in range(-most, most + 1):
+        other = np.roll(right, k)
+        both = among & np.isfinite(left) & np.isfinite(other)
+        like[k + most] = np.corrcoef(left[both], other[both])[0, 1] if both.sum() > 2 else 0.0
+    top = int(np.argmax(like))
+    if like[top] < LEAST_LIKE or top in (0, 2 * most):
+        return None
+    before, here, after = like[top - 1 : top + 2]
+    return float((top - most + 0.5 * (before - after) / (before - 2.0 * here + after)) / RATE_HZ)
+
+
+def _bicycle(speed: FloatArray, steering: FloatArray, vehicle: Vehicle) -> FloatArray:
+    """Yaw rate that the vehicle file's bicycle makes of the steering, by the trapezoidal rule."""
+    m, inertia, a, b = vehicle.mass, vehicle.yaw_inertia, vehicle.cg_to_front_axle, vehicle.cg_to_rear_axle
+    per_share = 4.0 * vehicle.cornering_stiffness / (a + b)  # of all wheels, shared out by their static load
+    c_f, c_r = b * per_share, a * per_share
+    half, motion, told = 0.5 / RATE_HZ, np.zeros(2), np.full(len(speed), np.nan)
+    before = 0.0
+    for k, (v, delta) in enumerate(zip(speed.tolist(), steering.tolist(), strict=True)):
+        if not (v > SLOWEST and abs(delta) < 1.0):  # standing, or NaN
+            motion, before = np.zeros(2), 0.0
+            continue
+        system = np.array([
+            [-(c_f + c_r) / (m * v), (b * c_r - a * c_f) / (m * v) - v],
+            [(b * c_r - a * c_f) / (inertia * v), -(a * a * c_f + b * b * c_r) / (inertia * v)],
+        ])  # fmt: skip
+        driven = np.array([c_f / m, a * c_f / inertia]) * (half * (before + delta))
+        motion = np.linalg.solve(np.eye(2) - half * system, motion + half * (system @ motion) + driven)
+        before, told[k] = delta, motion[1]
+    return told
