@@ -15,7 +15,7 @@ from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import forget, unpack
 from fleet_service.fusion.late import LATE_MOST_NS, delayed, fused_at
 from fleet_service.fusion.observations import Observations, SmallArray
-from fleet_service.fusion.shared import KERNELS, read_road, shared_parts
+from fleet_service.fusion.shared import ALARM_KERNELS, KERNELS, read_road, shared_parts
 from fleet_service.fusion.standing import ERRORS, UNKNOWN, Standing, classes, first_standing, unknown
 from fleet_service.fusion.store.cells import Cells
 from fleet_service.fusion.store.records import AGED, NOBODY, NONE, USED, Rows
@@ -179,6 +179,10 @@ class Fusion:
     def believed(self, slots: IntArray) -> FloatArray:
         """Belief of each slot about its road, (k, 32), at its last observation."""
         return _believed(self.store.state.live, KERNELS, slots)
+
+    def alarming(self, slots: IntArray) -> FloatArray:
+        """As `believed`, with the doubt about gentle values that an alarm has to bear, see `shared`."""
+        return _believed(self.store.state.live, ALARM_KERNELS, slots)
 
     def slots_of(self, cell: IntArray, sector: IntArray | SmallArray) -> IntArray:
         """Slot of each cell and sector, -1 where nobody was."""

@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.fusion import constants as c
+from fleet_service.fusion.standing import SLOPE_STEP
 from fleet_service.fusion.store.records import MANOEUVRES, SHARED, USED, WEIGHT
 from schemas import mugrid
 from schemas.numeric import ByteArray, Float32Array, FloatArray
@@ -63,12 +64,14 @@ def shared_parts(reported: Float32Array, error: Float32Array) -> ByteArray:
     return np.asarray((np.clip(np.sqrt(hidden + stretched), 0.0, STATED[-1]) * SHARED).astype(np.uint8))
 
 
-def shared_kernel(used: float, kinds: float, stated: float) -> FloatArray:
-    """K of the mean grip used, the number of kinds of manoeuvre and what is shared of what is stated, (32, 32)."""
+def shared_kernel(used: float, kinds: float, stated: float, *, alarm: bool = False) -> FloatArray:
+    """K of the mean grip used, the number of kinds of manoeuvre and what is shared of what is stated, (32, 32); of an
+    `alarm` with more doubt about the shape of tyres."""
     centres = mugrid.CENTRES
     always = c.COMMON_ALWAYS**2 + c.COMMON_MANOEUVRE**2 / kinds
     always += stated**2 * (c.SHARED_ALWAYS + (1.0 - c.SHARED_ALWAYS) / kinds)
-    shape = np.clip(c.SHARED_SLOPE * (c.SHARED_SHARE - used / centres), 0.0, c.SHARED_MOST)
+    slope, most = (c.ALERT_SLOPE, c.ALERT_MOST) if alarm else (c.SHARED_SLOPE, c.SHARED_MOST)
+    shape = np.clip(slope * (c.SHARED_SHARE - used / centres), 0.0, most)
     above = np.hypot(np.sqrt(always) * centres, c.COMMON_ABSOLUTE)
     below = np.hypot(above, shape * centres)
     away = centres[None, :] - centres[:, None]
@@ -83,10 +86,10 @@ def base_kernel() -> FloatArray:
     return np.asarray(kernel / kernel.sum(axis=1, keepdims=True))
 
 
-def _table() -> Float32Array:
+def _table(*, alarm: bool = False) -> Float32Array:
     """Kernels transposed, so that the bins of a road stand beside each other; `kernel_of` finds them, (…, 32, 32)."""
     rows = [
-        shared_kernel((row + 0.5) * USED_STEP, kinds, stated).T
+        shared_kernel((row + 0.5) * USED_STEP, kinds, stated, alarm=alarm).T
         for row in range(USED_ROWS)
         for kinds in KINDS
         for stated in STATED
@@ -95,6 +98,7 @@ def _table() -> Float32Array:
 
 
 KERNELS: Final = _table()  # handed to kernels: a global of this size is not kept in their cache
+ALARM_KERNELS: Final = _table(alarm=True)
 
 
 @refcount_free_inlined
@@ -139,6 +143,8 @@ def note_value(cells: RecordArray, row: int, entries: RecordArray, entry: int, s
     """Note an entry's value in its cell: manoeuvre, grip used, and what it shares with others; the gentler or wider it
     is, the less it counts."""
     used, shared = entries[entry].used / USED, entries[entry].shared / SHARED
+    # a slope that is known makes up for its part of what was left: the error that remains is of who used more
+    used += entries[entry].slope * SLOPE_STEP * max(float(entries[entry].mean) - used, 0.0)
     gentle = used / (max(float(entries[entry].mean), mugrid.LOWER) * c.SHARED_SHARE)
     weight = strength * min(max(gentle, c.SHARED_LEAST), 1.0) ** 2 / (1.0 + (shared / c.SHARED_WIDE) ** 2)
     before, largest = 0.0, 0

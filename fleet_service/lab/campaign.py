@@ -10,14 +10,17 @@ from typing import Final
 
 import numpy as np
 
-from fleet_service.lab import attacks, bars, changes, end_to_end, exact, fleets, models, plots, situations
+from fleet_service.lab import attacks, bars, changes, end_to_end, exact, fleets, models, moments, plots, situations
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
 
 # Towns, ways and errors of seeds from JUDGING on are for figures; constants are chosen on those below.
 JUDGING: Final = 20_000
 SEEDS, QUICK_SEEDS = 10, 1
-LENGTHS: Final = {end_to_end.LEVEL: (200, 60.0), end_to_end.HILLS: (120, 180.0)}  # vehicles, seconds
+LENGTHS: Final = {end_to_end.LEVEL: (200, 60.0), end_to_end.HILLS: (120, 180.0)} | dict.fromkeys(
+    end_to_end.WAYS, (20, 1800.0)
+)  # vehicles, seconds
+WHOLE_WAY: Final = "fusion.whole_way"  # prefix of what is measured end to end
 EXACT_SEEDS: Final = 8  # drives of 20 minutes; nothing random is averaged there, the largest difference counts
 
 LogLine = Callable[[str], None]
@@ -42,7 +45,7 @@ def run(folder: Path, quick: bool, drives: Drives, log_line: LogLine, *, alone: 
         began = time.perf_counter()
         found |= part()
         log_line(f"{name}: {time.perf_counter() - began:.0f} s")
-    judged = [figure for figure in bars.judged(found) if not alone or figure.name.startswith(end_to_end.LEVEL.prefix)]
+    judged = [figure for figure in bars.judged(found) if not alone or figure.name.startswith(WHOLE_WAY)]
     figures.write(folder / "figures.json", "fusion" + (" --quick" if quick else ""), list(seeds), judged)
     barred = [figure for figure in judged if figure.bar is not None]
     shown = [figure for figure in judged if figure.bar is None and not _curve(figure.name)]
@@ -69,10 +72,20 @@ def _curve(name: str) -> bool:
 
 
 def _ways(drives: Drives, folder: Path) -> list[tuple[str, Part]]:
-    return [
+    ways = {world: drive for world, drive in drives.items() if world in end_to_end.WAYS}
+    parts: list[tuple[str, Part]] = [
         (f"end to end, {world.scenario}", partial(end_to_end.measure, drive, folder, world))
-        for world, drive in drives.items()
+        for world, drive in drives.items() if world not in ways
     ]  # fmt: skip
+    return [*parts, (f"end to end, {len(ways)} rough ways", partial(_rough, ways, folder))] if ways else parts
+
+
+def _rough(ways: Drives, folder: Path) -> dict[str, float]:
+    found = []
+    for world, drive in ways.items():
+        drive(folder / world.scenario)
+        found.append(moments.moments(folder / world.scenario))
+    return moments.figures(found, WHOLE_WAY)
 
 
 def _parts(seeds: range, log_line: LogLine) -> list[tuple[str, Part]]:

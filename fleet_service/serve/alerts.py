@@ -57,8 +57,9 @@ class Alerts:
         """Alerts that the cells just updated raise or clear."""
         time, slippery = self._fusion.live.time[slots], self._slippery(slots)
         standing = np.isin(slots, np.fromiter(self._standing, np.int64, len(self._standing)))
-        out = []
-        for k in np.flatnonzero((slippery > RAISE_ABOVE) & ~standing).tolist():
+        out, likely = [], np.flatnonzero((slippery > RAISE_ABOVE) & ~standing)
+        alarming = self._fusion.alarming(slots[likely]) @ SLIPPERY_SHARE > RAISE_ABOVE
+        for k in likely[alarming].tolist():
             slot, when = int(slots[k]), int(time[k])
             if self._corroborated(slot, ICE, when):
                 self._standing[slot] = self._alert(

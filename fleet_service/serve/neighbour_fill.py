@@ -1,6 +1,10 @@
 """Imputation: beliefs of cells that nobody visited, from visited neighbours: wider, and marked as borrowed. Pure.
 
 A neighbour's road may be another road (the other side of a shadow, a bridge): half of the imputed belief is the prior.
+Along a route, where it is known what lies behind what, a cell borrows from the nearest visited ones before and behind,
+up to REACH cells away, with a share of the prior that grows with the distance: three visits in a street say something
+about all of it. Where both sides are visited each counts by its share, so that what was seen on both sides of a border
+makes a wide belief between them, and not a mean surface.
 """
 
 from __future__ import annotations
@@ -12,16 +16,20 @@ import numpy as np
 from fleet_service.fusion import Fusion
 from fleet_service.serve.view import CellView
 from schemas import grid, mugrid
-from schemas.numeric import IntArray
+from schemas.numeric import FloatArray, IntArray
 
 PRIOR_SHARE: Final = 0.5
+REACH: Final = 10  # cells, some 130 m
+# What is left of a neighbour's share for each further cell: on drawn towns a surface is some five to ten cells long.
+KEPT: Final = 0.8
 
 
 def impute(fusion: Fusion, tile: int, slots: IntArray, route: IntArray | None, now: int) -> CellView:
-    """Unvisited cells of a tile that adjoin its visited `slots`, same sector; of a route's keys only those it passes.
+    """Unvisited cells of a tile that adjoin its visited `slots`, same sector; along a route's keys those it passes.
 
-    Belief: half the prior, half the mean of the visited neighbours. `vehicles` is the least of theirs, so that an
-    imputed value is never more public than what it was made from; times are the newest and oldest of theirs.
+    Belief: half the prior, half the mean of the visited neighbours; less of them, the further they are. `vehicles` is
+    the least of theirs, so that an imputed value is never more public than what it was made from; times are the newest
+    and oldest of theirs.
     """
     live = fusion.live
     near = grid.neighbours(live.key[slots] // grid.SECTORS).reshape(-1)
@@ -29,12 +37,18 @@ def impute(fusion: Fusion, tile: int, slots: IntArray, route: IntArray | None, n
     sector = live.key[visited] % grid.SECTORS
     free = (near >= 0) & (grid.tile_of(near) == tile) & (fusion.slots_of(np.maximum(near, 0), sector) < 0)
     keys, visited = (near * grid.SECTORS + sector)[free], visited[free]
+    share = np.full(len(keys), 1.0 - PRIOR_SHARE)
     if route is not None:
         ahead = np.isin(keys, route)
-        keys, visited = keys[ahead], visited[ahead]
+        along = _along(fusion, route, tile)
+        keys, visited, share = (
+            np.concatenate([a[ahead], b]) for a, b in zip((keys, visited, share), along, strict=True)
+        )  # fmt: skip
     wanted, group = np.unique(keys, return_inverse=True)
-    belief = np.zeros((len(wanted), mugrid.BINS))
-    np.add.at(belief, group, fusion.beliefs(visited, now))
+    belief, whole, most = np.zeros((len(wanted), mugrid.BINS)), np.zeros(len(wanted)), np.zeros(len(wanted))
+    np.add.at(belief, group, share[:, None] * fusion.beliefs(visited, now))
+    np.add.at(whole, group, share)
+    np.maximum.at(most, group, share)
     vehicles = np.full(len(wanted), np.iinfo(np.int64).max)
     first, last = vehicles.copy(), np.zeros(len(wanted), np.int64)
     np.minimum.at(vehicles, group, live.vehicles[visited])
@@ -42,7 +56,26 @@ def impute(fusion: Fusion, tile: int, slots: IntArray, route: IntArray | None, n
     np.maximum.at(last, group, live.time[visited])
     return CellView(
         cell=wanted // grid.SECTORS, sector=wanted % grid.SECTORS,
-        belief=PRIOR_SHARE * mugrid.PRIOR + (1.0 - PRIOR_SHARE) * belief / belief.sum(axis=1, keepdims=True),
+        belief=mugrid.PRIOR + most[:, None] * (belief / whole[:, None] - mugrid.PRIOR),
         values=np.zeros(len(wanted), np.float32), vehicles=vehicles, observations=np.zeros(len(wanted), np.int64),
         first=first, last=last, imputed=np.ones(len(wanted), bool),
     )  # fmt: skip
+
+
+def _along(fusion: Fusion, route: IntArray, tile: int) -> tuple[IntArray, IntArray, FloatArray]:
+    """Unvisited keys of a route in a tile, the slots of the nearest visited ones on it, before and behind, and shares.
+
+    A key stands once for each side that lies within REACH; those that adjoin are the neighbours' own.
+    """
+    slots = fusion.slots_of(route // grid.SECTORS, route % grid.SECTORS)
+    place = np.arange(len(route))
+    before = np.maximum.accumulate(np.where(slots >= 0, place, -1))
+    behind = np.minimum.accumulate(np.where(slots >= 0, place, len(route))[::-1])[::-1]
+    free = (slots < 0) & (grid.tile_of(route // grid.SECTORS) == tile)
+    parts = []
+    for nearest, there in ((before, before >= 0), (behind, behind < len(route))):
+        away = np.abs(nearest - place)
+        take = np.flatnonzero(free & there & (away > 1) & (away <= REACH))
+        parts.append((route[take], slots[nearest[take]], (1.0 - PRIOR_SHARE) * KEPT ** (away[take] - 1.0)))
+    keys, visited, share = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return keys, visited, share

@@ -1,0 +1,65 @@
+"""What an unvisited cell borrows: less with the distance, never surer than whom it borrows from, and marked."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fleet_service.fusion import Fusion
+from fleet_service.lab.drive import CELL
+from fleet_service.serve.neighbour_fill import PRIOR_SHARE, REACH, impute
+from fleet_service.serve.view import CellView
+from schemas import grid, mugrid
+from schemas.numeric import IntArray
+from tests.fleet_service.examples import observations, value
+
+EAST: IntArray = grid.interleave(
+    grid.deinterleave(CELL[:1])[0] + np.arange(30), np.repeat(grid.deinterleave(CELL[:1])[1], 30)
+)
+ROUTE = EAST * grid.SECTORS
+
+
+def borrowed(visited: dict[int, float], route: IntArray | None = ROUTE) -> CellView:
+    """What thirty cells in a row borrow, in all tiles, when three vehicles gave a value of some of them."""
+    fusion = Fusion(120.0)
+    for place, mu in visited.items():
+        o = observations(np.arange(3) * 2.0, np.arange(3), value(np.full(3, mu)), cell=int(EAST[place]))
+        fusion.update(o)
+    now = int(fusion.live.time[: fusion.size].max())
+    slots = np.arange(fusion.size)
+    tile = int(grid.tile_of(EAST[0]))
+    assert (grid.tile_of(EAST) == tile).all()
+    return impute(fusion, tile, slots, route, now)
+
+
+def widths(cells: CellView) -> dict[int, float]:
+    """Width of the interval by place in the row."""
+    lower, upper = (mugrid.quantiles(cells.belief, q) for q in (0.05, 0.95))
+    return {int(np.flatnonzero(c == EAST)[0]): w for c, w in zip(cells.cell, upper - lower, strict=True)}
+
+
+def test_along_a_route_a_cell_borrows_the_less_the_further_it_is() -> None:
+    cells = borrowed({5: 0.3})
+    assert cells.imputed.all()
+    near = cells.belief[np.argsort(cells.cell)] @ (mugrid.CENTRES < 0.4)
+    place = np.sort([np.flatnonzero(c == EAST)[0] for c in cells.cell])
+    assert place.tolist() == [*range(5), *range(6, 6 + REACH)]
+    behind = near[place > 5]
+    assert (np.diff(behind) < 0.0).all()
+    assert behind[0] < PRIOR_SHARE * 0.31 + (1.0 - PRIOR_SHARE)
+    assert behind[-1] > mugrid.PRIOR @ (mugrid.CENTRES < 0.4)
+
+
+def test_between_two_surfaces_nothing_of_a_third_is_believed() -> None:
+    cells = borrowed({5: 0.2, 12: 0.9})
+    found = {int(np.flatnonzero(c == EAST)[0]): b for c, b in zip(cells.cell, cells.belief, strict=True)}
+    between = found[8]
+    third = np.abs(mugrid.CENTRES - 0.55) < 0.1
+    assert between[third].max() <= mugrid.PRIOR[0]
+    assert between[np.abs(mugrid.CENTRES - 0.2) < 0.05].max() > mugrid.PRIOR[0]
+    assert between[np.abs(mugrid.CENTRES - 0.9) < 0.05].max() > mugrid.PRIOR[0]
+
+
+def test_without_a_route_only_what_adjoins_is_borrowed() -> None:
+    cells = borrowed({5: 0.3}, route=None)
+    assert len(cells.cell) == 8
+    assert set(widths(borrowed({5: 0.3}))) >= {4, 6}
