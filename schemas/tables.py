@@ -92,7 +92,7 @@ STATE: Final = (
 # Who sent a row: the identity of its batch. In the archive the vehicle is a keyed hash.
 IDENTITY: Final = (
     Field("vehicle", pa.string(), "-", "enrolled name on the wire; keyed hash in the archive"),
-    Field("boot", I64, "-", "random, drawn at each start of the agent"),
+    Field("boot", I64, "-", "keyed hash of the agent's start, with the month's key; in archives of before, the start"),
     Field("region", I64, "quadint z10", "region of the batch"),
     Field("seq", I64, "-", "dense from 1 per (boot, kind, region)"),
     Field("row", I32, "-", "place in the batch, from 0"),

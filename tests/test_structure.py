@@ -66,6 +66,7 @@ PURE = (
     "edge_agent/inputs/block.py",
     "fleet_service/fusion",
     "fleet_service/ingest/dedup.py",
+    "fleet_service/ingest/grouping.py",
     *(f"fleet_service/serve/{name}.py" for name in ("alerts", "map_state", "neighbour_fill", "view")),
 )
 # Beside it, what turns one thing in memory into another: tables and messages too, but no input or output either.

@@ -25,6 +25,10 @@ def metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
         Metric("rejected_records", "counter", "refused by a service for good", _named(counts.rejected), "kind"),
         Metric("dropped_records", "counter", "given up for want of room", {"": publisher.dropped}),
         Metric("late_batches", "counter", "when the map had gone on: old news", _named(counts.late), "kind"),
+        Metric(
+            "unanswered_records", "counter", "given up: no service answers them, only later ones",
+            {"": publisher.unanswered},
+        ),
         Metric("resent_batches", "counter", "sent again", {"": counts.resent_batches}),
         Metric("bad_acks", "counter", "acknowledgements that could not be read", {"": counts.bad_acks}),
         Metric("damaged_spools", "counter", "times that the outbox was found damaged", {"": publisher.damage[0]}),

@@ -30,6 +30,9 @@ from schemas.wire import Kind
 BOOT_LIMIT = 2**63  # boot fits a signed 64-bit column
 FIRST_RESEND_S = 2.0  # a service writes a segment each second: an answer younger than this is on its way
 LONGEST_RESEND_S = 6.0  # for an answer of a service that does answer; see `pacing` for one that does not
+# A batch that no service can read is answered by none. Once so many later ones of its stream were settled, a service is
+# about to take no more (it remembers 65 536 above one that is missing), so that this one must go.
+PASSED_OVER = 50_000
 JITTER = 0.25  # share of the delay, either way: agents that lost one router do not return in step
 DEFAULT_CAPACITY_BYTES = 256 * 2**20  # some days of one vehicle at a batch per second and kind
 EVICTION_ORDER = (Kind.STATE, Kind.OBSERVATION)  # an old state is worth least, an observation most
@@ -64,6 +67,7 @@ class OutboxCounts:
     settled: int = 0
     evicted: dict[Kind, int] = field(default_factory=lambda: dict.fromkeys(EVICTION_ORDER, 0))
     damaged: int = 0  # records that damage took, as far as it is known
+    unanswered: int = 0  # records of batches that were given up since nobody answers them, only later ones
     damages: int = 0  # times that the file was found damaged
 
 
@@ -303,7 +307,10 @@ class Outbox:
             if entry is not None and entry.due == at:
                 entry.due = None
                 self._pacer(entry).unanswered(now, self._jitter())
-                self._pacer(entry).wait(key)
+                if self._passed_over(entry):
+                    self.counts.unanswered += self._forget(key).records
+                else:
+                    self._pacer(entry).wait(key)
         keys: list[int] = []
         for (vehicle, _), pacer in self._pacers.items():
             if vehicles is None or vehicle in vehicles:
@@ -313,6 +320,12 @@ class Outbox:
                 keys += taken
         self._pacers = {name: pacer for name, pacer in self._pacers.items() if not pacer.idle or pacer.silent}
         return [batch for key in sorted(keys) if (batch := self._read(key)) is not None]
+
+    def _passed_over(self, entry: _Entry) -> bool:
+        """Whether PASSED_OVER later batches of the stream were settled, and this one, the oldest, was not."""
+        sequence = self._streams[entry.stream]
+        later = sequence.next - entry.seq - len(sequence.held)
+        return later >= PASSED_OVER and sequence.first_held() == entry.seq
 
     def held(self) -> list[StoredBatch]:
         """All batches that are held, oldest first. Raises sqlite3.Error."""
@@ -324,7 +337,7 @@ class Outbox:
         query = f"SELECT {spool_file.NAME}, payload, checksum FROM batch WHERE id = ?"
         row = self._database.execute(query, (key,)).fetchone()
         if row is None or (row[-1] is not None and spool_file.checksum(row[:6], row[6]) != row[-1]):
-            self.counts.damaged += self._forget(key).records
+            self.counts.damaged += max(self._forget(key).records, 1)  # the number may be what is damaged
             return None
         return StoredBatch(key, entry.stream, entry.seq, entry.records, row[6])
 

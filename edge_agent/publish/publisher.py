@@ -118,6 +118,11 @@ class Publisher:
         return self._outbox.bytes / self._outbox.capacity_bytes
 
     @property
+    def unanswered(self) -> int:
+        """Records of batches that were given up: only later ones were answered."""
+        return self._outbox.counts.unanswered
+
+    @property
     def damage(self) -> tuple[int, int]:
         """How often the outbox was found damaged, and the records known to be lost by it."""
         return self._outbox.counts.damages, self._outbox.counts.damaged

@@ -17,9 +17,10 @@ from typing import Final, NamedTuple
 
 from fleet_service.app.clock import TimeNow
 from fleet_service.app.engine import Engine
-from fleet_service.archive import reserve, segments, snapshots
+from fleet_service.archive import layout, reserve, segments, snapshots
 from fleet_service.archive.load import count_set_aside
 from fleet_service.archive.retention import retire
+from fleet_service.ingest import weather
 from fleet_service.replay import checkpoints
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
@@ -50,6 +51,7 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
 
     def compaction(stop: threading.Event) -> str | None:
         reserve.keep(root)
+        weather.gather(root)
         if not config.put_to and not any(segments.paths(root, kind) for kind in Kind):
             return None
         words = ["compact", "--archive", str(root), "--round-rows", str(ROUND_ROWS)]
@@ -74,6 +76,7 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
         if not at.sure:
             return "retention waits: no report has confirmed the clock yet"
         done = retire(root, config.raw_days, datetime.fromtimestamp(at.now // NS, UTC).date())
+        weather.retire(root, at.now // layout.DAY_NS - config.raw_days - 1)
         return f"retired: {done.days} days" if done.days else None
 
     def inventory(_: threading.Event) -> str | None:

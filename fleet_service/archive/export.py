@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -14,6 +15,7 @@ import pyarrow.compute as pc
 import pyarrow.csv as pacsv
 
 from fleet_service.archive import geo, layout, reading, rollup, snapshots
+from fleet_service.archive.between import Between
 from fleet_service.archive.files import MAP, write_table
 from fleet_service.archive.load import load
 from schemas import grid, tables
@@ -36,11 +38,11 @@ class Extract(NamedTuple):
 
 def observations(root: Path, part: Extract) -> pa.Table:
     """Rows of observations, inbox included, as points."""
-    where = (pc.field("leave_time") >= _time(part.since)) & (pc.field("leave_time") < _time(part.until))
+    where = [_within("leave_time", part)]
     if part.bbox is not None:
         west, south, east, north = part.bbox
-        where &= (pc.field("longitude") >= west) & (pc.field("longitude") < east)
-        where &= (pc.field("latitude") >= south) & (pc.field("latitude") < north)
+        where.append(Between("longitude", west, math.nextafter(east, -math.inf)))
+        where.append(Between("latitude", south, math.nextafter(north, -math.inf)))
     days = (part.since // layout.DAY_NS, part.until // layout.DAY_NS)
     found = [*reading.read(root, Kind.OBSERVATION, where=where, days=days), tables.OBSERVATION_ARCHIVE.empty_table()]
     table = pa.concat_tables(found).sort_by([("cell", "ascending"), ("leave_time", "ascending")])
@@ -86,8 +88,7 @@ def without(table: pa.Table, names: Sequence[str], known: BoolArray) -> pa.Table
 
 def cell_hours(root: Path, part: Extract) -> pa.Table:
     """Parts of the roll-up, with the polygons of their cells."""
-    hour = pc.field("hour")
-    where = (hour >= _time(part.since)) & (hour < _time(part.until))
+    where = [_within("hour", part)]
     days = layout.days(root, rollup.TABLE, part.since // layout.DAY_NS, part.until // layout.DAY_NS)
     paths = sorted(path for folder in days for path in folder.glob("*/*.parquet"))
     loaded = (load(path, tables.CELL_HOUR_SCHEMA, where=where) for path in paths)
@@ -103,8 +104,9 @@ WHAT: Final[dict[str, Callable[[Path, Extract], pa.Table]]] = {
 }  # fmt: skip
 
 
-def _time(ns: int) -> pa.Scalar[Any]:
-    return pa.scalar(ns // tables.US_STEP, pa.int64()).cast(tables.US)
+def _within(column: str, part: Extract) -> Between:
+    """Rows from the first time on, before the second."""
+    return Between(column, -(-part.since // tables.US_STEP), -(-part.until // tables.US_STEP) - 1)
 
 
 def _inside(table: pa.Table, bbox: Box | None) -> pa.Table:

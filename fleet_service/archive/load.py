@@ -14,9 +14,9 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from fleet_service.archive.between import Where, groups, those
 from fleet_service.archive.segments import is_value
 from fleet_service.archive.version import DamagedError, Version, entries_of, judge, newer
 from schemas import tables
@@ -62,7 +62,7 @@ def load(
     path: Path,
     schema: pa.Schema,
     columns: Sequence[str] | None = None,
-    where: pc.Expression | None = None,
+    where: Where | None = None,
     *,
     whole: bool = False,
     damaged: Damaged = pass_over,
@@ -85,17 +85,51 @@ def load(
     known = schema if columns is None else pa.schema([schema.field(name) for name in columns])
 
     def read(file: pq.ParquetFile) -> pa.Table:
-        if where is not None and file.metadata.num_row_groups > 1:
-            options: dict[str, Any] = {"filters": where, "partitioning": None, "page_checksum_verification": True}
-            return pq.read_table(path, columns=None if whole else known.names, schema=schema, **options)
         names = None if whole else [name for name in known.names if name in file.schema_arrow.names]
+        if where is not None and file.metadata.num_row_groups > 1:
+            return _some(file, names, where)
         return file.read(names)  # for small files half of read_table
 
     found = _content(path, read, damaged)
     if found is None:
         return None
     table = conformed(found.table, schema if whole else known)
-    return (table if where is None else table.filter(where)).select(known.names)
+    return (table if where is None else those(table, where)).select(known.names)
+
+
+def load_groups(
+    path: Path,
+    schema: pa.Schema,
+    columns: Sequence[str],
+    where: Where,
+    take: Callable[[pa.Table], None],
+    damaged: Damaged = pass_over,
+) -> bool:
+    """As `load`, with the rows handed to `take` a row group at a time: a whole file takes several times their memory
+    while it is read. False if the file is damaged: what was taken of it is to be forgotten.
+
+    Raises:
+        as `load`.
+    """
+    known = pa.schema([schema.field(name) for name in columns])
+
+    def read(file: pq.ParquetFile) -> pa.Table:
+        names = [name for name in columns if name in file.schema_arrow.names]
+        for group in groups(file.metadata, where):
+            part = file.read_row_group(group, names)
+            part.validate(full=True)
+            take(those(conformed(part, known), where))
+        return file.schema_arrow.empty_table().select(names)
+
+    return _content(path, read, damaged) is not None
+
+
+def _some(file: pq.ParquetFile, names: list[str] | None, where: Where) -> pa.Table:
+    """Row groups that may hold rows that are wanted, one after the other, with no more of each than these."""
+    own = file.schema_arrow
+    known = [one for one in where if one.column in own.names]
+    parts = [those(file.read_row_group(group, names), known) for group in groups(file.metadata, where)]
+    return pa.concat_tables(parts) if parts else own.empty_table().select(own.names if names is None else names)
 
 
 def content(path: Path, damaged: Damaged = pass_over) -> Content | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Final
 
@@ -15,10 +16,11 @@ FOLDERS: Final = (*TABLES.values(), "map", "rollup")
 _CHUNK: Final = 1 << 22
 
 
-def put(root: Path, uri: str) -> int:
+def put(root: Path, uri: str, again: Collection[Path] = ()) -> int:
     """Put what is not there yet, or was rewritten since; returns how many files.
 
-    What was retired here stays there. A file appears under its name when it is whole.
+    What was retired here stays there. A file appears under its name when it is whole. What is to be put `again` is so
+    whatever its size.
 
     Raises:
         InputError: the place cannot be used.
@@ -33,7 +35,7 @@ def put(root: Path, uri: str) -> int:
     count = 0
     for path in sorted(path for folder in FOLDERS for path in (root / folder).rglob("*.parquet")):
         target = f"{base}/{path.relative_to(root).as_posix()}"
-        if sizes.get(target) != path.stat().st_size:
+        if path in again or sizes.get(target) != path.stat().st_size:
             _copy(path, there, target)
             count += 1
     return count

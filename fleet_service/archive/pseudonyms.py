@@ -1,4 +1,5 @@
-"""Keyed hashes of vehicle names, with a key per month: destroying a month's key forgets who drove in it.
+"""Keyed hashes of vehicle names and of their starts, with a key per month: destroying a month's key forgets who drove
+in it. A start has another number in each month too, or one that lasts over midnight would tell both months' pseudonyms.
 
 The month is that of a batch's first record, so that a batch that is sent again has the same pseudonym.
 """
@@ -60,6 +61,16 @@ class Pseudonyms:
             digest = blake2b(vehicle.encode(), key=self._key(month), digest_size=_DIGEST_BYTES)
             pseudonym = self._known[month, vehicle] = digest.hexdigest()
         return pseudonym
+
+    def boot(self, vehicle: str, boot: int, time: int) -> int:
+        """Number (63 bits) of a vehicle's start at a time [ns].
+
+        Raises:
+            OSError: as `of`.
+        """
+        text = f"{vehicle}/{boot}".encode()
+        digest = blake2b(text, key=self._key(self.month(time)), digest_size=_DIGEST_BYTES).digest()
+        return int.from_bytes(digest) >> 1
 
     def _month(self, day: int) -> str:
         month = self._month_of_day.get(day)

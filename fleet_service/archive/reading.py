@@ -8,20 +8,18 @@ is not read, for its rows were read from the inbox. So it is the order of these 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
-from functools import reduce
-from operator import and_
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from fleet_service.archive import layout, segments
+from fleet_service.archive.between import Where
 from fleet_service.archive.layout import Partition
-from fleet_service.archive.load import Damaged, load, pass_over
+from fleet_service.archive.load import Damaged, load, load_groups, pass_over
 from fleet_service.archive.version import DamagedError, entries_of, judge
 from schemas.numeric import BoolArray
 from schemas.wire import Kind
@@ -36,7 +34,7 @@ class Wanted(NamedTuple):
     and written after a place in the log. May yield more than was written after it: the rest of a compacted file."""
 
     columns: Sequence[str] | None = None
-    where: pc.Expression | None = None
+    where: Where | None = None
     days: tuple[int | None, int | None] = (None, None)
     after: layout.Cut | None = None
 
@@ -49,7 +47,7 @@ def read(
     root: Path,
     kind: Kind,
     columns: Sequence[str] | None = None,
-    where: pc.Expression | None = None,
+    where: Where | None = None,
     days: tuple[int | None, int | None] = (None, None),
     damaged: Damaged = pass_over,
 ) -> Iterator[pa.Table]:
@@ -103,11 +101,19 @@ class Listing:
         for path, table in fresh:
             yield without(table, self.kind, self._done.get(path.name, set())).select(self._names)
 
-    def load(self, path: Path, where: pc.Expression | None = None) -> pa.Table | None:
-        """Rows of one of the files, where this filter holds too; None if it is damaged, or its day was retired."""
-        both = [one for one in (self._wanted.where, where) if one is not None]
+    def load_groups(self, path: Path, where: Where, take: Callable[[pa.Table], None]) -> bool:
+        """As `load`, a row group at a time; False if what was taken is to be forgotten."""
+        both = [*(self._wanted.where or ()), *where]
         try:
-            return load(path, self._schema, self._names, reduce(and_, both) if both else None, damaged=self._damaged)
+            return load_groups(path, self._schema, self._names, both, take, self._damaged)
+        except FileNotFoundError:
+            return False
+
+    def load(self, path: Path, where: Where | None = None) -> pa.Table | None:
+        """Rows of one of the files, where this filter holds too; None if it is damaged, or its day was retired."""
+        both = [*(self._wanted.where or ()), *(where or ())]
+        try:
+            return load(path, self._schema, self._names, both or None, damaged=self._damaged)
         except FileNotFoundError:
             return None
 

@@ -10,14 +10,16 @@ from datetime import date, timedelta
 from pathlib import Path
 from typing import Final, NamedTuple
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_service.archive import layout, reading, rollup, witnesses
+from fleet_service.archive import layout, reading, rollup, snapshots, witnesses
+from fleet_service.archive.between import Between
 from fleet_service.archive.compaction import compact, compacting
-from fleet_service.archive.files import COMPACTED, lock, put_in_place
+from fleet_service.archive.files import COMPACTED, MAP, lock, put_in_place
 from fleet_service.archive.layout import TABLES
-from fleet_service.archive.load import content
+from fleet_service.archive.load import BAD, content
 from fleet_service.archive.pseudonyms import Pseudonyms, number
 from fleet_service.archive.version import KEY
 from schemas.errors import InputError
@@ -26,6 +28,7 @@ from schemas.wire import Kind
 
 # A batch may come again for thirty days (ServiceConfig.oldest_s), and its rows are what tells that it was there before.
 LEAST_DAYS: Final = 31
+ANONYMOUS: Final = 5  # vehicles of a cell, as the settings that are shipped as secure have it: none of them shows
 _KEYS: Final = "keys"
 
 
@@ -87,8 +90,16 @@ def forget_period(root: Path, month: str) -> None:
         sync_directory(key.parent)
 
 
-def forget_vehicle(root: Path, vehicle: str, month: str) -> int:
-    """Remove the rows of one vehicle in one month; returns how many. Roll-ups are made anew from what stays.
+class Forgotten(NamedTuple):
+    """What forgetting a vehicle changed: rows removed, files rewritten or removed."""
+
+    rows: int
+    files: tuple[Path, ...]
+
+
+def forget_vehicle(root: Path, vehicle: str, month: str) -> Forgotten:
+    """Remove the rows of one vehicle in one month, and what could tell of them: lines of few vehicles in the month's
+    snapshots, files that were set aside, checkpoints. Roll-ups are made anew from what stays.
 
     Raises:
         InputError: the month's key is gone, or a service runs on the archive (it remembers more than its files).
@@ -98,17 +109,36 @@ def forget_vehicle(root: Path, vehicle: str, month: str) -> int:
     with lock(root):
         key_of(root, month)
         compact(root)
-        noon = (first - date(1970, 1, 1)).days * layout.DAY_NS + layout.DAY_NS // 2
-        pseudonym = Pseudonyms(root / _KEYS).of(vehicle, noon)
+        begin, end = (first - date(1970, 1, 1)).days, _last_day(first) + 1
+        pseudonym = Pseudonyms(root / _KEYS).of(vehicle, begin * layout.DAY_NS + layout.DAY_NS // 2)
         witnesses.forget(root / _KEYS, month, number(pseudonym))
+        rows, files, cells = 0, [*root.rglob(f"*{BAD}")], set[int]()
         with compacting(root):
             drop_checkpoints(root)  # what it reported is in them
-            return sum(
-                _without(root, kind, path, pseudonym)
-                for kind in Kind
+            for damaged in files:  # nobody can tell what is in them
+                damaged.unlink()
+            for kind in Kind:
                 # a batch has the pseudonym of its first record and may end a day later
-                for path in layout.compacted(root, kind, (first - date(1970, 1, 1)).days, _last_day(first) + 1)
-            )
+                for path in layout.compacted(root, kind, begin, end):
+                    if len(gone := _without(root, kind, path, pseudonym)):
+                        rows, cells = rows + len(gone), cells.union(gone)
+                        files += [path, rollup.part_of(path)] if kind is Kind.OBSERVATION else [path]
+            for folder in layout.days(root, snapshots.TABLE, begin, end):
+                files += [path for path in sorted(folder.glob("*.parquet")) if _thinned(root, path, cells)]
+    return Forgotten(rows, tuple(files))
+
+
+def _thinned(root: Path, path: Path, cells: set[int]) -> bool:
+    """Whether a snapshot had lines of these cells with less than ANONYMOUS vehicles; they are removed."""
+    found = content(path, _unread)
+    if found is None or not cells:
+        return False
+    lines = np.isin(found.table["cell"].to_numpy(), sorted(cells)) & (found.table["vehicles"].to_numpy() < ANONYMOUS)
+    if not lines.any():
+        return False
+    stay = found.table.filter(pa.array(~lines))
+    put_in_place(root, stay, path, MAP, {KEY: str(found.version), **found.entries})
+    return True
 
 
 def rows_of_vehicle(root: Path, vehicle: str, month: str) -> int:
@@ -121,7 +151,8 @@ def rows_of_vehicle(root: Path, vehicle: str, month: str) -> int:
     first = (_month(month) - date(1970, 1, 1)).days
     key_of(root, month)
     noon = first * layout.DAY_NS + layout.DAY_NS // 2
-    where = pc.field("vehicle") == Pseudonyms(root / _KEYS).of(vehicle, noon)
+    pseudonym = Pseudonyms(root / _KEYS).of(vehicle, noon)
+    where = [Between("vehicle", pseudonym, pseudonym)]
     days = (first, _last_day(_month(month)) + 1)
     return sum(table.num_rows for kind in Kind for table in reading.read(root, kind, ["vehicle"], where, days))
 
@@ -137,15 +168,18 @@ def drop_checkpoints(root: Path) -> None:
         sync_directory(root)
 
 
-def _without(root: Path, kind: Kind, path: Path, pseudonym: str) -> int:
+def _without(root: Path, kind: Kind, path: Path, pseudonym: str) -> list[int]:
+    """Cells of the rows of a vehicle, which are removed from a file."""
     found = content(path, _unread)
     if found is None or pseudonym not in pc.unique(found.table["vehicle"]).to_pylist():
-        return 0
-    table = found.table.filter(pc.not_equal(found.table["vehicle"], pa.scalar(pseudonym)))
-    put_in_place(root, table, path, COMPACTED, {KEY: str(found.version), **found.entries})
+        return []
+    theirs = pc.equal(found.table["vehicle"], pa.scalar(pseudonym))
+    put_in_place(
+        root, found.table.filter(pc.invert(theirs)), path, COMPACTED, {KEY: str(found.version), **found.entries}
+    )
     if kind is Kind.OBSERVATION:
         rollup.make(root, path)
-    return found.table.num_rows - table.num_rows
+    return [int(cell) for cell in found.table["cell"].filter(theirs).to_numpy()]
 
 
 def _unread(path: Path, problem: str) -> None:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import errno
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from hashlib import blake2b
 from pathlib import Path
@@ -116,9 +116,8 @@ def _whole(data: bytes) -> Iterator[tuple[int, int]]:
             yield pseudonym, number
 
 
-def numbers_of(folder: Path, pseudonyms: IntArray) -> IntArray:
-    """Numbers of pseudonyms (n,); one that is not known is its own."""
-    known = read(folder)
+def numbers_of(known: Mapping[int, int], pseudonyms: IntArray) -> IntArray:
+    """Numbers of pseudonyms (n,) by what `read` gave; one that is not known is its own."""
     if not known or not len(pseudonyms):
         return pseudonyms
     distinct, index = np.unique(pseudonyms, return_inverse=True)

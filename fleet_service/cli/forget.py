@@ -12,6 +12,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_archive(parser)
     parser.add_argument("--period", metavar="MONTH", required=True, help="e.g. 2026-01")
     parser.add_argument("--vehicle", metavar="NAME", help="only this vehicle; its rows are removed")
+    parser.add_argument("--put-to", metavar="URI", help="the mirror, where what was rewritten is put again")
     add_dry_run(parser)
 
 
@@ -21,6 +22,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _forget(arguments: argparse.Namespace) -> ArchiveReport:
+    from fleet_service.archive import mirror
     from fleet_service.archive.retention import forget_period, forget_vehicle, key_of, rows_of_vehicle
 
     root, month, vehicle = arguments.archive, arguments.period, arguments.vehicle
@@ -34,6 +36,10 @@ def _forget(arguments: argparse.Namespace) -> ArchiveReport:
     if vehicle is None:
         forget_period(root, month)
         return ArchiveReport(what, {"rows": 0, "key": True})
-    rows = forget_vehicle(root, vehicle, month)
-    line = f"{rows} rows removed" if rows else f"no rows of {vehicle} in {month}: nothing removed"
-    return ArchiveReport(line, {"rows": rows, "key": False})
+    done = forget_vehicle(root, vehicle, month)
+    line = f"{done.rows} rows removed" if done.rows else f"no rows of {vehicle} in {month}: nothing removed"
+    report: dict[str, object] = {"rows": done.rows, "key": False, "files": len(done.files)}
+    if arguments.put_to is not None:
+        report["put"] = mirror.put(root, arguments.put_to, done.files)
+        line += f", {report['put']} files put to {arguments.put_to}"
+    return ArchiveReport(line, report)

@@ -46,10 +46,11 @@ class Acks:
         settled: dict[str, dict[AckedStream, list[int]]] = {vehicle: {} for vehicle in self._rejected}
         late: dict[tuple[str, AckedStream], set[int]] = defaultdict(set)
         for stream, seqs in self._durable.items():
-            settled.setdefault(stream.vehicle, {}).setdefault(stream.key[1:], []).extend(seqs)
+            name = (stream.boot, *stream.key[2:])
+            settled.setdefault(stream.vehicle, {}).setdefault(name, []).extend(seqs)
             if stream in self._late:
                 told = self._late[stream].intersection(seqs)
-                late[stream.vehicle, stream.key[1:]] |= told
+                late[stream.vehicle, name] |= told
                 self._late[stream] -= told
                 if not self._late[stream]:
                     del self._late[stream]

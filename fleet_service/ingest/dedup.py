@@ -7,10 +7,12 @@ and a stream whose newest record is older than the service accepts is forgotten.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
 
+from fleet_service.ingest.grouping import grouped, largest_of
 from schemas.numeric import BoolArray, IntArray
 from schemas.wire import Kind
 
@@ -18,7 +20,7 @@ from schemas.wire import Kind
 MAX_GAPS: Final = 1 << 16
 _KINDS: Final = tuple(Kind)
 _NONE: Final[frozenset[int]] = frozenset()
-StreamKey = tuple[int, int, Kind, int]  # number of the vehicle's pseudonym, boot, kind, region
+StreamKey = tuple[int, int, Kind, int]  # numbers of the vehicle's pseudonym and of its start, kind, region
 
 
 class SequenceTracker:
@@ -27,16 +29,17 @@ class SequenceTracker:
     Attributes:
         key: its name.
         vehicle: enrolled name of the sender; empty until it is heard.
+        boot: as its sender calls it; 0 until it is heard.
         witness: number that the map knows it by, in every month; 0 until it is heard.
         low: every seq up to here is settled, or will never come.
         seen: the accepted ones above.
         newest: newest time of an accepted record, by which a batch is too old [ns].
     """
 
-    __slots__ = ("key", "low", "newest", "seen", "vehicle", "witness")
+    __slots__ = ("boot", "key", "low", "newest", "seen", "vehicle", "witness")
 
     def __init__(self, key: StreamKey) -> None:
-        self.key, self.vehicle, self.witness = key, "", 0
+        self.key, self.vehicle, self.boot, self.witness = key, "", 0, 0
         self.low, self.newest = 0, 0
         self.seen: set[int] | frozenset[int] = _NONE
 
@@ -59,10 +62,13 @@ class SequenceTracker:
             self.newest = time
         return True
 
-    def reach(self, last: int, time: int) -> None:
-        """Everything from the watermark to `last` was accepted."""
-        self.raise_to(last + 1)
-        self.newest = max(self.newest, time)
+    def add(self, seqs: list[int]) -> None:
+        """These, which rise, were accepted."""
+        if seqs[0] == self.low + 1 and seqs[-1] - seqs[0] == len(seqs) - 1:  # as most often: a run that goes on
+            self.raise_to(seqs[-1] + 1)
+        else:
+            for seq in seqs:
+                self.accept(seq)
 
     def raise_to(self, first_held: int) -> None:
         """Older than `first_held` never comes."""
@@ -162,18 +168,17 @@ class SequenceTrackers:
         """Note archived rows (n,) of one kind, in any order; `time` [ns] of each record."""
         if not len(seq):
             return
-        order = np.lexsort((seq, region, boot, vehicle))
-        names = np.stack([vehicle, boot, region])[:, order]
-        seq, first_held, time = seq[order], first_held[order], time[order]
-        starts = np.flatnonzero(np.r_[True, (np.diff(names) != 0).any(axis=0)])
-        for start, stop in zip(starts.tolist(), [*starts[1:].tolist(), len(order)], strict=True):
-            stream = self[int(names[0, start]), int(names[1, start]), kind, int(names[2, start])]
-            stream.raise_to(int(first_held[start:stop].max()))
-            newest = int(time[start:stop].max())
-            some = np.unique(seq[start:stop])
-            first, last = int(some[0]), int(some[-1])
-            if first <= stream.low + 1 and last - first == len(some) - 1:  # as most often: a run that goes on
-                stream.reach(last, newest)
-            else:
-                for one in some.tolist():
-                    stream.accept(one, newest)
+        group, first = grouped(vehicle, boot, region)
+        streams = [
+            self[one, start, kind, where]
+            for one, start, where in zip(*(column[first].tolist() for column in (vehicle, boot, region)), strict=True)
+        ]
+        held, newest = (largest_of(column, group, len(first)).tolist() for column in (first_held, time))
+        for stream, least, last in zip(streams, held, newest, strict=True):
+            stream.raise_to(least)
+            stream.newest = max(stream.newest, last)
+        above = np.flatnonzero(seq > np.array([stream.low for stream in streams])[group])  # few: senders hold little
+        above = above[np.lexsort((seq[above], group[above]))]
+        starts = np.flatnonzero(np.diff(group[above], prepend=-1))
+        for start, stop in pairwise([*starts.tolist(), len(above)]):
+            streams[group[above[start]]].add(np.unique(seq[above[start:stop]]).tolist())

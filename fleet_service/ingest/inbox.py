@@ -27,6 +27,7 @@ from fleet_service.ingest.budgets import STREAMS_AT_ONCE, STREAMS_PER_HOUR, Buck
 from fleet_service.ingest.dedup import BatchId, SequenceTracker, SequenceTrackers
 from fleet_service.ingest.rate_limit import RateLimiter
 from fleet_service.ingest.validation import Clock, Refusal
+from schemas.errors import InputError
 from schemas.grid import cell_of
 from schemas.keys import Parsed
 from schemas.numeric import BoolArray, IntArray
@@ -34,7 +35,7 @@ from schemas.runtime.batch_decoder import decode_many
 from schemas.tables import US_STEP
 from schemas.thresholds import NS
 from schemas.wire import Kind
-from schemas.wire.batches import Decoded, Head, Heads
+from schemas.wire.batches import Decoded, Head, Heads, head_of
 
 FIRST_TIME: Final = {Kind.OBSERVATION: "enter_time", Kind.STATE: "time"}  # by which a batch is too old
 # Of a step of the worker, so that a flood does not delay alerts, answers and segments by more than a moment. Most of
@@ -177,10 +178,10 @@ class BatchIntake:
             self._count("key", found_owners.count(None))
             messages = [message for message, owner in zip(messages, found_owners, strict=True) if owner is not None]
         found = decode_many(kind, [(message.payload, message.encoding) for message in messages])
-        for _, error in found.errors:
-            self._count(error.field)
-        time = found.columns[FIRST_TIME[kind]][np.cumsum(found.sizes) - found.sizes]
         keyed = [owner for owner in found_owners if owner is not None]
+        for index, error in found.errors:
+            self._refuse_unusable(kind, keyed[index], messages[index], error)
+        time = found.columns[FIRST_TIME[kind]][np.cumsum(found.sizes) - found.sizes]
         owners = keyed if len(found.indices) == len(keyed) else [keyed[place] for place in found.indices]
         broken, rules = validation.check_heads(kind, owners, found.heads, time, clock)
         self._tell_time(owners, time)
@@ -228,16 +229,19 @@ class BatchIntake:
         vehicle, boot, region, _ = name
         try:
             pseudonym = number(self._pseudonyms.of(vehicle, time))
+            told = self._pseudonyms.boot(vehicle, boot, time)
             witness = self._witnesses.of(vehicle, self._pseudonyms.month(time), pseudonym)
         except OSError:
             self._counts["key_failures"] += 1
             return None
         key = (pseudonym, boot, kind, region)
+        if key not in self._streams:  # else its archive is older, and keeps starts as they were sent
+            key = (pseudonym, told, kind, region)
         if key not in self._streams and not self._budget.take(witness, 1, self._now):
             self._counts["too_many_streams"] += 1
             return None
         stream = self._known[kind][name] = self._streams[key]
-        stream.vehicle, stream.witness = vehicle, witness
+        stream.vehicle, stream.boot, stream.witness = vehicle, boot, witness
         return stream
 
     def _rows(self, kind: Kind, new: dict[BatchId, int], found: Decoded, clock: Clock) -> AcceptedBatches:
@@ -274,6 +278,15 @@ class BatchIntake:
             self._acks.rejected(vehicle, head, refusal.row, refusal.reason)
         self._count(refusal.rule)
 
+    def _refuse_unusable(self, kind: Kind, owner: Parsed, message: Message, error: InputError) -> None:
+        """Refuse a batch whose records cannot be used: for good, where its head says which it is, or it would come
+        again for ever; else it is only counted."""
+        head = head_of(kind, message.payload, message.encoding)
+        named = head is not None and head.vehicle == owner.name and head.region in (0, owner.quadint)
+        if head is not None and named and head.boot >= 0 and head.seq >= 1 and owner.quadint is not None:
+            self._acks.rejected(head.vehicle, head._replace(region=owner.quadint), validation.BATCH, str(error)[:150])
+        self._count(error.field)
+
     def _count(self, rule: str, times: int = 1) -> None:
         if times:
             self._counts[f"refused.{rule}"] += times
@@ -302,7 +315,8 @@ def _named(kind: Kind, batches: list[BatchId], heads: Heads, rows: Rows, sizes: 
     identity = {
         "vehicle": texts(numbers), "witness": np.array([stream.witness for stream, _ in batches], np.int64),
         "estimator": np.array(heads.estimator, np.bytes_),
-        "boot": heads.boot, "seq": heads.seq, "first_held": heads.first_held,
+        "boot": np.array([stream.key[1] for stream, _ in batches], np.int64),
+        "seq": heads.seq, "first_held": heads.first_held,
     }  # fmt: skip
     rows |= {name: np.repeat(values, sizes) for name, values in identity.items()}
     rows["received_at"] = np.full(len(rows["row"]), clock.now, np.int64)

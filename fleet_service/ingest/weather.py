@@ -2,6 +2,9 @@
 
     weather/NAME-TIME.parquet     reports as they came, with the time from which the map used them
 
+Each file is written when reports come; `gather` makes one of a day's, so that a start and a look at the past read as
+many as there are days. What is read twice, since a power loss came in between, is the same report and changes nothing.
+
 A report acts on observations of which none was fused yet (`acts_from`). It is durable before it acts, so that a replay
 of the archive finds the weather that the map had, and gives the same map.
 """
@@ -19,17 +22,22 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fleet_service.archive.files import SEGMENT, write_table
+from fleet_service.archive.layout import DAY_NS
 from fleet_service.archive.load import Damaged, load, pass_over
+from fleet_service.archive.segments import nanoseconds
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.weather import VALID_NS, Reports
 from schemas import grid, keys, mugrid, tables, weather
 from schemas.errors import InputError
+from schemas.runtime.durable import make_folder
 from schemas.thresholds import NS
 from schemas.weather import Report
 
 FOLDER: Final = "weather"
 WAITING: Final = 10_000  # reports that wait at the most: a whole continent's regions; the oldest go first
 AHEAD_NS: Final = 86_400 * NS  # a forecast for tomorrow is weather, one for next year a wrong clock
+_DIGITS: Final = 20  # of the time in a file's name [ns]
+_TURNS: Final = 100  # a reader that is overtaken so often has another trouble
 COLUMNS: Final = ("region", "time", *weather.RANGES, "prior")
 
 
@@ -89,7 +97,7 @@ class WeatherInbox:
         table = _table(found, now, self._fusion.next_epoch)
         self._last = max(time.time_ns(), self._last + 1)
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
+            make_folder(self._folder)
             write_table(table, self._folder / f"{self._name}-{self._last:020d}.parquet", SEGMENT)
         except OSError:  # what is not archived must not act; the next report comes within the hour
             self._counts["weather_failures"] += 1
@@ -122,7 +130,7 @@ def _table(found: list[tuple[int, Report]], now: int, next_epoch: int) -> pa.Tab
 def _reports(table: pa.Table) -> Reports:
     prior = [np.full(mugrid.BINS, np.nan) if row is None else np.array(row) for row in table["prior"].to_pylist()]
     air, road, water = (table[name].to_numpy().astype(np.float64) for name in weather.RANGES)
-    acts = table["acts_from"].cast(tables.NS).cast(pa.int64()).to_numpy()
+    acts = nanoseconds(table["acts_from"])
     return Reports(table["region"].to_numpy(), acts, air, road, water, np.array(prior).reshape(-1, mugrid.BINS))
 
 
@@ -141,18 +149,62 @@ def archived(
         InputError: a file is of a newer major version.
         OSError: the archive cannot be read.
     """
-    paths = [path for path in files(root) if path.name not in known]
-    parts = [load(path, tables.WEATHER_ARCHIVE, whole=True, damaged=damaged) for path in paths]
+    for _ in range(_TURNS):
+        try:
+            paths = [path for path in files(root) if path.name not in known]
+            parts = [load(path, tables.WEATHER_ARCHIVE, whole=True, damaged=damaged) for path in paths]
+            break
+        except FileNotFoundError:  # gathered meanwhile
+            continue
+    else:
+        raise OSError(f"the weather of {root} changes faster than it can be read")
     table = pa.concat_tables([tables.WEATHER_ARCHIVE.empty_table(), *(part for part in parts if part is not None)])
     if received_until is not None:
-        received = table["received_at"].cast(tables.NS).cast(pa.int64()).to_numpy()
-        table = table.filter(pa.array(received <= received_until))
+        table = table.filter(pa.array(nanoseconds(table["received_at"]) <= received_until))
     return _reports(table)
 
 
 def files(root: Path) -> list[Path]:
     """Files of weather, in the order in which they came."""
-    return sorted((root / FOLDER).glob("*.parquet"), key=lambda path: path.stem[-20:])
+    return sorted((root / FOLDER).glob("*.parquet"), key=lambda path: path.stem[-_DIGITS:])
+
+
+def gather(root: Path, damaged: Damaged = pass_over) -> int:
+    """Put the reports of each day into its newest file; returns how many files that saved.
+
+    Raises:
+        InputError: a file is of a newer major version.
+        OSError: a file cannot be read or written; nothing is lost.
+    """
+    days: dict[int, list[Path]] = {}
+    for path in files(root):
+        days.setdefault(_day(path), []).append(path)
+    saved = 0
+    for paths in (paths for paths in days.values() if len(paths) > 1):
+        found = [(p, load(p, tables.WEATHER_ARCHIVE, whole=True, damaged=damaged)) for p in paths]
+        whole = [(path, table) for path, table in found if table is not None]
+        if len(whole) > 1:
+            write_table(pa.concat_tables([table for _, table in whole]), whole[-1][0], SEGMENT)
+            for path, _ in whole[:-1]:
+                path.unlink()
+            saved += len(whole) - 1
+    return saved
+
+
+def retire(root: Path, until_day: int) -> int:
+    """Remove files whose reports acted until a day since 1970, or earlier; returns how many."""
+    removed = 0
+    for path in files(root):
+        table = load(path, tables.WEATHER_ARCHIVE, ["acts_from"])
+        if table is not None and int(nanoseconds(table["acts_from"]).max(initial=0)) // DAY_NS <= until_day:
+            path.unlink()
+            removed += 1
+    return removed
+
+
+def _day(path: Path) -> int:
+    """Days since 1970 when a file was written."""
+    return int(path.stem[-_DIGITS:]) // DAY_NS
 
 
 def read_file(path: Path) -> list[tuple[int, Report]]:

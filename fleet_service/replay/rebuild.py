@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import fields
-from functools import reduce
-from operator import and_
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from fleet_service.archive import layout, reading, segments
+from fleet_service.archive import layout, reading, segments, witnesses
+from fleet_service.archive.between import Between, groups, those
 from fleet_service.archive.load import Damaged, pass_over
 from fleet_service.archive.pseudonyms import number
-from fleet_service.archive.witnesses import numbers_of
 from fleet_service.fusion import Fusion, Observations, Updated, observations_of
 from fleet_service.fusion.constants import EPOCH_NS
 from fleet_service.fusion.fuse import Before
@@ -25,21 +23,26 @@ from fleet_service.fusion.standing import ERRORS, UNKNOWN
 from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.weather import archived
 from schemas import grid
+from schemas.errors import InputError
 from schemas.numeric import BoolArray, IntArray
-from schemas.tables import US, US_STEP
+from schemas.runtime.process import trim_memory
+from schemas.tables import US_STEP
 from schemas.wire import Kind
 
 IDENTITY: Final = ["vehicle", "boot", "region", "seq"]
 _FIRST_TIME: Final = {Kind.OBSERVATION: "enter_time", Kind.STATE: "time"}  # by which a batch is too old
 COLUMNS: Final = [
-    *("leave_time", "cell", "sector", "latitude", "longitude", "position_std", "yaw", "mu", "mu_lower", "mu_upper"),
-    *("mu_utilised", "log_likelihood", *IDENTITY, "row", "received_at", "late", "weight"),
+    *("leave_time", "cell", "sector", "latitude", "position_std", "yaw", "mu", "mu_lower", "mu_upper"),
+    *("mu_utilised", "log_likelihood", *IDENTITY, "row", "late", "weight"),
     *("used_longitudinal", "used_lateral", "late_by", *ERRORS),
 ]  # of what the fusion takes
+FILTERED: Final = ("longitude", "received_at")  # beside them, where not all rows are wanted
 Box = tuple[float, float, float, float]  # west, south, east, north [deg]
 # Days of observations that show in the map, and of batches that may come again (ServiceConfig.oldest_s is 30 days).
 MAP_DAYS: Final = 31
-PART_ROWS: Final = 1_000_000  # of a replay at once: 300 MB while they are sorted
+PART_ROWS: Final = 8_000_000  # of a day that are held at once: 400 MB
+CHUNK_ROWS: Final = 100_000  # that are fused at once: what is made of them on the way takes four times their memory
+_PACKED: Final = pa.ipc.IpcWriteOptions(compression="lz4")
 SEGMENT_ROW_BYTES: Final = 60  # in the inbox, at the least
 MARGIN_DEG: Final = 0.002  # around a box: over 100 m, more than a visit's position error moves what it tells
 
@@ -85,39 +88,42 @@ class Since(NamedTuple):
     """Which rows a replay takes: from a place in the log and a day on, received until `until` [ns], near `box` [deg].
 
     Cells do not depend on each other once weights are known, so that those well inside a box come out as in a whole
-    replay. Of compacted files that reach over the place in the log, the batches that `known` has are left out.
+    replay. Of compacted files that reach over the place in the log, the batches that `known` has are left out. More
+    rows than `most` are an error.
     """
 
     begin: Begin = Begin()
     known: SequenceTrackers | None = None
     until: int | None = None
     box: Box | None = None
+    most: int | None = None
 
-    def where(self) -> pc.Expression | None:
-        """The rows as a filter, or None for all."""
-        parts = []
-        if self.until is not None:
-            parts.append(pc.field("received_at") <= _time(self.until))
+    def where(self) -> list[Between] | None:
+        """The rows as ranges, or None for all."""
+        found = [] if self.until is None else [Between("received_at", most=self.until // US_STEP)]
         if self.box is not None:
             west, south, east, north = self.box
-            parts.append((pc.field("longitude") > west - MARGIN_DEG) & (pc.field("longitude") < east + MARGIN_DEG))
-            parts.append((pc.field("latitude") > south - MARGIN_DEG) & (pc.field("latitude") < north + MARGIN_DEG))
-        return reduce(and_, parts) if parts else None
+            found.append(Between("longitude", west - MARGIN_DEG, east + MARGIN_DEG))
+            found.append(Between("latitude", south - MARGIN_DEG, north + MARGIN_DEG))
+        return found or None
 
 
-def _time(ns: int) -> pa.Scalar[Any]:
-    return pa.scalar(ns // US_STEP, pa.int64()).cast(US)
+def too_much() -> InputError:
+    """A question about the past that asks for too many rows."""
+    return InputError("at", "would have to read too much of the archive", "narrow bbox")
 
 
-def past(root: Path, lateness_s: float, until: int, box: Box | None = None) -> Fusion:
+def past(root: Path, lateness_s: float, until: int, box: Box | None = None, most: int | None = None) -> Fusion:
     """The fusion of a service that had received everything until a moment [ns], near a box [deg].
 
     Raises:
+        InputError: there are more rows than `most`.
         OSError: the archive cannot be read.
     """
     fusion = Fusion(lateness_s)
+    begin = Begin(until // layout.DAY_NS - MAP_DAYS)
     fusion.update_weather(archived(root, received_until=until))
-    for _ in replay(root, fusion, Since(Begin(until // layout.DAY_NS - MAP_DAYS), until=until, box=box)):
+    for _ in replay(root, fusion, Since(begin, until=until, box=box, most=most)):
         pass  # the alerts of then are history
     return fusion
 
@@ -148,19 +154,19 @@ def replay(
         damaged: is told of a damaged file.
     """
     last = None if since.until is None else since.until // layout.DAY_NS + 1
-    wanted = reading.Wanted(COLUMNS, since.where(), (since.begin.day, last), since.begin.after)
+    where = since.where()
+    columns = COLUMNS if where is None else [*COLUMNS, *FILTERED]
+    wanted = reading.Wanted(columns, where, (since.begin.day, last), since.begin.after)
     waiting: list[tuple[Observations, Before]] = []  # late rows that were fused after the end of their table
-    for table in in_order(reading.Listing(root, Kind.OBSERVATION, wanted, damaged)):
-        vehicle = numbers(table["vehicle"])
-        rows = segments.rows_of(table.drop_columns(["vehicle"]))
-        new = np.ones(len(vehicle), bool)
+    known = witnesses.read(root / "keys")
+    for table in in_order(reading.Listing(root, Kind.OBSERVATION, wanted, damaged), since.most):
+        rows = segments.rows_of(table)
         if since.known is not None:
-            names = np.stack([vehicle, rows["boot"], rows["region"], rows["seq"]], axis=1)
+            names = np.stack([rows[name] for name in IDENTITY], axis=1)
             distinct, index = np.unique(names, axis=0, return_inverse=True)
             new = ~since.known.accepted(Kind.OBSERVATION, distinct)[index.reshape(-1)]
-        rows = {name: column[new] for name, column in rows.items()}
-        o = observations_of(rows, numbers_of(root / "keys", vehicle[new]))
-        before = _before(rows)
+            rows = {name: column[new] for name, column in rows.items()}
+        o, before = observations_of(rows, witnesses.numbers_of(known, rows["vehicle"])), _before(rows)
         end = int(segments.nanoseconds(table["leave_time"]).max(initial=0)) // EPOCH_NS
         o, before = _joined([*waiting, (o, before)])
         epoch = (o.time + before.late_by) // EPOCH_NS
@@ -203,12 +209,19 @@ def _fused(fusion: Fusion, o: Observations, before: Before) -> Iterator[Updated]
             yield fusion.update(*_taken(o, before, part))
 
 
-def in_order(listing: reading.Listing) -> Iterator[pa.Table]:
-    """The rows of a listing by rising time of measurement, PART_ROWS at a time or so, cut between epochs."""
-    time = layout.TIME[listing.kind]
+def in_order(listing: reading.Listing, most: int | None = None) -> Iterator[pa.Table]:
+    """The rows of a listing, CHUNK_ROWS at a time or so, each chunk later than the one before and cut between epochs.
+
+    A file is read once, or once for each part of a day that has more than PART_ROWS; vehicles are numbers.
+
+    Raises:
+        InputError: there are more than `most` rows.
+    """
+    name = layout.TIME[listing.kind]
     fresh = [table for table in listing.inbox() if table.num_rows]
-    inbox = pa.concat_tables(fresh).sort_by(time) if fresh else None
-    inbox_days = np.zeros(0, np.int64) if inbox is None else segments.nanoseconds(inbox[time]) // layout.DAY_NS
+    inbox = pa.concat_tables(fresh).sort_by(name) if fresh else None
+    seen = 0
+    inbox_days = np.zeros(0, np.int64) if inbox is None else segments.nanoseconds(inbox[name]) // layout.DAY_NS
     files: dict[int, list[Path]] = {day: [] for day in np.unique(inbox_days).tolist()}
     for path in listing.files:
         files.setdefault(layout.partition_of(path).day, []).append(path)
@@ -216,16 +229,82 @@ def in_order(listing: reading.Listing) -> Iterator[pa.Table]:
         begin, end = np.searchsorted(inbox_days, [day, day + 1]).tolist()
         mine = None if inbox is None else inbox.slice(begin, end - begin)
         rows = end - begin + sum(_rows_of(path) for path in files[day])
-        parts = max(1, min(-(-rows // PART_ROWS), layout.DAY_NS // EPOCH_NS))
-        borders = (
-            np.linspace(0, layout.DAY_NS // EPOCH_NS, parts + 1).astype(np.int64) * EPOCH_NS
-        ) + day * layout.DAY_NS
-        for low, high in zip(borders[:-1].tolist(), borders[1:].tolist(), strict=True):
-            within = (pc.field(time) >= _time(low)) & (pc.field(time) < _time(high)) if parts > 1 else None
-            tables = [] if mine is None else [mine if within is None else mine.filter(within)]
-            tables += [table for path in files[day] if (table := listing.load(path, within)) is not None]
-            if sum(table.num_rows for table in tables):
-                yield pa.concat_tables(tables).sort_by(time)
+        for low, high in pairwise(_borders(day * layout.DAY_NS, (day + 1) * layout.DAY_NS, rows, PART_ROWS)):
+            within = [Between(name, low // US_STEP, high // US_STEP - 1)] if high - low < layout.DAY_NS else []
+            borders = _borders(low, high, rows * (high - low) // layout.DAY_NS, CHUNK_ROWS)
+            held = _Held(name, borders)
+            if mine is not None:
+                held.take(those(mine, within))
+                held.keep()
+            for path in files[day]:
+                if listing.load_groups(path, within, held.take):
+                    held.keep()
+                else:
+                    held.forget()
+                if most is not None and seen + held.rows > most:
+                    raise too_much()
+            seen += held.rows
+            yield from held.chunks()
+            pa.default_memory_pool().release_unused()  # before the next is read
+            trim_memory()
+
+
+class _Held:
+    """Rows that wait, by the chunk that they belong to, compressed to a third of their memory.
+
+    Args:
+        name: of the column of times.
+        borders: of the chunks [ns].
+    """
+
+    def __init__(self, name: str, borders: list[int]) -> None:
+        self._name, self._borders = name, borders
+        self._kept: list[list[pa.Buffer]] = [[] for _ in borders[1:]]
+        self._taken: list[tuple[int, int, pa.Buffer]] = []  # chunk and rows
+        self.rows = 0
+
+    def take(self, table: pa.Table) -> None:
+        """Put rows to those that are kept or forgotten next."""
+        time = segments.nanoseconds(table[self._name])
+        order = np.argsort(time, kind="stable")
+        table, places = _numbered(table).take(order), np.searchsorted(time[order], self._borders).tolist()
+        for k, (start, stop) in enumerate(pairwise(places)):
+            if stop > start:
+                sink = pa.BufferOutputStream()
+                with pa.ipc.new_stream(sink, table.schema, options=_PACKED) as stream:
+                    stream.write_table(table.slice(start, stop - start))
+                self._taken.append((k, stop - start, sink.getvalue()))
+
+    def keep(self) -> None:
+        """Keep what was taken."""
+        for k, rows, packed in self._taken:
+            self._kept[k].append(packed)
+            self.rows += rows
+        self._taken.clear()
+
+    def forget(self) -> None:
+        """Forget what was taken: its file is damaged."""
+        self._taken.clear()
+
+    def chunks(self) -> Iterator[pa.Table]:
+        """The rows of each chunk that has any, in turn; once."""
+        for k, packed in enumerate(self._kept):
+            self._kept[k] = []
+            if packed:
+                yield pa.concat_tables([pa.ipc.open_stream(one).read_all() for one in packed])
+
+
+def _borders(low: int, high: int, rows: int, most: int) -> list[int]:
+    """Times from `low` to `high` [ns], between epochs, with `most` rows between two if they are even in time."""
+    epochs = (high - low) // EPOCH_NS
+    parts = max(1, min(-(-rows // most), epochs))
+    return [low + int(part) * EPOCH_NS for part in np.linspace(0, epochs, parts + 1)]
+
+
+def _numbered(table: pa.Table) -> pa.Table:
+    """With numbers for pseudonyms: less than half the memory."""
+    at = table.column_names.index("vehicle")
+    return table.set_column(at, "vehicle", pa.array(numbers(table["vehicle"])))
 
 
 def rows_near(root: Path, until: int, box: Box | None, most: int) -> int:
@@ -245,28 +324,11 @@ def rows_near(root: Path, until: int, box: Box | None, most: int) -> int:
     return found
 
 
-def _touches(group: Any, columns: dict[str, int], box: Box) -> bool:  # noqa: ANN401 metadata of a row group
-    """Whether a row group may have rows in a box, by its statistics."""
-    west, south, east, north = box
-    for name, least, most in (("longitude", west, east), ("latitude", south, north)):
-        found = group.column(columns[name]).statistics
-        if (
-            found is not None
-            and found.has_min_max
-            and (found.max < least - MARGIN_DEG or found.min > most + MARGIN_DEG)
-        ):
-            return False
-    return True
-
-
 def _rows_of(path: Path, box: Box | None = None) -> int:
     """Rows of a file by its footer, of row groups near a box; 0 if it has none that can be read, or is gone."""
     try:
         footer = pq.read_metadata(path)
     except (OSError, pa.ArrowInvalid):
         return 0
-    if box is None:
-        return int(footer.num_rows)
-    columns = {footer.schema.column(at).path: at for at in range(footer.num_columns)}
-    groups = (footer.row_group(at) for at in range(footer.num_row_groups))
-    return int(sum(group.num_rows for group in groups if _touches(group, columns, box)))
+    near = Since(box=box).where() or []
+    return sum(int(footer.row_group(group).num_rows) for group in groups(footer, near))

@@ -108,6 +108,16 @@ def message_of(kind: Kind, payload: bytes, encoding: str) -> Any:  # noqa: ANN40
     return message
 
 
+def head_of(kind: Kind, payload: bytes, encoding: str) -> Head | None:
+    """The head of a batch whose records cannot be used; None where not even that can be read, as of another format."""
+    try:
+        found = parse(payload, encoding, MESSAGES[kind], ENCODING[kind])
+    except WireError:
+        return None
+    held = found.first_held or 1
+    return Head(kind, found.vehicle, found.boot, found.region, found.seq, held, found.estimator)
+
+
 def decode(payload: bytes, encoding: str, kind: Kind) -> Batch:
     """Read one batch; the inverse of `encode` for every column that was sent.
 

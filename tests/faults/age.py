@@ -22,7 +22,7 @@ import numpy as np
 from fleet_service.analytics import synthetic
 from fleet_service.analytics.synthetic import LATITUDE, LONGITUDE, START_NS, SyntheticFleet
 from fleet_service.app.engine import Engine
-from fleet_service.app.past import MOST_ROWS, PastQuery, box_of, replies
+from fleet_service.app.past import LOOKED_ROWS, PastQuery, box_of, replies
 from fleet_service.archive.layout import CHECKPOINTS, DAY_NS
 from fleet_service.archive.segments import SCHEMAS, Writer
 from fleet_service.replay import checkpoints
@@ -116,7 +116,7 @@ def main() -> None:
     what, root, began = sys.argv[1], Path(sys.argv[2]), time.perf_counter()
     if what == "past":
         asked = PastQuery(query.parse({"bbox": NEAR}), START_NS + (DAYS - 1) * DAY_NS, 120.0, None)
-        assert rows_near(root, asked.at, box_of(asked), MOST_ROWS) <= MOST_ROWS
+        assert rows_near(root, asked.at, box_of(asked), LOOKED_ROWS) <= LOOKED_ROWS
         found = {"tiles": len(list(replies(root, asked)))}  # as the process of its own does
     else:
         with closing(Engine(ServiceConfig(), root)) as engine:

@@ -44,7 +44,6 @@ CAMPAIGNS: Final = (
             *("faults.age.ready_s", "faults.age.ready_mb", "faults.age.at_mb"),
             *("faults.age.cold_s", "faults.age.cold_mb", "faults.age.cells"),
         ),
-        in_quick=False,  # at_mb does not hold (312 of 300 MB): it stands in the whole run
     ),
     Campaign("truncation", truncation.run, ("faults.truncation.lost_rows",)),
     Campaign(

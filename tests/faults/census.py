@@ -72,7 +72,7 @@ def told(journals: Iterable[Path]) -> Told:
 def take(journals: Iterable[Path], archive: Path) -> Census:
     """Compare the journals with the whole archive."""
     stored, settled = told(journals)
-    held, doubled, rows = _archived(archive, {name[0] for name in stored})
+    held, doubled, rows = _archived(archive, {name[:2] for name in stored})
     missing = {name for name, (records, _) in stored.items() if held.get(name, 0) < records}
     return Census(
         len(stored), len(settled.keys() & stored.keys()), len(missing & settled.keys()), len(missing), doubled, rows,
@@ -80,8 +80,8 @@ def take(journals: Iterable[Path], archive: Path) -> Census:
     )  # fmt: skip
 
 
-def _archived(archive: Path, vehicles: set[str]) -> tuple[dict[Name, int], int, int]:
-    """Distinct rows of every archived batch; rows that are there again; all rows."""
+def _archived(archive: Path, starts: set[tuple[str, int]]) -> tuple[dict[Name, int], int, int]:
+    """Distinct rows of every archived batch, by starts (vehicle, boot); rows that are there again; all rows."""
     columns = ["vehicle", "boot", "region", "seq", "row"]
     tables = list(reading.read(archive, Kind.OBSERVATION, columns))
     if not tables:
@@ -89,9 +89,15 @@ def _archived(archive: Path, vehicles: set[str]) -> tuple[dict[Name, int], int, 
     whole = pa.concat_tables(tables)
     found = whole.group_by(columns[:-1]).aggregate([("row", "count_distinct")]).to_pydict()
     pseudonyms, now = Pseudonyms(archive / "keys"), time.time_ns()
-    name_of = {pseudonyms.of(vehicle, now - ago): vehicle for vehicle in vehicles for ago in (0, HOUR_NS)}
-    names = zip(
-        (name_of.get(p, p) for p in found["vehicle"]), found["boot"], found["region"], found["seq"], strict=True
+    start_of = {
+        (pseudonyms.of(vehicle, now - ago), pseudonyms.boot(vehicle, boot, now - ago)): (vehicle, boot)
+        for vehicle, boot in starts
+        for ago in (0, HOUR_NS)
+    }
+    kept = zip(found["vehicle"], found["boot"], strict=True)
+    names = (
+        (*start_of.get(start, start), region, seq)
+        for start, region, seq in zip(kept, found["region"], found["seq"], strict=True)
     )
     held = dict(zip(names, found["row_count_distinct"], strict=True))
     return held, whole.num_rows - sum(held.values()), whole.num_rows

@@ -95,8 +95,10 @@ def _lost(root: Path, batches: Sequence[Batch]) -> int:
     held = {(seq, row, round(mu, 3)) for seq, row, mu in _rows(root)}
     streams = SequenceTrackers()
     restore_streams(root, streams)
-    vehicle = number(Pseudonyms(root / "keys").of("sim-001", int(batches[0].columns["enter_time"][0])))
-    stream = streams[vehicle, batches[0].boot, Kind.OBSERVATION, batches[0].region]
+    pseudonyms, first, at = Pseudonyms(root / "keys"), batches[0], int(batches[0].columns["enter_time"][0])
+    vehicle, boot = number(pseudonyms.of("sim-001", at)), pseudonyms.boot("sim-001", first.boot, at)
+    assert (vehicle, boot, Kind.OBSERVATION, first.region) in streams
+    stream = streams[vehicle, boot, Kind.OBSERVATION, first.region]
     owed = [b for place, b in enumerate(batches) if place < len(batches) - BATCHES or stream.accepted(b.seq)]
     return len(_expected(owed) - held) + len(held - _expected(batches))
 

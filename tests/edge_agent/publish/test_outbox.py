@@ -302,3 +302,22 @@ def test_a_file_that_is_no_outbox_is_refused_and_left_alone(path: Path) -> None:
     with pytest.raises(InputError, match="spool: .* cannot be opened"):
         Outbox(path)
     assert path.read_bytes().startswith(b"my shopping list")
+
+
+def test_a_batch_that_nobody_answers_is_given_up_once_it_would_stop_its_stream(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("edge_agent.publish.outbox.PASSED_OVER", 40)
+    outbox, now = Outbox(path, boot=BOOT), 0.0
+    for turn in range(60):
+        now += 1.0
+        fresh = outbox.store([draft(records=2)], now)
+        outbox.due(now, 64)
+        for batch in fresh:
+            if batch.seq != 3:  # which no service can read
+                outbox.settle(stream(), [(batch.seq, batch.seq)])
+        assert outbox.counts.unanswered == 0 or turn >= 42
+    assert outbox.batches == 0
+    assert outbox.counts.unanswered == 2
+    assert outbox.store([draft()], now)[0].payload == b"61/61", "older than that never comes"
+    outbox.close()

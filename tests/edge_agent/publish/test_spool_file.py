@@ -68,6 +68,18 @@ def test_a_bit_that_flips_within_a_batch_is_noticed(tmp_path: Path) -> None:
     outbox.close()
 
 
+def test_a_batch_whose_number_of_records_is_damaged_is_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "spool.sqlite"
+    whole = stored(path)
+    with sqlite3.connect(path) as database:
+        database.execute("UPDATE batch SET records = 0 WHERE seq = 20")
+    database.close()
+    outbox = Outbox(path, boot=6)
+    assert found(outbox.held()).keys() == whole.keys() - {20}
+    assert outbox.counts.damaged == 1
+    outbox.close()
+
+
 def test_damage_while_it_is_in_use_is_mended_and_names_go_on(tmp_path: Path) -> None:
     path = tmp_path / "spool.sqlite"
     stored(path)

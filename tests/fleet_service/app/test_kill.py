@@ -15,6 +15,7 @@ import pyarrow as pa
 import zenoh
 
 from fleet_service.archive import reading
+from fleet_service.archive.pseudonyms import Pseudonyms
 from schemas.config import ZenohSettings
 from schemas.wire import Kind
 from tests.fleet_service.app.test_service import Fleet
@@ -67,13 +68,14 @@ def test_a_killed_service_keeps_what_it_acknowledged_and_counts_nothing_twice(
                 process.terminate()
                 assert process.wait(10) == 0
         held = archived(tmp_path)
-        assert all(one in held for one in identities(fleet))
+        assert all(one in held for one in identities(fleet, tmp_path))
     assert len(held) == len(set(held)) == 3 * len(sent)
 
 
-def identities(fleet: Fleet) -> list[tuple[int, int, int]]:
-    """Boot, seq and row of everything acknowledged."""
-    boots = {f"sim-{vehicle:03}": batch(f"sim-{vehicle:03}", 1, 0, [0.8]).boot for vehicle in range(VEHICLES)}
+def identities(fleet: Fleet, folder: Path) -> list[tuple[int, int, int]]:
+    """Boot as it is archived, seq and row of everything acknowledged."""
+    pseudonyms, now = Pseudonyms(folder / "archive" / "keys"), time.time_ns()
+    boots = {name: pseudonyms.boot(name, batch(name, 1, 0, [0.8]).boot, now) for name in fleet.durable}
     return [(boots[v], seq, row) for v, seqs in list(fleet.durable.items()) for seq in list(seqs) for row in range(3)]
 
 

@@ -5,12 +5,20 @@ from __future__ import annotations
 import time
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
+from numpy.typing import NDArray
 
 from fleet_service.app import past
 from fleet_service.app.engine import Engine
+from fleet_service.archive import files, layout, segments
+from fleet_service.archive.between import Between
 from fleet_service.archive.compaction import compact
+from fleet_service.archive.load import load
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay.rebuild import rows_near
 from schemas import query, wire
@@ -53,6 +61,39 @@ def test_what_would_read_too_much_is_refused_and_a_narrower_box_is_not(
     with pytest.raises(InputError, match="at: would have to read too much of the archive; narrow bbox"):
         list(past.ask(root, question(), lambda _: True))
     assert list(past.ask(root, question(bbox="0,0,1,1"), lambda _: True)) == []
+    with pytest.raises(InputError, match="at: would have to read too much of the archive; narrow bbox"):
+        list(past.replies(root, question(bbox=NEAR)))  # as many lie in the box itself
+    monkeypatch.setattr(past, "LOOKED_ROWS", 399)
+    with pytest.raises(InputError, match="at: would have to read too much"):
+        list(past.ask(root, question(bbox=NEAR), lambda _: True))
+
+
+@pytest.mark.parametrize("group", [1, 7, 400])
+def test_a_filter_finds_the_same_rows_however_they_are_grouped(
+    root: Path, monkeypatch: pytest.MonkeyPatch, group: int
+) -> None:
+    (path,) = layout.compacted(root, Kind.OBSERVATION)
+    table = pq.read_table(path, partitioning=None)
+    monkeypatch.setattr(files, "ROW_GROUP", group)
+    files.write_table(table, path, files.COMPACTED)
+    assert pq.read_metadata(path).num_row_groups == -(-400 // group)
+    schema, begin = segments.SCHEMAS[Kind.OBSERVATION], table["leave_time"].cast(pa.int64()).to_numpy()
+    wanted: list[tuple[Between, NDArray[Any]]] = [
+        (Between("seq", 2, 3), np.isin(table["seq"], [2, 3])),
+        (Between("leave_time", most=int(np.median(begin))), begin <= np.median(begin)),
+        (Between("vehicle", table["vehicle"][7].as_py(), table["vehicle"][7].as_py()), np.array([
+            one == table["vehicle"][7].as_py() for one in table["vehicle"].to_pylist()
+        ])),
+        (Between("latitude", LATITUDE - 1.0, LATITUDE + 1.0), np.ones(400, bool)),
+        (Between("seq", 100), np.zeros(400, bool)),
+    ]  # fmt: skip
+    for where, right in wanted:
+        for columns in (["vehicle", "seq", "row", "leave_time", "latitude"], None):
+            found = load(path, schema, columns, [where])
+            assert found is not None
+            names = columns or schema.names
+            assert repr(found.to_pylist()) == repr(table.filter(pa.array(right)).select(names).to_pylist()), where
+    assert 0 < wanted[0][1].sum() < 400
 
 
 def test_the_answer_of_the_other_process_is_that_of_this_one(root: Path) -> None:

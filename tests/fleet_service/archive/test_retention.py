@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from contextlib import closing
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -12,15 +13,19 @@ import pyarrow.parquet as pq
 import pytest
 
 from fleet_service.app.engine import Engine
-from fleet_service.archive import export, layout, mirror, reading, retention, rollup, segments
+from fleet_service.archive import export, layout, mirror, reading, retention, rollup, segments, snapshots
 from fleet_service.archive.compaction import compact
+from fleet_service.archive.load import BAD
 from fleet_service.archive.pseudonyms import Pseudonyms
 from fleet_service.archive.segments import Writer
 from fleet_service.cli import main
+from fleet_service.ingest.inbox import Message
+from schemas import grid, wire
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
 from schemas.wire import Kind
 from tests.fleet_service.archive.rows import START, fill, identities, rows_of
+from tests.fleet_service.examples import LATITUDE, LONGITUDE, batch, key
 
 DATE = layout.date_of(20_000)
 MONTH = f"{DATE:%Y-%m}"
@@ -69,7 +74,31 @@ def test_one_vehicle_is_forgotten_and_the_others_are_not_touched(tmp_path: Path)
     rolled = [pq.read_table(p, partitioning=None) for p in (tmp_path / rollup.TABLE).rglob("*.parquet")]
     assert sum(table["observations"].to_numpy().sum() for table in rolled) == 144
     assert compact(tmp_path) == (0, 0, 0)
-    assert retention.forget_vehicle(tmp_path, "sim-003", MONTH) == 0
+    assert retention.forget_vehicle(tmp_path, "sim-003", MONTH) == (0, ())
+
+
+def test_what_could_tell_of_a_forgotten_vehicle_goes_too_here_and_in_the_mirror(tmp_path: Path) -> None:
+    root, there = tmp_path / "archive", tmp_path / "there"
+    now = time.time_ns()
+    month = f"{datetime.fromtimestamp(now / 1e9, UTC):%Y-%m}"
+    with closing(Engine(ServiceConfig(), root)) as engine:
+        for k in range(8):  # six in one cell; and one, and another, alone
+            latitude = LATITUDE if k < 6 else LATITUDE - 0.001 * k
+            one = batch(f"car-{k:03}", 1, now, [0.8], latitude=[latitude], cell=[grid.cell_of(latitude, LONGITUDE)])
+            engine.ingest([Message(Kind.OBSERVATION, key(one.vehicle), wire.encode(one), "")], now)
+        engine.flush()
+        snapshot = snapshots.write(root, engine.whole_map(now), now)
+    assert main(["compact", "--archive", str(root), "--put-to", there.as_uri()]) == 0
+    (root / "inbox" / f"shard-0-0000000001-00000001.parquet{BAD}").write_bytes(b"who knows")
+    words = ["forget", "--archive", str(root), "--period", month, "--put-to", there.as_uri(), "--yes", "--vehicle"]
+    for vehicle, cells in (("car-001", 3), ("car-007", 2)):  # a line of five others stays, that of nobody else goes
+        assert main([*words, vehicle]) == 0
+        for folder in (root, there):
+            table = pq.read_table(folder / snapshot.relative_to(root), partitioning=None)
+            assert (table.num_rows, b"geo" in (table.schema.metadata or {})) == (cells, True)
+            gone = Pseudonyms(root / "keys").of(vehicle, now).encode()
+            assert not [path for path in folder.rglob("*.parquet") if gone in path.read_bytes()]
+    assert not list(root.rglob(f"*{BAD}"))
 
 
 def test_a_destroyed_key_makes_the_way_back_to_a_name_unknown(tmp_path: Path) -> None:

@@ -11,9 +11,11 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from fleet_service.app.engine import Engine
+from fleet_service.archive import reading
 from fleet_service.archive.pseudonyms import Pseudonyms, number
 from fleet_service.archive.retention import drop_checkpoints, forget_period
 from fleet_service.archive.witnesses import Witnesses, read
@@ -58,6 +60,39 @@ def test_one_car_is_one_witness_over_midnight_of_a_month_live_and_after_a_replay
     with closing(Engine(ServiceConfig(), tmp_path)) as again:
         assert again.fusion.live.vehicles[0] == 1
         assert again.alerts == 0
+
+
+def test_a_start_that_lasts_over_midnight_of_a_month_links_none_of_its_pseudonyms(tmp_path: Path) -> None:
+    before, after = months(time.time_ns())
+    sent = [batch("car-001", seq, at, [0.8]) for seq, at in enumerate((before, after), 1)]
+    for again in (False, True):
+        with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+            engine.ingest([message(one) for one in sent], after)
+            assert engine.counts["duplicates"] == (2 if again else 0), "a restart knows both"
+            ((vehicle, ack),) = engine.flush()
+            streams = wire.decode_ack(ack)[1]
+            assert {stream.boot for stream in streams} == {sent[0].boot}, "its sender hears its own name for it"
+            assert sorted(seq for stream in streams for run in stream.durable for seq in run) == [1, 2]
+    table = pa.concat_tables(reading.read(tmp_path, Kind.OBSERVATION, ["vehicle", "boot"]))
+    assert (vehicle, table.num_rows) == ("car-001", 2)
+    assert len(set(table["vehicle"].to_pylist())) == len(set(table["boot"].to_pylist())) == 2
+    assert sent[0].boot not in table["boot"].to_pylist()
+    assert table["boot"].to_numpy().min() >= 0
+
+
+def test_batches_of_an_archive_that_keeps_starts_as_they_were_sent_are_known_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = time.time_ns()
+    sent = [message(batch("car-001", seq, now, [0.8])) for seq in (1, 2, 3)]
+    with monkeypatch.context() as before:
+        before.setattr(Pseudonyms, "boot", lambda self, vehicle, boot, time: boot)
+        with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+            engine.ingest(sent[:2], now)
+            engine.flush()
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        engine.ingest(sent, now)
+        assert (engine.counts["duplicates"], engine.counts[Kind.OBSERVATION]) == (2, 1)
 
 
 def test_a_car_with_one_foot_in_last_month_raises_no_alert_alone(engine: Engine) -> None:

@@ -87,7 +87,7 @@ def test_an_acknowledgement_is_never_larger_than_its_receiver_reads() -> None:
         head = Head(one.kind, one.vehicle, one.boot, one.region, one.seq, one.first_held, one.estimator)
         acks.rejected("sim-001", head, 0, "x" * 120)
     stream = SequenceTracker((1, sent[0].boot, sent[0].kind, sent[0].region))
-    stream.vehicle = "sim-001"
+    stream.vehicle, stream.boot = "sim-001", sent[0].boot
     acks.durable((stream, seq) for seq in range(5001, 9001, 2))
     messages = acks.messages()
     told = [part for _, payload in messages for part in wire.decode_ack(payload)[1]]

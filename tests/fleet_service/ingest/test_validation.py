@@ -20,6 +20,7 @@ from fleet_service.ingest.inbox import BatchIntake, Inbox, Message
 from fleet_service.ingest.rate_limit import RateLimiter
 from fleet_service.ingest.validation import Clock
 from schemas import grid, wire
+from schemas.proto.gripmap_pb2 import ObservationBatch
 from schemas.wire import Kind
 from tests.fleet_service.examples import CELL, LATITUDE, REGION, SECOND, batch, key
 
@@ -173,3 +174,19 @@ def test_no_mutation_of_a_batch_stops_the_intake_or_lets_nonsense_in(desk: Desk,
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_no_text_stops_the_intake(desk: Desk, payload: bytes) -> None:
     assert desk.take(Message(Kind.OBSERVATION, key("sim-001"), payload, wire.JSON)) == 0
+
+
+def test_a_batch_whose_records_cannot_be_used_is_refused_for_good_where_its_head_says_which_it_is(desk: Desk) -> None:
+    """Else it would come again for ever, and stop its stream after 65 536 others."""
+    pb = wire.parse(wire.encode(batch("sim-001", 7, NOW, [0.8, 0.8])), "", ObservationBatch, "")
+    del pb.mu[1:]
+    assert desk.take(message(batch("sim-001", 7, NOW, [0.8]), pb.SerializeToString())) == 0
+    ((seq, row, reason),) = desk.rejected()
+    assert (seq, row) == (7, -1)
+    assert reason.startswith("mu: has 1 records")
+    assert desk.counts["refused.mu"] == 1
+    pb.vehicle = "sim-002"  # on another's key: whose it is, is not known
+    desk.take(message(batch("sim-001", 7, NOW, [0.8]), pb.SerializeToString()))
+    desk.take(message(batch("sim-001", 7, NOW, [0.8]), b"\xff" * 40))
+    assert desk.rejected() == []
+    assert desk.counts["refused.payload"] == 1

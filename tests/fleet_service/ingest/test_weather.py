@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +16,17 @@ import pytest
 import zenoh
 
 from fleet_service.app.engine import Engine
+from fleet_service.archive.layout import DAY_NS
+from fleet_service.archive.retention import drop_checkpoints
 from fleet_service.ingest.inbox import Message
-from fleet_service.ingest.weather import WeatherMessage, archived, read_file
+from fleet_service.ingest.weather import WeatherMessage, archived, files, gather, read_file, retire
+from fleet_service.replay import checkpoints
 from schemas import grid, keys, mugrid, tables, weather, wire
 from schemas.config import ServiceConfig
 from schemas.errors import InputError, WireError
 from schemas.weather import Report
 from schemas.wire import Kind
+from tests.fleet_service.archive.kept import taken
 from tests.fleet_service.conftest import Running
 from tests.fleet_service.examples import REGION, SECOND, batch, key
 from tests.waiting import matched, until
@@ -110,6 +116,35 @@ def test_a_restart_from_the_archive_has_the_weather_that_was_used_and_gives_the_
     assert pq.read_schema(next((tmp_path / "a" / "weather").glob("*"))).equals(tables.WEATHER_ARCHIVE)
     again.close()
     dry.close()
+
+
+def test_reports_of_a_day_are_gathered_in_a_file_and_the_map_stays_whatever_a_checkpoint_knew(tmp_path: Path) -> None:
+    start, root = time.time_ns() - 7200 * SECOND, tmp_path / "a"
+    with closing(Engine(ServiceConfig(), root)) as engine:
+        for k in range(6):
+            told = weather.encode(Report(start + 600 * k * SECOND, road_temperature=-1.0, precipitation=float(k % 2)))
+            engine.weather.enqueue(WeatherMessage(keys.weather_key(REGION), told, wire.WEATHER_ENCODING))
+            engine.update_weather(start + 600 * k * SECOND)
+            drive(engine, start + 600 * k * SECOND, 1 + k)
+            if k == 3:
+                checkpoints.save(root, taken(engine))
+        now = start + 5000 * SECOND
+        right, before = beliefs(engine, now), archived(root)
+    path = files(root)[2]
+    shutil.copy(path, tmp_path / path.name)
+    assert (gather(root), gather(root), len(files(root))) == (5, 0, 1)
+    shutil.copy(tmp_path / path.name, path)  # a power loss before its name was gone
+    assert len(archived(root).time) == 7
+    for kept in (1, 0):
+        assert len(checkpoints.newest(root)) == kept
+        with closing(Engine(ServiceConfig(), root)) as again:
+            np.testing.assert_array_equal(beliefs(again, now), right)
+        drop_checkpoints(root)
+    assert gather(root) == 1
+    assert {*archived(root).time.tolist()} == {*before.time.tolist()}
+    day = start // DAY_NS
+    assert (retire(root, day - 2), len(files(root))) == (0, 1)
+    assert (retire(root, day + 1), len(files(root))) == (1, 0)
 
 
 def test_a_running_service_takes_weather_over_its_key(

@@ -71,8 +71,8 @@ def replayed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     rows: list[int] = []
     in_order: Callable[..., Iterable[pa.Table]] = rebuild.in_order
 
-    def counted(listing: reading.Listing) -> list[pa.Table]:
-        found = list(in_order(listing))
+    def counted(listing: reading.Listing, most: int | None) -> list[pa.Table]:
+        found = list(in_order(listing, most))
         rows.append(sum(table.num_rows for table in found))
         return found
 
