@@ -21,6 +21,7 @@ from schemas.thresholds import NS
 from schemas.wire.ahead import GripWarning, WarningState
 
 UPDATE_S: Final = 1.0  # between two looks: a stretch may come by so much nearer before it is told
+GAIN: Final = 3.0  # [m/s] that a car may gain until the next look: 3 m/s^2 is a swift start
 LINK_M: Final = 30.0  # nearer stretches are one
 ABSENT_S: Final = 2.0  # for which a stretch is not seen before it is over: fixes jump
 NEAR_M: Final = 30.0  # who was so near to a stretch that is no longer ahead has passed it
@@ -61,7 +62,8 @@ def warn(
         known: what the car has heard, ahead or not.
     """
     told: list[GripWarning] = []
-    stretches = [stretch for horizon in horizons for stretch in _stretches(horizon, pose.speed)]
+    speed = pose.speed + GAIN if pose.speed > SLOWEST else 0.0
+    stretches = [stretch for horizon in horizons for stretch in _stretches(horizon, speed)]
     kept: dict[str, Active] = {one.told.id: one for one in active}
     here: set[str] = set()  # those that lie ahead now
     for places, ways in _by_place(stretches):
@@ -69,7 +71,7 @@ def warn(
         before = next((one for one in kept.values() if one.places & places), None)
         sure = len({id(way.horizon) for way in ways}) == len(horizons)
         if before is None:
-            if nearest.room > 0.5 * pose.speed**2:
+            if nearest.room > 0.5 * speed**2:
                 continue
             first = min(nearest.places)
             name = f"{grid.quadkey(first // grid.SECTORS, grid.CELL_ZOOM)}{first % grid.SECTORS}-{pose.time // NS:x}"
