@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -25,6 +26,7 @@ from schemas.runtime.jit import compiled
 from schemas.thresholds import Z_95
 
 _LESS: Final = 0.5 * c.UTILISED_STD
+_USED_STEP: Final = 0.005  # of the grip used where its bound is looked up, rounded down: a seventh of a bin
 
 
 def evidence(columns: Mapping[str, NDArray[Any]], with_likelihood: BoolArray) -> Evidence:
@@ -59,9 +61,30 @@ def supported(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
     An estimator whose model is contradicted says nothing about the road, yet its accelerometers felt what was used. The
     two are of one visit, so that they are not multiplied.
     """
-    bound = levelled(mugrid.encode_log_likelihood(at_least(used)), np.minimum(used, c.UTILISED_MOST))
-    both = np.maximum(steps, bound)
-    return np.asarray(both - both.min(axis=1, keepdims=True))
+    out = steps.copy()
+    _support(out, np.asarray(used, np.float64), _bounds())
+    return out
+
+
+@cache
+def _bounds() -> ByteArray:
+    """Levelled bounds in steps, of uses _USED_STEP apart, as far as one is believed."""
+    used = np.arange(0.0, c.UTILISED_MOST + 0.5 * _USED_STEP, _USED_STEP)
+    return levelled(mugrid.encode_log_likelihood(at_least(used)), used)
+
+
+@compiled
+def _support(steps: ByteArray, used: FloatArray, bounds: ByteArray) -> None:
+    for n in range(len(steps)):
+        if math.isnan(used[n]):
+            continue
+        bound = bounds[min(max(int(used[n] / _USED_STEP), 0), len(bounds) - 1)]
+        least = np.uint8(255)
+        for i in range(mugrid.BINS):
+            steps[n, i] = max(steps[n, i], bound[i])
+            least = min(least, steps[n, i])
+        for i in range(mugrid.BINS):
+            steps[n, i] -= least
 
 
 def levelled(steps: ByteArray, used: NDArray[Any]) -> ByteArray:
