@@ -46,7 +46,7 @@ FLOOR: Final = {"radius": 0.0004, "ax": 0.10, "ay": 0.05, "yaw_rate": 0.0015, "s
                 "steer_gain": 0.03, "force_gain": 0.02, "understeer": 0.0015, "wheel_lag": 0.012,
                 "steer_lag": 0.012}  # fmt: skip
 BIAS: Final = {"radius": 0.0001, "ax": 0.02, "ay": 0.25, "yaw_rate": 0.0005, "steer_offset": 0.0004,
-               "steer_gain": 0.03, "force_gain": 0.002, "understeer": 0.0005, "wheel_lag": 0.003,
+               "steer_gain": 0.03, "force_gain": 0.002, "understeer": 0.0005, "wheel_lag": 0.009,
                "steer_lag": 0.009}  # fmt: skip
 USUAL: Final = {"radius": 0.006, "ax": 0.4, "ay": 0.2, "yaw_rate": 0.004, "steer_offset": 0.005, "steer_gain": 0.04,
                 "force_gain": 0.08, "understeer": 0.01, "wheel_lag": 0.04, "steer_lag": 0.04}  # fmt: skip
