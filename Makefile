@@ -5,13 +5,13 @@ STAMP := .venv/.installed
 
 TESTS := $(BIN)/python -m pytest -q --numprocesses auto --dist loadfile
 
-.PHONY: setup demo test test-all test-shuffled check package docs lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test usability figures roads-bench
+.PHONY: setup demo test test-all test-shuffled check package docs lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test usability figures roads-bench browser-test
 
 setup: $(STAMP)  ## make .venv and install everything, pinned
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[analytics,certs,demo,dev,inputs,metrics]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[analytics,certs,demo,dev,inputs,metrics,page]'
 	$(BIN)/python -m deploy.precompile
 	touch $@
 
@@ -26,6 +26,9 @@ test-all: setup  ## these, and the campaigns in their quick form
 
 test-shuffled: setup  ## all ten times in an order drawn anew: none may lean on another
 	for round in 1 2 3 4 5 6 7 8 9 10; do $(TESTS) --random-order || exit 1; done
+
+browser-test: setup  ## pages in the system's Chromium; pictures in .page
+	$(BIN)/python -m pytest -q -rs tests/fleet_service/page tests/fleet_service/analytics/test_page.py
 
 docs: setup  ## the documentation site, .docs/index.html; a warning is an error
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[docs]'
@@ -85,4 +88,4 @@ lock: setup  ## write the installed versions to constraints.txt
 	$(BIN)/python -m pip freeze --exclude-editable --exclude gripmap > constraints.txt
 
 clean:
-	rm -rf .venv .demo .docs dist .bench .analytics .evaluation .faults .usability .roads build *.egg-info
+	rm -rf .venv .demo .docs dist .bench .analytics .evaluation .faults .usability .roads .page build *.egg-info

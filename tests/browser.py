@@ -50,8 +50,8 @@ class Opened:
 
 
 @contextmanager
-def opened(path: Path, *, phone: bool = False, ratio: float = 1.0) -> Iterator[Opened]:
-    """A file of this machine in the browser; skips the test where there is none."""
+def opened(path: Path | str, *, phone: bool = False, ratio: float = 1.0) -> Iterator[Opened]:
+    """A file of this machine, or an address, in the browser; skips the test where there is none."""
     program = executable()
     if program is None:
         pytest.skip("no Chromium on this machine: apt install chromium")
@@ -63,7 +63,7 @@ def opened(path: Path, *, phone: bool = False, ratio: float = 1.0) -> Iterator[O
         )
         try:
             found = Opened(context.new_page())
-            found.page.goto(path.resolve().as_uri())
+            found.page.goto(path if isinstance(path, str) else path.resolve().as_uri())
             yield found
         finally:
             browser.close()

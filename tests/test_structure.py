@@ -46,10 +46,11 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "replay": {"fusion", "archive", "ingest"},
         "enrolment": set(),
         "client": set(),
+        "page": {"archive", "client"},
         "app": {"fusion", "archive", "ingest", "serve", "replay", "enrolment"},
         "analytics": {"fusion", "archive", "ingest", "serve", "replay"},
         "lab": {"fusion", "archive", "ingest", "serve", "replay", "app"},
-        "cli": {"archive", "app", "client", "enrolment", "analytics", "lab"},
+        "cli": {"archive", "app", "client", "page", "enrolment", "analytics", "lab"},
     },
 }
 MOST_ARROWS = {"edge_agent": 30, "fleet_service": 32}
@@ -75,6 +76,7 @@ SANS_IO = (
     "edge_agent/ahead/hearing.py",
     *(f"fleet_service/ingest/{name}.py" for name in ("acks", "validation")),
     *(f"fleet_service/serve/{name}.py" for name in ("encode", "query", "tile_cache")),
+    *(f"fleet_service/page/{name}.py" for name in ("colours", "records", "route", "stopping")),
 )
 IMPURE = {
     "asyncio", "datetime", "duckdb", "http", "logging", "multiprocessing", "os", "pathlib", "pyarrow", "random",

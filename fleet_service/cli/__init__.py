@@ -1,4 +1,4 @@
-"""`fleet-service`: run, query, watch, compact, retention, forget, export, roads, analyze, certs,
+"""`fleet-service`: run, query, watch, page, compact, retention, forget, export, roads, analyze, certs,
 evaluate, completion.
 
 Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. What a command needs is imported when
@@ -17,7 +17,7 @@ from schemas.runtime import commandline, talk
 from schemas.runtime.commandline import Command
 
 BAD_INPUT: Final = commandline.BAD_INPUT
-LIVE: Final = ("run", "watch")  # commands that go on until a signal
+LIVE: Final = ("run", "watch", "page")  # commands that go on until a signal
 # 25 MB that a running service's libraries load where they find them: for matrix products in kernels, of which there are
 # none, and for file systems that only a compaction writes to, which is a process of its own.
 UNUSED = ("scipy", "pyarrow._s3fs", "pyarrow._gcsfs", "pyarrow._azurefs", "pyarrow._hdfs")
@@ -29,6 +29,8 @@ COMMANDS: Final = (
             "fleet-service query --bbox -0.5,51.2,0.3,51.7 --out map.geojson"),
     Command("watch", "fleet_service.cli.watch", "print tiles and alerts as they change, until Ctrl-C",
             "fleet-service watch --bbox 11.9,57.6,12.1,57.8"),
+    Command("page", "fleet_service.cli.page", "the live map in a browser: now, alerts, the past, routes",
+            "fleet-service page --connect tcp/127.0.0.1:7447 --archive archive"),
     Command("compact", "fleet_service.cli.compact", "sort the log into files by date and zone, roll them up",
             "fleet-service compact --archive archive"),
     Command("retention", "fleet_service.cli.retention", "remove old raw rows; their roll-ups stay",

@@ -95,6 +95,17 @@ SHOWN_BELOW: Final = {
     "roads": {"extract", "--out", "--id", "--name"},  # analytics/roads/test_join.py
     "analyze": {"--roads", "--level", "--within"},  # analytics/roads/test_contract.py
     "query": {"--bbox", "--route", "--min-vehicles", "--at", "--basis", "--format", "--out", "--connect", "--config"},
+    "page": {  # page/test_server.py
+        "--archive",
+        "--host",
+        "--port",
+        "--name",
+        "--metrics",
+        "--overlay",
+        "--base-map",
+        "--connect",
+        "--config",
+    },
     "watch": {"--bbox", "--connect", "--config", "--alerts", "--json", "--webhook"},
 }
 # A campaign takes minutes: tests/fleet_service/lab/test_evaluate.py runs it small.

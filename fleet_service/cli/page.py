@@ -1,0 +1,54 @@
+"""`fleet-service page`: the live map in a browser."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from fleet_service.cli.common import add_connection, stop_on_signals
+from schemas.errors import InputError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--archive", metavar="DIR", type=Path, help="of a service on this machine: past and history")
+    parser.add_argument("--host", default="127.0.0.1", help="where to listen (default 127.0.0.1: this machine only)")
+    parser.add_argument("--port", type=int, default=8080, help="0: a free one (default 8080)")
+    parser.add_argument("--name", action="append", default=[], help="host name under which a proxy passes it on")
+    parser.add_argument(
+        "--metrics", metavar="URL", action="append", default=[], help="metrics of a service, for the health view"
+    )
+    parser.add_argument("--overlay", metavar="FILE", type=Path, help="Parquet of cell, sector, mu to lay over the map")
+    parser.add_argument("--base-map", metavar="URL", help="raster tiles below the cells, with {z}, {x} and {y}")
+    add_connection(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Serve the page until a signal."""
+    from fleet_service.client import map_client
+
+    try:
+        from fleet_service.page import server
+    except ImportError as error:
+        fix = "pip install 'gripmap[page]'"
+        raise InputError("page", f"the package {error.name} is missing", fix) from error
+    if arguments.archive is not None:
+        from fleet_service.archive.layout import insist_on_archive
+
+        insist_on_archive(arguments.archive)
+    _insist_on_base_map(arguments.base_map)
+    settings = server.PageSettings(
+        connection=map_client.settings(arguments.connect, arguments.config), host=arguments.host, port=arguments.port,
+        names=arguments.name, archive=arguments.archive, metrics=arguments.metrics, overlay=arguments.overlay,
+        base_map=arguments.base_map,
+    )  # fmt: skip
+    server.run(settings, stop_on_signals(), lambda line: print(line, flush=True))
+    return 0
+
+
+def _insist_on_base_map(address: str | None) -> None:
+    if address is None:
+        return
+    whole = all(f"{{{name}}}" in address for name in "zxy") and not any(mark in address for mark in " ;,'\"")
+    if not whole or not address.startswith(("http://", "https://", "/")):
+        raise InputError("base_map", f"{address[:60]!r} is no address of tiles", "write https://HOST/{z}/{x}/{y}.png")

@@ -1,0 +1,40 @@
+"""What a cell is drawn in: the less is known the fewer colours, and none at all for a mere bound.
+
+Value-suppressing palette (Correll, Moritz and Heer, CHI 2018): four classes of mu where its interval is narrow, two
+where it is middling, one grey where it is wide. What is slippery even at the upper end keeps its colour, however wide.
+Dark is slippery on light ground, and nothing is ever green: a safe colour would be a promise.
+`tests/fleet_service/page/test_colours.py` computes how far they lie apart for four kinds of sight.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from schemas.thresholds import SLIPPERY_MU
+
+NARROW: Final = 0.25  # width of the interval below which four classes are told apart: half of it is less than a class
+MIDDLING: Final = 0.6  # ... two
+EDGES: Final = (0.2, SLIPPERY_MU, 0.6)  # ice | snow | wet | dry (Pacejka 2012, ch. 1)
+FOUR: Final = ("#4c007b", "#aa5271", "#f58c41", "#eeea79")
+TWO: Final = ("#663144", "#e7bb9c")
+LITTLE: Final = "#c4c3c3"
+GROUND: Final = "#ffffff"  # nobody was there
+ALERT: Final = "#c4003a"
+
+
+def colour_of(mu: float, lower: float, upper: float) -> str:
+    """Colour of what was measured as mu, with its 5 % and 95 % quantiles."""
+    width = round(upper - lower, 6)  # a step of the records is .005
+    if upper < SLIPPERY_MU or width < NARROW:
+        return FOUR[sum(mu >= edge for edge in EDGES)]
+    if width < MIDDLING:
+        return TWO[int(mu >= SLIPPERY_MU)]
+    return LITTLE
+
+
+def told() -> dict[str, Any]:
+    """All of it for the page."""
+    return {
+        "narrow": NARROW, "middling": MIDDLING, "edges": EDGES, "slippery": SLIPPERY_MU, "four": FOUR, "two": TWO,
+        "little": LITTLE, "ground": GROUND, "alert": ALERT,
+    }  # fmt: skip

@@ -1,0 +1,70 @@
+"""What services say of themselves at `/metrics`, for the health view: a reader hears nothing of it over Zenoh."""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+import urllib.request
+from typing import Any, Final
+
+from schemas.runtime.metrics import PREFIX
+
+READ_S: Final = 2.0
+KEPT_S: Final = 2.0  # many browsers ask, a service is asked once
+MOST_BYTES: Final = 1 << 20
+_LINE: Final = re.compile(rf'{PREFIX}(\w+?)(_total)?(?:\{{\w+="([^"]*)"\}})? (\S+)')
+
+
+class ServiceHealth:
+    """The metrics of services, by address.
+
+    Args:
+        addresses: such as http://127.0.0.1:9464.
+    """
+
+    def __init__(self, addresses: list[str]) -> None:
+        self._addresses = addresses
+        self._lock = threading.Lock()
+        self._told: list[dict[str, Any]] = []
+        self._asked = 0.0
+        self._before: dict[str, tuple[float, float]] = {}
+
+    def services(self) -> list[dict[str, Any]]:
+        """One entry a service: `address`, `answers`, and what it says."""
+        with self._lock:
+            if time.monotonic() - self._asked >= KEPT_S:
+                self._told = [self._ask(address) for address in self._addresses]
+                self._asked = time.monotonic()
+            return self._told
+
+    def _ask(self, address: str) -> dict[str, Any]:
+        try:
+            with urllib.request.urlopen(f"{address.rstrip('/')}/metrics", timeout=READ_S) as answer:
+                text = answer.read(MOST_BYTES).decode("utf-8", "replace")
+        except (OSError, ValueError):
+            return {"address": address, "answers": False}
+        found = values(text)
+        rows = found.get("rows", {}).get("observation", 0.0)
+        now = time.monotonic()
+        before = self._before.get(address)
+        self._before[address] = (now, rows)
+        rate = None if before is None or now <= before[0] else max(rows - before[1], 0.0) / (now - before[0])
+        single = {
+            name: found.get(name, {}).get("")
+            for name in ("report_lag_seconds", "cells", "alerts", "queue_messages", "clock_lag_seconds")
+        }
+        return {
+            "address": address, "answers": True, "observations": rows, "per_second": rate,
+            "refused": found.get("refused_messages", {}), "failures": found.get("failures", {}), **single,
+        }  # fmt: skip
+
+
+def values(text: str) -> dict[str, dict[str, float]]:
+    """Values of an OpenMetrics text by name and label; "" is the label of a single one."""
+    found: dict[str, dict[str, float]] = {}
+    for line in text.splitlines():
+        match = _LINE.fullmatch(line)
+        if match:
+            found.setdefault(match[1], {})[match[3] or ""] = float(match[4])
+    return found

@@ -1,0 +1,104 @@
+"""Past moments from the snapshots that a service keeps: which there are, a map of then, a cell's history.
+
+Snapshots hold public cells only, so what is read here is as public as the map itself.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from fleet_service.archive import layout, snapshots
+from fleet_service.page import records, world
+from fleet_service.page.records import Records
+from schemas import grid
+from schemas.errors import InputError
+from schemas.numeric import IntArray
+from schemas.thresholds import NS
+
+KEPT: Final = 8  # snapshots in memory
+MOST: Final = 3000  # moments that the slider is told of: four months of hours
+HISTORY: Final = 200  # snapshots that a history looks at, the newest
+_COLUMNS: Final = ("cell", "sector", "mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehicles", "last_time")
+_OF_HISTORY: Final = ("mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehicles")
+
+
+class Moments:
+    """The snapshots of an archive.
+
+    Args:
+        root: of the archive; None where the page has none.
+    """
+
+    def __init__(self, root: Path | None) -> None:
+        self._root = root
+        self._kept: OrderedDict[int, dict[int, Records]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def times(self) -> list[int]:
+        """The moments of all snapshots [s since 1970], oldest first."""
+        return sorted(self._files())[-MOST:]
+
+    def tiles(self, moment: int) -> list[int]:
+        """Tiles with cells then."""
+        return list(self._at(moment))
+
+    def encoded(self, moment: int, tile: int, level: int) -> bytes:
+        """All of a tile then; empty where nothing was known of it."""
+        cells = self._at(moment).get(tile)
+        return b"" if cells is None else world.block_at(level, tile, cells, 1, float(moment))
+
+    def history(self, cell: int, sector: int) -> list[dict[str, Any]]:
+        """What was believed of a cell at each moment at which it was public, oldest first."""
+        found = []
+        files = self._files()
+        for moment in sorted(files)[-HISTORY:]:
+            wanted = (pc.field("cell") == cell) & (pc.field("sector") == sector)
+            try:
+                table = pq.read_table(files[moment], columns=list(_OF_HISTORY), filters=wanted, partitioning=None)
+            except FileNotFoundError:  # retention was quicker
+                continue
+            for row in table.to_pylist()[:1]:
+                measured = row["basis"] == "measured"
+                found.append({"moment": moment, **row, "mu": row["mu"] if measured else None})
+        return found
+
+    def _files(self) -> dict[int, Path]:
+        if self._root is None:
+            return {}
+        folders = layout.days(self._root, snapshots.TABLE)
+        return {snapshots.time_of(path) // NS: path for folder in folders for path in folder.glob("*.parquet")}
+
+    def _at(self, moment: int) -> dict[int, Records]:
+        with self._lock:
+            if moment not in self._kept:
+                self._kept[moment] = self._read(moment)
+                while len(self._kept) > KEPT:
+                    self._kept.popitem(last=False)
+            self._kept.move_to_end(moment)
+            return self._kept[moment]
+
+    def _read(self, moment: int) -> dict[int, Records]:
+        try:
+            path = self._files()[moment]
+            table = pq.read_table(path, columns=list(_COLUMNS), partitioning=None)
+        except (KeyError, OSError, pa.ArrowException) as error:
+            raise InputError("at", f"there is no snapshot of {moment}", "take one of /moments") from error
+        last = table["last_time"].cast(pa.timestamp("ns", "UTC"), safe=False)
+        table = table.set_column(table.schema.get_field_index("last_time"), "last_time", last)
+        tile: IntArray = np.asarray(grid.tile_of(table["cell"].to_numpy()))
+        order = np.argsort(tile, kind="stable")
+        names, first = np.unique(tile[order], return_index=True)
+        table = table.take(order)
+        ends = np.append(first, len(tile))[1:]
+        return {
+            int(name): records.of_table(table.slice(int(a), int(b - a)))
+            for name, a, b in zip(names, first, ends, strict=True)
+        }

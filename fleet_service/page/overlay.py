@@ -1,0 +1,33 @@
+"""Another map to lay over this one, such as a simulation's truth: a Parquet file of cell, sector and mu.
+
+The file is read when it is asked for: it may come into being while the page runs.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from schemas.errors import InputError
+
+
+def cells(path: Path | None) -> dict[str, list[Any]] | None:
+    """Cell (as text), sector and mean mu of each place; None where there is no file, or none yet.
+
+    Raises:
+        InputError: the file has other columns.
+    """
+    if path is None or not path.is_file():
+        return None
+    try:
+        table = pq.read_table(path, columns=["cell", "sector", "mu"], partitioning=None)
+    except (OSError, pa.ArrowException) as error:
+        raise InputError("overlay", f"{path.name} has no cell, sector and mu", "give a file that has") from error
+    found = table.group_by(["cell", "sector"]).aggregate([("mu", "mean")])
+    return {
+        "cell": [str(cell) for cell in found["cell"].to_pylist()], "sector": found["sector"].to_pylist(),
+        "mu": found["mu_mean"].to_numpy().round(3).tolist(),
+    }  # fmt: skip

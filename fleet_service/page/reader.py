@@ -1,0 +1,189 @@
+"""The page's ear: a reader's session. Hears tiles and alerts, asks for what it missed, sees which regions are served.
+
+What it puts: nothing. What it may not hear of (tokens, where the access list holds) it does without.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+import pyarrow as pa
+import zenoh
+
+from fleet_service.page.world import HeldWorld, box_of
+from schemas import grid, keys, tables, wire
+from schemas.config import ZenohSettings
+from schemas.errors import InputError, WireError
+from schemas.runtime import zenoh_session
+from schemas.wire.tile import decode_tile
+
+log = logging.getLogger(__name__)
+ROUND_S: Final = 0.5
+ASK_S: Final = 10.0
+REFRESH_S: Final = 60.0  # a tile is put when it changes; that its intervals widen with time must be asked for
+REFRESHED: Final = 20  # tiles in a round: 40 a second, 2 400 in the minute; more are renewed more rarely
+REGIONS: Final = 256  # that are watched for a service
+
+
+class Reader:
+    """One session of the page.
+
+    Args:
+        connection: how to reach the router.
+        world: takes what is heard.
+    """
+
+    def __init__(self, connection: ZenohSettings, world: HeldWorld) -> None:
+        self._connection, self._world = connection, world
+        self._session: zenoh.Session | None = None
+        self._queriers: dict[int, Any] = {}
+        self._away_since: dict[int, float] = {}
+        self._names: dict[str, set[str]] = {"alive": set(), "shard": set()}
+        self._anything: Any = None
+        self._served = False
+
+    def run(self, stop: threading.Event) -> None:
+        """Listen until `stop` is set."""
+        session = zenoh_session.open_session(self._connection, stop)
+        if session is None:
+            return
+        with session:
+            self._session = session
+            session.declare_subscriber(f"{keys.ROOT}/map/**", self._tile)
+            session.declare_subscriber(f"{keys.ROOT}/alert/**", self._alert)
+            for kind in self._names:
+                session.liveliness().declare_subscriber(f"{keys.ROOT}/{kind}/*", self._token, history=True)
+            while not stop.is_set():
+                served = bool(self._sees_services())
+                if served and not self._served:  # at the start, and when a service came back: what was missed
+                    self._ask_all(session)
+                self._served = served
+                self._refresh(session)
+                stop.wait(ROUND_S)
+            self._session = None
+
+    @property
+    def connected(self) -> bool:
+        """Whether a router is there."""
+        session = self._session
+        return session is not None and bool(list(session.info.routers_zid()))
+
+    @property
+    def served(self) -> bool:
+        """Whether any service answers."""
+        return self._served and self.connected
+
+    def regions(self) -> list[dict[str, Any]]:
+        """Regions with cells: their box, whether a service answers for them, since when none does."""
+        return [
+            {"region": grid.quadkey(region, grid.REGION_ZOOM), "box": box_of(region, grid.REGION_ZOOM),
+             "served": region not in self._away_since, "since": self._away_since.get(region)}
+            for region in list(self._queriers)
+        ]  # fmt: skip
+
+    def names(self, kind: str) -> list[str]:
+        """Names with a token; empty where this reader may not hear of them."""
+        return sorted(self._names[kind])
+
+    def ask(self, selector: str, parameters: Mapping[str, str]) -> Iterator[tuple[int, pa.Table]]:
+        """Tile and cells of every reply.
+
+        Raises:
+            InputError: a service refused the question, or no router is there.
+        """
+        session = self._session
+        if session is None:
+            raise InputError("connect", "no router answers", "see that one runs")
+        text = ";".join(f"{name}={value}" for name, value in parameters.items())
+        for reply in session.get(f"{selector}?{text}" if text else selector, timeout=ASK_S):
+            if reply.ok is None:
+                problem = reply.err.payload.to_string() if reply.err else "no reply"
+                field, _, rest = problem.partition(": ")
+                raise InputError(field if rest else "query", rest or problem, "see above")
+            tile = keys.parse(str(reply.ok.key_expr)).quadint
+            if tile is not None:
+                yield tile, decode_tile(reply.ok.payload.to_bytes())
+
+    def _tile(self, sample: zenoh.Sample) -> None:
+        with _told(sample):
+            tile = keys.parse(str(sample.key_expr)).quadint
+            if tile is not None:
+                self._world.take_tile(tile, decode_tile(sample.payload.to_bytes()), time.time())
+
+    def _alert(self, sample: zenoh.Sample) -> None:
+        with _told(sample):
+            self._world.take_alert(wire.decode_alert(sample.payload.to_bytes()), time.time())
+
+    def _token(self, sample: zenoh.Sample) -> None:
+        with _told(sample):
+            parsed = keys.parse(str(sample.key_expr))
+            names = self._names[parsed.topic.name]
+            (names.add if sample.kind == zenoh.SampleKind.PUT else names.discard)(str(parsed.name))
+
+    def _ask_all(self, session: zenoh.Session) -> None:
+        """What was there before this page; it subscribed first, so that nothing is missed in between."""
+        try:
+            for tile, table in self.ask(f"{keys.ROOT}/map/**", {}):
+                self._world.take_tile(tile, table, time.time())
+        except (InputError, WireError) as error:
+            log.warning("the map was not told: %s", error)
+        standing = []
+        for reply in session.get(f"{keys.ROOT}/alert/**", timeout=ASK_S):
+            if reply.ok is not None:
+                standing += wire.decode_standing(reply.ok.payload.to_bytes())
+        self._world.take_standing(standing, lambda cell: self._answers(int(grid.region_of(cell))), time.time())
+
+    def _refresh(self, session: zenoh.Session) -> None:
+        for region in {int(grid.parent(tile, grid.REGION_ZOOM, grid.TILE_ZOOM)) for tile in self._world.tiles()}:
+            if region not in self._queriers and len(self._queriers) < REGIONS:
+                expression = f"{keys.ROOT}/map/{keys.chunks(region, grid.REGION_ZOOM)}/*"
+                self._queriers[region] = session.declare_querier(expression)
+        for region, querier in self._queriers.items():
+            if querier.matching_status.matching:
+                self._away_since.pop(region, None)
+            else:
+                self._away_since.setdefault(region, time.time())
+        now = time.time()
+        for tile in self._world.oldest(now - REFRESH_S, REFRESHED):
+            found = False
+            try:
+                for answered, table in self.ask(keys.map_key(tile), {}):
+                    self._world.take_tile(answered, table, now)
+                    found = True
+            except (InputError, WireError) as error:
+                log.warning("a tile was not told: %s", error)
+            if found:
+                continue
+            if self._answers(int(grid.parent(tile, grid.REGION_ZOOM, grid.TILE_ZOOM))):
+                self._world.take_tile(tile, tables.MAP_SCHEMA.empty_table(), now)  # fewer vehicles than are shown
+            else:
+                self._world.touch(tile, now)
+
+    def _answers(self, region: int) -> bool:
+        querier = self._queriers.get(region)
+        return querier is not None and bool(querier.matching_status.matching)
+
+    def _sees_services(self) -> bool:
+        """Whether a service answers for any place: by its token, or, where none may be heard, by what it serves."""
+        if self._names["shard"]:
+            return True
+        session = self._session
+        if session is None:
+            return False
+        if self._anything is None:
+            self._anything = session.declare_querier(f"{keys.ROOT}/map/**")
+        return bool(self._anything.matching_status.matching)
+
+
+@contextlib.contextmanager
+def _told(sample: zenoh.Sample) -> Iterator[None]:
+    """What a stranger put is no reason to end: it is said, and the next is heard."""
+    try:
+        yield
+    except (InputError, WireError, KeyError) as error:
+        log.warning("%s: %s", sample.key_expr, error)

@@ -1,0 +1,128 @@
+"""Cells of the map as 13-byte records, a tile a block: what the page is sent. Worst first where it is zoomed out. Pure.
+
+A block is a head of 32 bytes and its columns one after the other, each little-endian, so that a browser lays arrays
+over them without copying: `last` (4 bytes a cell), `place` (2), and `mu`, `lower`, `upper`, `slippery`, `basis`,
+`vehicles`, `unknown` (1 each). It ends at a multiple of four bytes.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from schemas import grid
+from schemas.numeric import FloatArray
+from schemas.thresholds import NS
+
+# last: newest observation [s since 1970]; place: cell within the tile · 4 + sector; mu, lower, upper: in MU_STEPS a
+# unit, 255 is 'no number'; slippery: P(mu < .4) in SHARE_STEPS; vehicles: 255 is '255 or more'; unknown: share of what
+# is below a place that was not measured.
+RECORD: Final = np.dtype([
+    ("last", "<u4"), ("place", "<u2"), ("mu", "u1"), ("lower", "u1"), ("upper", "u1"), ("slippery", "u1"),
+    ("basis", "u1"), ("vehicles", "u1"), ("unknown", "u1"),
+])  # fmt: skip
+Records = NDArray[np.void]
+HEAD: Final = struct.Struct("<4IB7xd")  # tile, version, the version that this changes (0: none), cells, level, moment
+MU_STEPS: Final = 200
+SHARE_STEPS: Final = 254
+NO_NUMBER: Final = 255
+BOUND, MEASURED, BORROWED, GONE = 0, 1, 2, 255
+CELL_LEVEL: Final = grid.CELL_ZOOM
+LEAST_LEVEL: Final = grid.TILE_ZOOM
+
+
+class TileBlock(NamedTuple):
+    """What is known of a tile, or what changed of it.
+
+    Attributes:
+        tile: z14 quadint.
+        level: zoom of the places, 14 to 21.
+        version: counts the changes of a tile, from 1.
+        base: the version that this changes; 0: this is all of the tile.
+        moment: when it was so [s since 1970].
+        records: by place; `basis` GONE takes a place away.
+    """
+
+    tile: int
+    level: int
+    version: int
+    base: int
+    moment: float
+    records: Records
+
+    def encoded(self) -> bytes:
+        """The block as bytes."""
+        head = HEAD.pack(self.tile, self.version, self.base, len(self.records), self.level, self.moment)
+        names: tuple[str, ...] = RECORD.names or ()
+        body = b"".join(self.records[name].tobytes() for name in names)
+        return head + body + b"\0" * (-len(body) % 4)
+
+
+def of_table(table: pa.Table) -> Records:
+    """Cells of one tile (the schema of the map, n rows) as records (n,), by place.
+
+    An interval is rounded outwards and P(slippery) upwards: no cell reads drier than it was told.
+    """
+    found = np.zeros(table.num_rows, RECORD)
+    found["last"] = np.clip(table["last_time"].cast(pa.int64()).to_numpy() // NS, 0, 2**32 - 1)
+    found["place"] = (table["cell"].to_numpy() & 0x3FFF) * grid.SECTORS + table["sector"].to_numpy()
+    found["mu"] = _steps(np.rint, table["mu"], MU_STEPS)
+    found["lower"] = _steps(np.floor, table["mu_lower"], MU_STEPS)
+    found["upper"] = _steps(np.ceil, table["mu_upper"], MU_STEPS)
+    found["slippery"] = _steps(np.ceil, table["p_slippery"], SHARE_STEPS)
+    basis = table["basis"].to_numpy()
+    found["basis"] = np.select([basis == "measured", basis == "borrowed"], [MEASURED, BORROWED], BOUND)
+    found["mu"][found["basis"] == BOUND] = NO_NUMBER  # whoever sent it: a bound has no number to colour by
+    found["vehicles"] = np.minimum(table["vehicles"].to_numpy(), 255)
+    found["unknown"] = np.where(found["basis"] == MEASURED, 0, SHARE_STEPS)
+    return found[np.argsort(found["place"], kind="stable")]
+
+
+def _steps(rounding: Callable[[FloatArray], FloatArray], column: pa.ChunkedArray[Any], steps: int) -> NDArray[np.uint8]:
+    value = column.to_numpy().astype(np.float64)
+    whole = np.clip(rounding(np.nan_to_num(value) * steps), 0, NO_NUMBER - 1)
+    return np.where(np.isfinite(value), whole, NO_NUMBER).astype(np.uint8)
+
+
+def worst(records: Records, level: int) -> Records:
+    """Records of cells (n,) as those of their ancestors at `level`, 14 to 21, all headings together.
+
+    An ancestor has the least of each quantile of what was measured below it, which is the largest P(slippery): no cell
+    below is more slippery than it says. `unknown` is the share of cells and headings below that were only passed.
+    """
+    if not len(records):
+        return records
+    place = (records["place"] >> (2 + 2 * (CELL_LEVEL - level))) << 2
+    first = np.flatnonzero(np.append(True, place[1:] != place[:-1]))
+    known = records["basis"] == MEASURED
+    count = np.diff(np.append(first, len(records)))
+    share = 1.0 - np.add.reduceat(known.astype(np.int64), first) / count
+    some = np.repeat(share < 1.0, count)
+    spoken = known | ~some  # a place that was only passed speaks where nothing was measured beside it
+    found = np.zeros(len(first), RECORD)
+    found["place"] = place[first]
+    for name in ("mu", "lower", "upper"):
+        found[name] = np.minimum.reduceat(np.where(spoken, records[name], NO_NUMBER), first)
+    for name in ("slippery", "vehicles"):
+        found[name] = np.maximum.reduceat(np.where(spoken, records[name], 0), first)
+    found["last"] = np.maximum.reduceat(records["last"], first)
+    found["basis"] = np.where(share < 1.0, MEASURED, BOUND)
+    found["mu"][share == 1.0] = NO_NUMBER
+    found["unknown"] = np.ceil(share * SHARE_STEPS)
+    return found
+
+
+def changed(before: Records, after: Records) -> Records:
+    """What must be laid over `before` to have `after`, both by place."""
+    places = np.union1d(before["place"], after["place"])
+    old, new = (np.zeros(len(places), RECORD) for _ in range(2))
+    for one, records in ((old, before), (new, after)):
+        one["basis"] = GONE
+        one["place"] = places
+        one[np.searchsorted(places, records["place"])] = records
+    return np.asarray(new[old != new])

@@ -1,0 +1,89 @@
+"""Grip along a route: stretches of the same cell and heading in their order, what is measured of them and what is not.
+
+What nobody measured is a stretch of its own without a number: it is neither dry nor slippery, and is counted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_service.page.stopping import SIGHTS_M, safe_speed
+from schemas import grid
+from schemas.errors import InputError
+from schemas.thresholds import METRES_PER_DEGREE
+
+STEP_M: Final = 4.0  # well below a cell's side
+MOST_M: Final = 200_000.0  # what a picture can show
+UNKNOWN: Final = "unknown"
+Points = Sequence[tuple[float, float]]
+
+
+def profile(points: Points, table: pa.Table) -> dict[str, Any]:
+    """Stretches along a route of (longitude, latitude) [deg], with the cells that a service told of it.
+
+    Returns:
+        `length_m`; `share` of the length by basis; `stretches` with from_m, to_m, middle, basis and, where measured,
+        mu, its quantiles, P(slippery), age_s and safe speeds [m/s] by metres of sight; `worst`: index of the least
+        lower end, or None.
+
+    Raises:
+        InputError: the route is too long or no route.
+    """
+    longitude, latitude, along, sector = _samples(points)
+    keys = grid.cell_of(latitude, longitude) * grid.SECTORS + sector
+    known = {
+        int(cell) * grid.SECTORS + int(heading): row
+        for row, (cell, heading) in enumerate(zip(table["cell"].to_numpy(), table["sector"].to_numpy(), strict=True))
+    }
+    rows = np.array([known.get(key, -1) for key in keys.tolist()])
+    runs = np.flatnonzero(np.append(True, (keys[1:] != keys[:-1]) & ~((rows[1:] < 0) & (rows[:-1] < 0))))
+    ends = np.append(runs[1:], len(keys) - 1)
+    cells = table.to_pylist()
+    stretches: list[dict[str, Any]] = []
+    length = float(along[-1])
+    share = dict.fromkeys(("measured", "bound", "borrowed", UNKNOWN), 0.0)
+    for first, last in zip(runs.tolist(), ends.tolist(), strict=True):
+        if along[last] <= along[first]:
+            continue
+        middle = (first + last) // 2
+        place = {"from_m": round(float(along[first]), 1), "to_m": round(float(along[last]), 1),
+                 "longitude": float(longitude[middle]), "latitude": float(latitude[middle])}  # fmt: skip
+        stretches.append(place | (_told(cells[rows[first]]) if rows[first] >= 0 else {"basis": UNKNOWN}))
+        share[stretches[-1]["basis"]] += float(along[last] - along[first]) / length
+    measured = [k for k, one in enumerate(stretches) if one["basis"] == "measured"]
+    worst = min(measured, key=lambda k: stretches[k]["mu_lower"], default=None)
+    return {"length_m": length, "share": share, "stretches": stretches, "worst": worst}
+
+
+def _told(cell: dict[str, Any]) -> dict[str, Any]:
+    measured = cell["basis"] == "measured"
+    names = ("cell", "sector", "basis", "mu_lower", "mu_upper", "p_slippery", "vehicles", "age_s")
+    speeds = {str(sight): safe_speed(cell["mu_lower"], sight) for sight in SIGHTS_M} if measured else None
+    return {name: cell[name] for name in names} | {
+        "mu": cell["mu"] if measured else None, "cell": str(cell["cell"]), "safe_speed": speeds,
+    }  # fmt: skip
+
+
+def _samples(points: Points) -> tuple[Any, Any, Any, Any]:
+    """Longitude and latitude [deg], metres along and heading sector, each step of the route."""
+    corners = np.array(points)
+    if corners.ndim != 2 or len(corners) < 2:
+        raise InputError("route", "needs two points", "click two or more")
+    scale = METRES_PER_DEGREE * math.cos(math.radians(float(corners[:, 1].mean())))
+    legs = np.diff(corners, axis=0) * [scale, METRES_PER_DEGREE]
+    lengths = np.hypot(*legs.T)
+    if not 0.0 < lengths.sum() <= MOST_M:
+        raise InputError("route", f"is {lengths.sum() / 1e3:.1f} km long", f"show up to {MOST_M / 1e3:.0f} km at once")
+    counts = np.maximum(np.ceil(lengths / STEP_M), 1).astype(np.int64)
+    leg = np.append(np.repeat(np.arange(len(counts)), counts), len(counts) - 1)
+    begun = np.cumsum(counts) - counts
+    share = np.append((np.arange(counts.sum()) - begun[leg[:-1]]) / counts[leg[:-1]], 1.0)
+    place = corners[leg] + share[:, None] * np.diff(corners, axis=0)[leg]
+    along = (np.cumsum(lengths) - lengths)[leg] + share * lengths[leg]
+    heading = grid.sector_of(np.arctan2(legs[:, 1], legs[:, 0]))[leg].astype(np.int64)
+    return place[:, 0], place[:, 1], along, heading

@@ -1,0 +1,132 @@
+"""The page's process: a reader's session in a thread, a web server on loopback, until a signal."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import threading
+from collections.abc import AsyncIterator, Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.types import ASGIApp
+
+from fleet_service.page import web
+from fleet_service.page.health import ServiceHealth
+from fleet_service.page.moments import Moments
+from fleet_service.page.reader import Reader
+from fleet_service.page.watchers import MOST, Watchers
+from fleet_service.page.world import HeldWorld
+from schemas.config import ZenohSettings
+from schemas.errors import InputError
+
+LOOPBACK: Final = ("127.0.0.1", "localhost", "::1")
+LEAVE_S: Final = 2
+LOOK_S: Final = 0.1
+
+
+@dataclass(frozen=True)
+class PageSettings:
+    """What a page is started with.
+
+    Attributes:
+        connection: how to reach the router.
+        host, port: where to listen; port 0 is a free one.
+        names: host names under which a proxy passes questions on; none, and not on loopback: any.
+        archive: of the service, for the past; None: there is none.
+        metrics: addresses of services' metrics, for the health view.
+        overlay: Parquet of cell, sector, mu to lay over the map.
+        base_map: address of raster tiles with {z}, {x}, {y}.
+        most: watchers at once.
+    """
+
+    connection: ZenohSettings
+    host: str = "127.0.0.1"
+    port: int = 8080
+    names: list[str] = field(default_factory=list)
+    archive: Path | None = None
+    metrics: list[str] = field(default_factory=list)
+    overlay: Path | None = None
+    base_map: str | None = None
+    most: int = MOST
+
+
+def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None]) -> None:
+    """Serve until `stop` is set; says `page: ADDRESS` when it listens.
+
+    Raises:
+        InputError: the port is taken.
+    """
+    listening = _listen(settings.host, settings.port)
+    world = HeldWorld()
+    reader = Reader(settings.connection, world)
+
+    def state() -> dict[str, Any]:
+        away = [region for region in reader.regions() if not region["served"]]
+        return {"router": reader.connected, "served": reader.served, "away": away}
+
+    watchers = Watchers(world, state, settings.most)
+    sources = web.Sources(
+        world, reader, Moments(settings.archive), ServiceHealth(settings.metrics), watchers, settings.overlay,
+        settings.base_map,
+    )  # fmt: skip
+    hosts = [*settings.names, *(LOOPBACK if settings.host in LOOPBACK or settings.names else ())]
+
+    @contextlib.asynccontextmanager
+    async def lifespan(_: Starlette) -> AsyncIterator[None]:
+        async with web.pushing(watchers):
+            yield
+
+    app = web.application(sources, hosts, lifespan)
+    listener = threading.Thread(target=reader.run, args=(stop,), name="reader", daemon=True)
+    listener.start()
+    try:
+        asyncio.run(_serve(app, listening, stop, watchers, say))
+    finally:
+        stop.set()
+        listener.join(LEAVE_S)
+
+
+async def _serve(
+    app: ASGIApp, listening: socket.socket, stop: threading.Event, watchers: Watchers, say: Callable[[str], None]
+) -> None:
+    config = uvicorn.Config(
+        app, log_level="warning", access_log=False, server_header=False, lifespan="on", ws="none",
+        timeout_graceful_shutdown=LEAVE_S, h11_max_incomplete_event_size=64 * 1024,
+    )  # fmt: skip
+    server = _Server(config)
+    serving = asyncio.create_task(server.serve(sockets=[listening]))
+    while not server.started and not serving.done():
+        await asyncio.sleep(0.01)
+    host, port = listening.getsockname()[:2]
+    say(f"page: http://{f'[{host}]' if ':' in host else host}:{port}/")
+    while not stop.is_set() and not serving.done():
+        await asyncio.sleep(LOOK_S)
+    watchers.close()
+    server.should_exit = True
+    await serving
+
+
+class _Server(uvicorn.Server):
+    """Signals are the command's, not the library's."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    found = socket.socket(family, socket.SOCK_STREAM)
+    found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        found.bind((host, port))
+    except OSError as error:
+        found.close()
+        fix = "give another with --port, or 0 for a free one"
+        raise InputError("port", f"cannot listen on {host}:{port} ({error.strerror})", fix) from error
+    return found

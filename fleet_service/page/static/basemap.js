@@ -1,0 +1,32 @@
+// The operator's own raster tiles below the cells; none unless the server was started with --base-map.
+const MOST = 300;
+
+export class BaseMap {
+  constructor(address, changed) {
+    Object.assign(this, { address, changed, pictures: new Map() });
+  }
+
+  paint(pen, view) {
+    const z = Math.max(0, Math.min(19, Math.round(view.zoom))), n = 2 ** z, px = view.scale / n, { west, east, north, south } = view.box;
+    pen.globalAlpha = .55;  // the cells' colours are what is read
+    for (let x = Math.max(0, Math.floor(west * n)); x < Math.min(n, east * n); x++)
+      for (let y = Math.max(0, Math.floor(north * n)); y < Math.min(n, south * n); y++) {
+        const picture = this.picture(z, x, y);
+        if (picture.complete && picture.naturalWidth) pen.drawImage(picture, view.left(x / n), view.top(y / n), px + .5, px + .5);
+      }
+    pen.globalAlpha = 1;
+  }
+
+  picture(z, x, y) {
+    const name = `${z}/${x}/${y}`;
+    let found = this.pictures.get(name);
+    if (!found) {
+      found = new Image();
+      found.onload = this.changed;
+      found.src = this.address.replace("{z}", z).replace("{x}", x).replace("{y}", y);
+      this.pictures.set(name, found);
+      if (this.pictures.size > MOST) this.pictures.delete(this.pictures.keys().next().value);
+    }
+    return found;
+  }
+}

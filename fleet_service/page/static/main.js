@@ -1,0 +1,332 @@
+// The page: one state, one window on the world, one panel at a time.
+import { alertsPanel, beep, begun } from "./alerts.js";
+import { BaseMap } from "./basemap.js";
+import { Cells } from "./cells.js";
+import { kindOf, setColours } from "./colours.js";
+import { byId, make } from "./elements.js";
+import { CELLS, CELL_LEVEL, cellAt, cellOf, columnOf, latitudeOf, localOfCell, longitudeOf, middleOf, rowOf, tileOfCell, TILES, worldX, worldY } from "./grid.js";
+import { healthPanel } from "./health.js";
+import { legend } from "./legend.js";
+import { Live } from "./live.js";
+import { paint, scaleBar } from "./paint.js";
+import { placePanel } from "./place.js";
+import { ask, open, routePanel } from "./route.js";
+import { fromHash, sharePanel, toHash } from "./share.js";
+import { ago, clock, loadTexts, say } from "./texts.js";
+import { Timeline } from "./timeline.js";
+import { View } from "./view.js";
+
+const TABS = ["legend", "cell", "alerts", "route", "health", "share"];
+const LOOK_MS = 120, CLOCK_MS = 500, HEALTH_MS = 3000, LIST_MS = 15000;
+
+class App {
+  constructor(settings) {
+    Object.assign(this, { settings, alerts: [], route: [], routeFound: null, routeError: "", chosen: null, comparing: false, pinned: null, tab: "legend", away: [] });
+    this.show = { bounds: true, overlay: false, borrowed: false, recent: 0, sound: false };
+    this.now = new Cells();
+    this.past = null;
+    this.view = new View(byId("map"));
+    this.view.moved = () => this.moved();
+    this.view.clicked = (px, py) => this.click(px, py);
+    this.base = settings.base_map ? new BaseMap(settings.base_map, () => this.draw()) : null;
+    this.live = new Live({ blocks: found => this.blocks(found), alerts: found => this.alerted(found), beat: state => this.beat(state), reload: () => this.reload() });
+    this.timeline = new Timeline(byId("timeline"), this);
+    this.now.changed = () => this.draw();
+    this.frame = 0;
+    this.looking = 0;
+  }
+
+  // What is shown in the large map: a moment, or now.
+  get cells() { return this.past ?? this.now; }
+  degreesOf(x, y) { return [longitudeOf(x), latitudeOf(y)]; }
+
+  async start() {
+    this.controls();
+    this.resize();
+    new ResizeObserver(() => this.resize()).observe(byId("map"));
+    addEventListener("hashchange", () => this.restore(fromHash(location.hash)));
+    document.addEventListener("dragover", e => e.preventDefault());
+    document.addEventListener("drop", e => { e.preventDefault(); const file = e.dataTransfer.files[0]; if (file) { this.open("route"); open(this, file); } });
+    byId("map").addEventListener("keydown", e => { if (e.key === "a" && this.alerts.length) this.jump(this.alerts[0]); });
+    setInterval(() => this.tick(), CLOCK_MS);
+    setInterval(() => this.tab === "health" && this.panel(), HEALTH_MS);
+    setInterval(() => { this.now.list(); this.timeline.load(); this.tab === "alerts" && this.panel(); }, LIST_MS);
+    await Promise.all([this.now.list(), this.timeline.load(), this.settings.overlay ? this.loadTruth() : null]);
+    const state = fromHash(location.hash);
+    if (state.x) await this.restore(state); else this.all();
+    this.open(this.tab);
+    this.tick();
+    await this.look();
+    document.body.dataset.ready = "1";
+  }
+
+  async restore(state) {
+    const number = (name, other) => Number.isFinite(Number(state[name])) && state[name] !== undefined ? Number(state[name]) : other;
+    for (const name of ["overlay", "borrowed", "sound"]) this.show[name] = state[name] === "1";
+    this.show.bounds = state.passed !== "0";
+    this.show.recent = number("recent", 0);
+    this.now.borrowed = this.show.borrowed;
+    this.tab = TABS.includes(state.tab) ? state.tab : this.tab;
+    this.view.go(number("x", .5), number("y", .35), number("zoom", 3));
+    this.route = (state.route ?? "").split("|").map(point => point.split(",").map(Number)).filter(point => point.length === 2 && point.every(Number.isFinite));
+    if (this.route.length > 1) this.setRoute(this.route);
+    if (state.at !== undefined) { this.timeline.put(number("at", null)); await this.goToMoment(this.timeline.at); }
+    if (state.compare !== undefined) await this.compare(true, state.compare === "now" ? this.now : new Cells(number("compare", 0)));
+    await this.look();
+    if (state.cell !== undefined) this.choose(tileOfCell(number("cell", 0)), localOfCell(number("cell", 0)));
+    this.open(this.tab);
+  }
+
+  controls() {
+    const button = (key, sign, act) => make("button", { type: "button", "aria-label": say(key), title: say(key), onclick: act }, sign);
+    byId("controls").append(button("zoom.in", "+", () => this.view.turn(2)), button("zoom.out", "−", () => this.view.turn(.5)), button("zoom.all", say("zoom.all.sign"), () => this.all()));
+    byId("map").setAttribute("aria-label", say("map.label"));
+    byId("tabs").append(...TABS.map(name => make("button", { type: "button", role: "tab", id: `tab-${name}`, "aria-controls": "panel", "aria-selected": "false", onclick: () => this.open(name) }, say(`tab.${name}`))));
+    byId("panel").setAttribute("role", "tabpanel");
+    byId("tabs").addEventListener("keydown", e => {
+      const step = { ArrowRight: 1, ArrowLeft: -1 }[e.key];
+      if (!step) return;
+      this.open(TABS[(TABS.indexOf(this.tab) + step + TABS.length) % TABS.length]);
+      byId(`tab-${this.tab}`).focus();
+    });
+  }
+
+  all() {
+    const tiles = [...this.cells.known];
+    if (!tiles.length) return;
+    const xs = tiles.map(columnOf), ys = tiles.map(rowOf), least = v => v.reduce((a, b) => Math.min(a, b)), most = v => v.reduce((a, b) => Math.max(a, b));
+    this.view.fit({ west: least(xs) / TILES, east: (most(xs) + 1) / TILES, north: least(ys) / TILES, south: (most(ys) + 1) / TILES });
+  }
+
+  resize() {
+    const ratio = devicePixelRatio || 1;
+    byId("view").classList.toggle("two", this.comparing);
+    byId("beside").hidden = !this.comparing;
+    for (const canvas of [byId("map"), byId("beside")]) {
+      canvas.width = Math.round(canvas.clientWidth * ratio);
+      canvas.height = Math.round(canvas.clientHeight * ratio);
+      canvas.getContext("2d").setTransform(ratio, 0, 0, ratio, 0, 0);
+    }
+    this.view.width = byId("map").clientWidth;
+    this.view.height = byId("map").clientHeight;
+    this.moved();
+  }
+
+  moved() {
+    this.draw();
+    clearTimeout(this.looking);
+    this.looking = setTimeout(() => this.look(), LOOK_MS);
+  }
+
+  async look() {
+    if (this.live.look(this.view)) this.draw();
+    const level = this.view.level, box = this.view.box, stores = this.comparing ? [this.cells, this.pinned] : [this.cells];
+    try { await Promise.all(stores.map(store => store.show(box, level))); } catch { this.note(say("error.asked")); }
+    this.remember();
+    this.draw();
+  }
+
+  async reload() {
+    await this.now.list();
+    if (!this.view.gone && !this.past) this.all();
+    this.now.generation++;
+    this.now.wanted.clear();
+    const box = this.view.box;
+    await this.now.fetch([...this.now.tiles.keys()], this.view.level).catch(() => this.note(say("error.asked")));
+    await this.now.show(box, this.view.level).catch(() => {});
+    this.draw();
+  }
+
+  blocks(found) {
+    if (this.show.borrowed) { this.now.fetch(found.map(block => block.tile), this.view.level); return; }
+    const missing = found.filter(block => block.level === this.view.level && !this.now.take(block)).map(block => block.tile);
+    if (missing.length) this.now.fetch(missing, this.view.level).catch(() => {});
+    if (!this.view.gone) this.all();
+    this.refreshPlace();
+    this.draw();
+    document.body.dataset.pushed = Number(document.body.dataset.pushed || 0) + found.length;
+  }
+
+  refreshPlace() {
+    if (this.past || !this.chosen) return;
+    const before = JSON.stringify(this.chosen.records);
+    this.chosen.records = this.cells.at_place(this.chosen.tile, this.chosen.local);
+    if (this.tab === "cell" && before !== JSON.stringify(this.chosen.records)) this.panel();
+  }
+
+  alerted(found) {
+    const fresh = this.heardAlerts ? begun(this.alerts, found) : [];
+    this.heardAlerts = true;
+    this.alerts = found;
+    for (const alert of fresh) {
+      this.note(say("alerts.new", { length: Math.round(alert.length_m), direction: alert.direction }));
+      if (this.show.sound) beep();
+    }
+    byId("tab-alerts").textContent = found.length ? `${say("tab.alerts")} (${found.length})` : say("tab.alerts");
+    document.body.dataset.alerts = found.length;
+    if (this.tab === "alerts") this.panel();
+    this.draw();
+  }
+
+  beat(state) {
+    this.away = state.away;
+    const words = byId("away"), since = Math.min(...state.away.map(one => one.since));
+    words.hidden = !state.away.length;
+    if (state.away.length) words.textContent = say("away", { count: state.away.length, ago: ago(state.now - since) });
+    this.tick();
+    this.draw();
+  }
+
+  tick() {
+    const words = this.live.words(this.past?.at ?? null), place = byId("live");
+    if (place.textContent !== words) place.textContent = words;
+    place.dataset.state = words === say("live") ? "live" : "late";
+  }
+
+  note(words) { byId("said").textContent = words; }
+
+  draw() {
+    if (this.frame) return;
+    this.frame = requestAnimationFrame(() => { this.frame = 0; this.drawNow(); });
+  }
+
+  drawNow() {
+    const extra = {
+      base: this.base, away: this.past ? [] : this.away, alerts: this.past ? [] : this.alerts, route: this.route, bounds: this.show.bounds,
+      oldest: this.show.recent ? (this.cells.at ?? this.live.now()) - this.show.recent : 0, truth: this.show.overlay ? this.truth : null, chosen: this.chosen,
+    };
+    const drawn = paint(byId("map").getContext("2d"), this.view, this.cells, extra);
+    if (this.comparing) this.drawBeside(extra);
+    scaleBar(byId("scale"), this.view, say);
+    Object.assign(document.body.dataset, { drawn: drawn.reduce((a, b) => a + b), kinds: drawn.join(","), level: this.view.level });
+  }
+
+  drawBeside(extra) {
+    const now = this.pinned.at === null;
+    paint(byId("beside").getContext("2d"), this.view, this.pinned, { ...extra, away: now ? this.away : [], alerts: now ? this.alerts : [] });
+    for (const [id, at] of [["moment-left", this.cells.at], ["moment-right", this.pinned.at]]) byId(id).textContent = at === null ? say("time.now") : clock(at);
+  }
+
+  click(px, py) {
+    const at = this.view.place(px, py);
+    if (this.tab === "route") { this.setRoute([...this.route, this.degreesOf(at.x, at.y)]); return; }
+    const { tile, local } = cellAt(at.x, at.y);
+    this.choose(tile, local);
+    this.open("cell");
+  }
+
+  choose(tile, local) {
+    const level = this.cells.tiles.get(tile)?.block.level ?? CELL_LEVEL, side = 2 ** (CELL_LEVEL - level) / CELLS;
+    const { x, y } = middleOf(cellOf(tile, local));
+    this.chosen = { tile, local, x, y, side, records: this.cells.at_place(tile, local) };
+    this.chosen.x = Math.floor(x / side) * side;
+    this.chosen.y = Math.floor(y / side) * side;
+    Object.assign(this.chosen, { middleX: x, middleY: y });
+    this.remember();
+    this.draw();
+    if (this.tab === "cell") this.panel();
+  }
+
+  open(name) {
+    this.tab = name;
+    for (const one of TABS) { byId(`tab-${one}`).setAttribute("aria-selected", String(one === name)); byId(`tab-${one}`).tabIndex = one === name ? 0 : -1; }
+    byId("panel").setAttribute("aria-labelledby", `tab-${name}`);
+    this.remember();
+    this.panel();
+  }
+
+  async panel() {
+    const name = this.tab, made = await ({
+      legend: () => legend(this), cell: () => placePanel(this, this.chosen), alerts: () => alertsPanel(this), route: () => routePanel(this),
+      health: () => healthPanel(this), share: () => sharePanel(this),
+    })[name]();
+    if (name === this.tab) byId("panel").replaceChildren(...made);
+  }
+
+  set(name, value) {
+    this.show[name] = value;
+    if (name === "borrowed") { this.now.borrowed = value; this.reload(); this.panel(); }
+    if (name === "sound" && value) beep();
+    this.remember();
+    this.draw();
+  }
+
+  jump(alert) {
+    this.goTo(alert.longitude, alert.latitude);
+    byId("map").focus();
+  }
+
+  goTo(longitude, latitude) { this.view.go(worldX(longitude), worldY(latitude), Math.max(this.view.zoom, 17.5)); }
+
+  fitTo(points) {
+    const xs = points.map(point => worldX(point[0])), ys = points.map(point => worldY(point[1]));
+    this.view.fit({ west: Math.min(...xs), east: Math.max(...xs), north: Math.min(...ys), south: Math.max(...ys) });
+  }
+
+  async setRoute(points, error = "") {
+    Object.assign(this, { route: points, routeFound: null, routeError: error });
+    this.remember();
+    this.draw();
+    if (points.length > 1) {
+      const { found, error: refused } = await ask(points);
+      if (this.route === points) Object.assign(this, { routeFound: found, routeError: refused });
+    }
+    if (this.tab === "route") this.panel();
+  }
+
+  async goToMoment(at) {
+    const before = this.past;
+    const past = at === null ? null : new Cells(at);
+    if (past) {
+      past.changed = () => this.draw();
+      await past.list();
+      await past.show(this.view.box, this.view.level);
+    }
+    if (this.past !== before) return;  // another was chosen meanwhile
+    this.past = past;
+    if (this.chosen) this.choose(this.chosen.tile, this.chosen.local);
+    this.tick();
+    this.remember();
+    this.drawNow();
+    document.body.dataset.at = at ?? "now";
+  }
+
+  // The moment that is shown now stays on the right, and the slider moves what is on the left.
+  async compare(on, pinned = this.cells) {
+    Object.assign(this, { comparing: on, pinned: on ? pinned : null });
+    pinned.changed = () => this.draw();
+    for (const id of ["moment-left", "moment-right"]) byId(id).hidden = !on;
+    if (on && pinned.at !== null) await pinned.list();
+    this.resize();
+    this.timeline.say();
+    this.look();
+  }
+
+  async loadTruth() {
+    const told = await (await fetch("/overlay")).json();
+    if (!told) { setTimeout(() => this.loadTruth(), LIST_MS); return; }
+    const steps = this.settings.mu_steps;
+    this.truth = told.cell.map((cell, k) => {
+      const { x, y } = middleOf(Number(cell)), mu = Math.round(told.mu[k] * steps);
+      return { x: x - .5 / CELLS, y: y - .5 / CELLS, sector: told.sector[k], kind: kindOf(1, mu, mu, mu) };
+    });
+    this.draw();
+  }
+
+  remember() {
+    const { view, show, chosen } = this, state = {
+      x: view.x.toFixed(8), y: view.y.toFixed(8), zoom: view.zoom.toFixed(2), at: this.past?.at, compare: this.comparing ? this.pinned.at ?? "now" : null, tab: this.tab,
+      cell: chosen ? cellOf(chosen.tile, chosen.local) : null, passed: show.bounds ? null : "0", overlay: show.overlay, borrowed: show.borrowed,
+      recent: show.recent || null, sound: show.sound, route: this.route.map(point => point.map(v => v.toFixed(6)).join(",")).join("|"),
+    };
+    if (this.view.gone) history.replaceState(null, "", toHash(state));
+  }
+}
+
+await loadTexts();
+document.title = say("title");
+const settings = await (await fetch("/settings")).json();
+setColours(settings);
+const app = new App(settings);
+globalThis.gripmap = app;  // for a person at the console
+await app.start();

@@ -1,0 +1,71 @@
+// One place: what is believed of each heading, how surely, since when, and how fast one may drive by it.
+import { BORROWED, MEASURED, NO_NUMBER } from "./blocks.js";
+import { density, history } from "./charts.js";
+import { make } from "./elements.js";
+import { cellOf } from "./grid.js";
+import { ago, clock, say } from "./texts.js";
+
+const BASES = { [MEASURED]: "measured", [BORROWED]: "borrowed" };
+
+export function safeSpeed(lower, sight, reaction) {
+  const grip = 9.81 * lower;
+  return grip > 0 ? grip * (Math.sqrt(reaction ** 2 + 2 * sight / grip) - reaction) : 0;
+}
+
+// A record in numbers; `mu` is null where nothing was measured.
+export function numbers(record, settings) {
+  const { mu_steps: steps, share_steps: shares } = settings;
+  const basis = BASES[record.basis] ?? "bound";
+  return {
+    ...record, basis, mu: basis === "bound" || record.mu === NO_NUMBER ? null : record.mu / steps, lower: record.lower / steps, upper: record.upper / steps,
+    slippery: Math.min(1, record.slippery / shares), unknown: record.unknown / shares,
+  };
+}
+
+const two = value => value.toFixed(2);
+// Never a higher grip than the number, never a lower risk.
+const down = value => (Math.floor(value * 100 + 1e-6) / 100).toFixed(2);
+const percent = value => value > .995 ? "over 99" : value < .005 ? "under 1" : String(Math.ceil(value * 100 - 1e-6));
+
+export function placePanel(app, chosen) {
+  if (!chosen) return [make("p", {}, say("cell.none"))];
+  if (!chosen.records.length) return [make("h2", {}, say("tab.cell")), make("p", { class: "nobody" }, say("cell.nobody"))];
+  return chosen.records.map(record => one(app, chosen, numbers(record, app.settings)));
+}
+
+function one(app, chosen, cell) {
+  const now = app.cells.at ?? app.live.now(), whole = cell.level === 21, limit = app.settings.colours.slippery;
+  const list = make("dl", {}), line = (name, value, id) => list.append(make("dt", {}, name), make("dd", { "data-value": id }, value));
+  line(say("cell.grip"), cell.mu === null ? say("cell.grip.bound", { lower: down(cell.lower) }) : say("cell.grip.value", { mu: two(cell.mu), lower: down(cell.lower), upper: two(cell.upper) }), "grip");
+  if (cell.mu !== null) line(say("cell.slippery"), say("cell.slippery.value", { percent: percent(cell.slippery), limit }), "slippery");
+  line(say("cell.basis"), say(`basis.${cell.basis}`), "basis");
+  const speeds = cell.basis === "measured" ? app.settings.sights_m.map(sight => say("cell.speed.value", { speed: Math.floor(3.6 * safeSpeed(cell.lower, sight, app.settings.reaction_s)), sight })) : [say("cell.speed.unknown")];
+  line(say("cell.speed"), speeds.join("; "), "speed");
+  line(say("cell.vehicles"), cell.vehicles === 255 ? "255+" : String(cell.vehicles), "vehicles");
+  line(say("cell.age"), say("cell.age.value", { ago: ago(now - cell.last), time: clock(cell.last) }), "age");
+  for (const alert of alertsAt(app, chosen)) line(say("cell.alert"), say("cell.alert.value", { count: alert.vehicles, reason: alert.reason }), "alert");
+  const past = make("div", { class: "history" });
+  const section = make("section", { class: "heading", "data-sector": cell.sector },
+    make("h2", {}, whole ? say("cell.heading", { heading: say(`heading.${cell.sector}`) }) : say("share.zoomed_out")), list,
+    cell.basis === "measured" ? make("p", { class: "note" }, say("cell.speed.note", { reaction: app.settings.reaction_s })) : null,
+    make("figure", {}, density(cell, limit), make("figcaption", {}, say(cell.mu === null ? "cell.density.bound" : "cell.density"))), past);
+  if (whole) fillIn(app, chosen, cell, list, past);
+  return section;
+}
+
+const alertsAt = (app, { x, y }) => app.cells.at !== null ? [] : app.alerts.filter(alert => {
+  const [west, south, east, north] = alert.bbox, at = app.degreesOf(x, y);
+  return west <= at[0] && at[0] <= east && south <= at[1] && at[1] <= north;
+});
+
+// What only the service and the archive know: exact counts, and how it was before.
+async function fillIn(app, chosen, cell, list, past) {
+  const name = `${cellOf(chosen.tile, chosen.local)}/${cell.sector}`;
+  if (app.cells.at === null) {
+    const answer = await fetch(`/cell/${name}`), told = answer.ok ? await answer.json() : null;
+    if (told) list.append(make("dt", {}, say("cell.observations")), make("dd", { "data-value": "observations" }, String(told.observations)));
+  }
+  const answer = await fetch(`/history/${name}`), rows = answer.ok ? await answer.json() : [];
+  past.append(make("h3", {}, say("cell.history")));
+  past.append(...(rows.length ? [history(rows, app.settings.colours.slippery), make("p", { class: "note" }, say("cell.history.label"))] : [make("p", {}, say("cell.history.none"))]));
+}

@@ -1,0 +1,42 @@
+// A route: clicked or from a GPX file; the grip along it, what is unknown of it, and how fast its worst place bears.
+import { profile } from "./charts.js";
+import { make } from "./elements.js";
+import { say } from "./texts.js";
+
+const MOST_POINTS = 400, MOST_BYTES = 20e6;
+
+export function routePanel(app) {
+  const file = make("input", { type: "file", accept: ".gpx", id: "gpx", onchange: e => e.target.files[0] && open(app, e.target.files[0]) });
+  const head = [
+    make("h2", {}, say("route.head")), make("p", {}, say("route.how")),
+    make("label", { class: "line", for: "gpx" }, say("route.file"), file),
+    make("button", { type: "button", id: "route-clear", disabled: !app.route.length, onclick: () => app.setRoute([]) }, say("route.clear")),
+  ];
+  if (app.routeError) head.push(make("p", { class: "error", role: "alert" }, app.routeError));
+  const found = app.routeFound;
+  if (!found) return head;
+  const share = value => Math.round(100 * value), worst = found.stretches[found.worst] ?? null, sight = app.settings.sights_m[0];
+  return [...head,
+    make("p", { id: "route-share" }, say("route.length", { length: (found.length_m / 1000).toFixed(2), measured: share(found.share.measured), unknown: 100 - share(found.share.measured) })),
+    make("p", { id: "route-worst" }, worst === null ? say("route.worst.none") : say("route.worst", { mu: worst.mu_lower.toFixed(2), where: (worst.from_m / 1000).toFixed(2), speed: Math.floor(3.6 * worst.safe_speed[sight]), sight })),
+    profile(found, app.settings.colours.slippery, one => app.goTo(one.longitude, one.latitude)), make("p", { class: "note" }, say("route.label"))];
+}
+
+export async function open(app, file) {
+  const points = file.size <= MOST_BYTES ? pointsOf(await file.text()) : [];
+  app.setRoute(points, points.length < 2 ? say("route.bad_file") : "");
+  if (points.length > 1) app.fitTo(points);
+}
+
+export function pointsOf(text) {
+  const found = new DOMParser().parseFromString(text, "application/xml");
+  const all = [...found.querySelectorAll("trkpt, rtept")].map(point => [Number(point.getAttribute("lon")), Number(point.getAttribute("lat"))]).filter(point => point.every(Number.isFinite));
+  const step = Math.max(1, Math.ceil(all.length / MOST_POINTS));
+  return all.filter((_, k) => k % step === 0 || k === all.length - 1);
+}
+
+export async function ask(points) {
+  const words = points.map(([longitude, latitude]) => `${longitude.toFixed(7)},${latitude.toFixed(7)}`).join("|");
+  const answer = await fetch(`/route?${new URLSearchParams({ points: words })}`);
+  return answer.ok ? { found: await answer.json(), error: "" } : { found: null, error: await answer.text() };
+}

@@ -1,0 +1,68 @@
+// The whole state as a link, and what is seen as a file.
+import { numbers } from "./place.js";
+import { byId, make } from "./elements.js";
+import { latitudeOf, longitudeOf } from "./grid.js";
+import { say } from "./texts.js";
+
+export function toHash(state) {
+  const words = new URLSearchParams();
+  for (const [name, value] of Object.entries(state)) if (value !== null && value !== undefined && value !== "" && value !== false) words.set(name, value === true ? "1" : String(value));
+  return `#${words}`;
+}
+
+export const fromHash = text => Object.fromEntries(new URLSearchParams(text.replace(/^#/, "")));
+
+export function sharePanel(app) {
+  const link = make("input", { type: "text", readonly: "", id: "link", value: location.href, "aria-label": say("share.link") });
+  const copy = make("button", { type: "button", onclick: async e => {
+    link.select();
+    await navigator.clipboard?.writeText(link.value);
+    e.target.textContent = say("share.copied");
+  } }, say("share.copy"));
+  const save = (id, name, kind, write) => make("button", { type: "button", id, onclick: () => download(name, kind, write(seen(app))) }, say(`share.${id}`));
+  return [make("h2", {}, say("share.head")), make("label", { class: "line", for: "link" }, say("share.link")), link, copy,
+    make("p", {}, save("geojson", "gripmap.geojson", "application/geo+json", geojson), " ", save("csv", "gripmap.csv", "text/csv", csv), " ",
+      make("button", { type: "button", onclick: () => print() }, say("share.print"))), make("p", { class: "note" }, say("share.zoomed_out"))];
+}
+
+// The places in view as rows; what is a mere bound has no mu.
+function seen(app) {
+  const box = app.view.box, rows = [];
+  for (const tile of app.cells.tiles.values()) {
+    const { rows: records, x, y, side } = tile.parts;
+    for (let k = 0; k < records.count; k++) {
+      if (x[k] > box.east || x[k] + side < box.west || y[k] > box.south || y[k] + side < box.north) continue;
+      const raw = Object.fromEntries(["last", "mu", "lower", "upper", "slippery", "basis", "vehicles", "unknown"].map(name => [name, records[name][k]]));
+      const cell = numbers(raw, app.settings), level = tile.block.level;
+      rows.push({
+        west: longitudeOf(x[k]), south: latitudeOf(y[k] + side), east: longitudeOf(x[k] + side), north: latitudeOf(y[k]), zoom: level,
+        heading: level === 21 ? ["east", "north", "west", "south"][records.place[k] & 3] : "all", basis: cell.basis, mu: cell.mu, mu_lower: cell.lower, mu_upper: cell.upper,
+        p_slippery: cell.slippery, unknown_share: cell.unknown, vehicles: cell.vehicles, last_time: new Date(cell.last * 1000).toISOString(),
+      });
+    }
+  }
+  return rows;
+}
+
+const short = value => typeof value === "number" ? Number(value.toFixed(7)) : value;
+
+function geojson(rows) {
+  return JSON.stringify({ type: "FeatureCollection", features: rows.map(({ west, south, east, north, ...rest }) => ({
+    type: "Feature", geometry: { type: "Polygon", coordinates: [[[west, south], [east, south], [east, north], [west, north], [west, south]].map(point => point.map(short))] },
+    properties: Object.fromEntries(Object.entries(rest).map(([name, value]) => [name, short(value)])),
+  })) });
+}
+
+function csv(rows) {
+  if (!rows.length) return "";
+  return [Object.keys(rows[0]).join(","), ...rows.map(row => Object.values(row).map(value => value === null ? "" : short(value)).join(","))].join("\r\n") + "\r\n";
+}
+
+function download(name, kind, text) {
+  const address = URL.createObjectURL(new Blob([text], { type: kind }));
+  const link = make("a", { href: address, download: name });
+  byId("panel").append(link);
+  link.click();
+  link.remove();
+  setTimeout(() => URL.revokeObjectURL(address), 10000);
+}

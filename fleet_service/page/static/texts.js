@@ -1,0 +1,26 @@
+// Every word that a person reads: one table a language, texts.en.json.
+let table = {};
+
+export async function loadTexts(language = "en") {
+  table = await (await fetch(`/static/texts.${language}.json`)).json();
+}
+
+// "{count} {count|region|regions}": a value, and a word that goes with one or with several.
+export function say(key, values = {}) {
+  const text = table[key] ?? key;
+  return text.replace(/\{(\w+)(?:\|([^|}]*)\|([^}]*))?\}/g, (_, name, one, many) =>
+    one === undefined ? String(values[name] ?? "") : values[name] === 1 ? one : many);
+}
+
+export function ago(seconds) {
+  const s = Math.max(0, seconds);
+  if (s < 100) return say("ago.seconds", { n: Math.round(s) });
+  if (s < 5400) return say("ago.minutes", { n: Math.round(s / 60) });
+  if (s < 129600) return say("ago.hours", { n: Math.round(s / 3600) });
+  return say("ago.days", { n: Math.round(s / 86400) });
+}
+
+export function clock(seconds) {
+  const at = new Date(seconds * 1000), two = n => String(n).padStart(2, "0");
+  return `${at.getFullYear()}-${two(at.getMonth() + 1)}-${two(at.getDate())} ${two(at.getHours())}:${two(at.getMinutes())}:${two(at.getSeconds())}`;
+}

@@ -1,0 +1,73 @@
+// The kept moments as a slider: its last place is now. The moment that is shown is always said.
+import { make } from "./elements.js";
+import { clock, say } from "./texts.js";
+
+const PLAY_MS = 700;
+
+export class Timeline {
+  constructor(footer, app) {
+    this.app = app;
+    this.moments = [];
+    this.timer = null;
+    this.slider = make("input", { type: "range", id: "slider", min: "0", max: "0", value: "0", "aria-label": say("time.label"), oninput: () => this.chosen() });
+    this.shown = make("output", { id: "moment", for: "slider" });
+    this.play = make("button", { type: "button", id: "play", onclick: () => this.timer ? this.stop() : this.start() }, say("time.play"));
+    this.compare = make("button", { type: "button", id: "compare", "aria-pressed": "false", onclick: () => app.compare(!app.comparing) }, say("time.compare"));
+    this.none = make("span", { class: "note" }, say("time.none"));
+    footer.append(this.play, this.slider, this.shown, this.compare, this.none);
+  }
+
+  async load() {
+    const answer = await fetch("/moments");
+    if (!answer.ok) return;
+    const at = this.at;
+    this.moments = await answer.json();
+    this.slider.max = this.moments.length;
+    this.put(at);
+  }
+
+  get at() {
+    return this.moments[Number(this.slider.value)] ?? null;
+  }
+
+  // Show a moment, or the last kept before it; null: now.
+  put(at) {
+    const found = at === null ? -1 : this.moments.findLastIndex(moment => moment <= at);
+    this.slider.value = found < 0 ? this.moments.length : found;
+    this.say();
+  }
+
+  say() {
+    const words = this.at === null ? say("time.now") : say("time.shown", { moment: clock(this.at) });
+    this.shown.textContent = words;
+    this.slider.setAttribute("aria-valuetext", words);
+    const any = this.moments.length > 0;
+    this.none.hidden = any;
+    for (const one of [this.play, this.slider, this.compare]) one.disabled = !any;
+    this.compare.textContent = say(this.app.comparing ? "time.compare.stop" : "time.compare");
+    this.compare.setAttribute("aria-pressed", String(this.app.comparing));
+  }
+
+  chosen() {
+    this.say();
+    return this.app.goToMoment(this.at);
+  }
+
+  start() {
+    if (this.at === null) this.slider.value = 0;
+    this.play.textContent = say("time.stop");
+    const step = async () => {
+      await this.chosen();
+      if (this.at === null) { this.stop(); return; }
+      this.timer = setTimeout(() => { this.slider.value = Number(this.slider.value) + 1; step(); }, PLAY_MS);
+    };
+    this.timer = -1;
+    step();
+  }
+
+  stop() {
+    clearTimeout(this.timer);
+    this.timer = null;
+    this.play.textContent = say("time.play");
+  }
+}

@@ -1,0 +1,89 @@
+// The window on the world: where it is, how large, and how mouse, fingers and keys move it.
+import { CELL_LEVEL, TILE_LEVEL, latitudeOf, longitudeOf } from "./grid.js";
+
+const LEAST_ZOOM = 2, MOST_ZOOM = 21, TILE_PX = 256, TURN = 1.25, STEP_PX = 60;
+
+export class View {
+  constructor(canvas) {
+    Object.assign(this, { canvas, x: .5, y: .35, zoom: 3, gone: false, width: 1, height: 1, moved: () => {}, clicked: () => {} });
+    this.fingers = new Map();
+    this.listen();
+  }
+
+  get scale() { return TILE_PX * 2 ** this.zoom; }
+  get box() {
+    const w = this.width / 2 / this.scale, h = this.height / 2 / this.scale;
+    return { west: this.x - w, east: this.x + w, north: this.y - h, south: this.y + h };
+  }
+  // Squares of four pixels or more; the finest level where those are cells.
+  get level() { return Math.max(TILE_LEVEL, Math.min(CELL_LEVEL, this.zoom >= 14.7 ? CELL_LEVEL : Math.floor(this.zoom) + 6)); }
+  degrees(pad = 0) {
+    const b = this.box, w = (b.east - b.west) * pad, h = (b.south - b.north) * pad, bound = v => Math.min(1, Math.max(0, v));
+    return [longitudeOf(bound(b.west - w)), latitudeOf(bound(b.south + h)), longitudeOf(bound(b.east + w)), latitudeOf(bound(b.north - h))];
+  }
+  left(x) { return (x - this.x) * this.scale + this.width / 2; }
+  top(y) { return (y - this.y) * this.scale + this.height / 2; }
+  place(px, py) { return { x: this.x + (px - this.width / 2) / this.scale, y: this.y + (py - this.height / 2) / this.scale }; }
+
+  go(x, y, zoom = this.zoom) {
+    this.gone = true;  // somebody chose where to look
+    this.zoom = Math.min(MOST_ZOOM, Math.max(LEAST_ZOOM, zoom));
+    this.x = Math.min(1, Math.max(0, x));
+    this.y = Math.min(1, Math.max(0, y));
+    this.moved();
+  }
+
+  fit({ west, east, north, south }) {
+    const zoom = Math.log2(.85 * Math.min(this.width / Math.max(east - west, 1e-6), this.height / Math.max(south - north, 1e-6)) / TILE_PX);
+    this.go((west + east) / 2, (north + south) / 2, Math.min(zoom, 18));
+  }
+
+  turn(by, px = this.width / 2, py = this.height / 2) {
+    const held = this.place(px, py);
+    this.zoom = Math.min(MOST_ZOOM, Math.max(LEAST_ZOOM, this.zoom + Math.log2(by)));
+    const now = this.place(px, py);
+    this.go(this.x + held.x - now.x, this.y + held.y - now.y);
+  }
+
+  shift(dx, dy) { this.go(this.x - dx / this.scale, this.y - dy / this.scale); }
+
+  listen() {
+    const { canvas, fingers } = this;
+    let travelled = 0;
+    canvas.addEventListener("pointerdown", e => {
+      if (!fingers.size) travelled = 0;
+      fingers.set(e.pointerId, [e.offsetX, e.offsetY]);
+      canvas.setPointerCapture(e.pointerId);
+    });
+    canvas.addEventListener("pointerup", e => {
+      const alone = fingers.size === 1;
+      fingers.delete(e.pointerId);
+      if (alone && travelled < 6) this.clicked(e.offsetX, e.offsetY);
+    });
+    canvas.addEventListener("pointercancel", e => fingers.delete(e.pointerId));
+    canvas.addEventListener("pointermove", e => {
+      const before = fingers.get(e.pointerId), now = [e.offsetX, e.offsetY];
+      if (!before) return;
+      const other = [...fingers].find(([id]) => id !== e.pointerId)?.[1];
+      travelled += Math.hypot(now[0] - before[0], now[1] - before[1]);
+      fingers.set(e.pointerId, now);
+      if (other) {
+        const apart = point => Math.hypot(point[0] - other[0], point[1] - other[1]) || 1;
+        this.turn(apart(now) / apart(before), (now[0] + other[0]) / 2, (now[1] + other[1]) / 2);
+      } else this.shift(now[0] - before[0], now[1] - before[1]);
+    });
+    canvas.addEventListener("wheel", e => {
+      e.preventDefault();
+      this.turn(TURN ** (-e.deltaY / 100), e.offsetX, e.offsetY);
+    }, { passive: false });
+    canvas.addEventListener("keydown", e => {
+      const moves = { ArrowLeft: [STEP_PX, 0], ArrowRight: [-STEP_PX, 0], ArrowUp: [0, STEP_PX], ArrowDown: [0, -STEP_PX] };
+      if (moves[e.key]) this.shift(...moves[e.key]);
+      else if (e.key === "+" || e.key === "=") this.turn(2 ** .5);
+      else if (e.key === "-") this.turn(2 ** -.5);
+      else if (e.key === "Enter") this.clicked(this.width / 2, this.height / 2);
+      else return;
+      e.preventDefault();
+    });
+  }
+}

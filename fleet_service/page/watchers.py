@@ -1,0 +1,142 @@
+"""Server-sent events to browsers: each has its part of the world and a short queue; who is slow is told to reload.
+
+tiles    blocks in base64, one a line: what changed of the cells, or all of a tile where the map is zoomed out
+alerts   all stretches that stand
+beat     the time, what is served, what stands: each two seconds
+reload   this watcher missed something: ask anew
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import json
+import time
+from collections.abc import AsyncIterator, Callable
+from typing import Any, Final, NamedTuple
+
+from fleet_service.page.records import CELL_LEVEL, TileBlock
+from fleet_service.page.world import HeldWorld, box_of
+from schemas import grid
+
+FLUSH_S: Final = 0.1  # changes of so long are one event
+BEAT_S: Final = 2.0
+WAITING: Final = 64  # events in a watcher's queue: six seconds of a busy map
+MOST: Final = 400  # watchers
+Box = tuple[float, float, float, float]
+_RELOAD: Final = b"event: reload\ndata: {}\n\n"
+
+
+class TooManyWatchersError(Exception):
+    """As many watch as may."""
+
+
+class View(NamedTuple):
+    """What a watcher looks at: west, south, east, north [deg], and the level of its places."""
+
+    box: Box
+    level: int
+
+
+class _OpenPage(NamedTuple):
+    view: View
+    queue: asyncio.Queue[bytes | None]
+
+
+class Watchers:
+    """All browsers that watch; lives in one event loop.
+
+    Args:
+        world: what they watch.
+        state: of services and health, as a beat tells it.
+        most: how many may watch.
+    """
+
+    def __init__(self, world: HeldWorld, state: Callable[[], dict[str, Any]], most: int = MOST) -> None:
+        self._world, self._state, self._most = world, state, most
+        self._watchers: set[_OpenPage] = set()
+        self.reloads = 0
+
+    def __len__(self) -> int:
+        return len(self._watchers)
+
+    def enter(self, view: View) -> AsyncIterator[bytes]:
+        """Events for a view, from now on, until the watcher goes.
+
+        Raises:
+            TooManyWatchersError: it has to come again later.
+        """
+        if len(self._watchers) >= self._most:
+            raise TooManyWatchersError
+        watcher = _OpenPage(view, asyncio.Queue(WAITING))
+        self._watchers.add(watcher)
+        watcher.queue.put_nowait(_event("alerts", self._world.standing()))
+        watcher.queue.put_nowait(_event("beat", self._beat()))
+        return self._events(watcher)
+
+    async def _events(self, watcher: _OpenPage) -> AsyncIterator[bytes]:
+        try:
+            while (event := await watcher.queue.get()) is not None:
+                yield event
+        finally:
+            self._watchers.discard(watcher)
+
+    async def run(self) -> None:
+        """Push what changes, until cancelled."""
+        beaten = 0.0
+        while True:
+            await asyncio.sleep(FLUSH_S)
+            if changes := self._world.changes():
+                self.push(changes)
+            if self._world.alerts_changed():
+                self._tell(_event("alerts", self._world.standing()))
+            if time.monotonic() - beaten >= BEAT_S:
+                beaten = time.monotonic()
+                self._tell(_event("beat", self._beat()))
+
+    def close(self) -> None:
+        """Let all go."""
+        for watcher in list(self._watchers):
+            self._put(watcher, None)
+
+    def _beat(self) -> dict[str, Any]:
+        return {"now": time.time(), "heard": self._world.heard, **self._state()}
+
+    def push(self, changes: list[TileBlock]) -> None:
+        """Tell what changed to those who look at it."""
+        lines: dict[tuple[int, int], bytes] = {}  # of (tile, level): made once for all who watch it
+        for watcher in list(self._watchers):
+            found = []
+            for block in changes:
+                if grid.touches(watcher.view.box, _area(block.tile)):
+                    place = (block.tile, watcher.view.level)
+                    if place not in lines:
+                        lines[place] = b"data: " + base64.b64encode(self._made(block, place[1])) + b"\n"
+                    found.append(lines[place])
+            if found:
+                self._put(watcher, b"event: tiles\n" + b"".join(found) + b"\n")
+
+    def _made(self, block: TileBlock, level: int) -> bytes:
+        return block.encoded() if level == CELL_LEVEL else self._world.encoded(block.tile, level)
+
+    def _tell(self, event: bytes) -> None:
+        for watcher in list(self._watchers):
+            self._put(watcher, event)
+
+    def _put(self, watcher: _OpenPage, event: bytes | None) -> None:
+        try:
+            watcher.queue.put_nowait(event)
+        except asyncio.QueueFull:
+            while not watcher.queue.empty():
+                watcher.queue.get_nowait()
+            self.reloads += 1
+            watcher.queue.put_nowait(_RELOAD if event is not None else None)
+
+
+def _area(tile: int) -> Box:
+    west, south, east, north = box_of(tile)
+    return west, south, east, north
+
+
+def _event(name: str, value: object) -> bytes:
+    return f"event: {name}\ndata: {json.dumps(value)}\n\n".encode()

@@ -1,0 +1,248 @@
+"""The routes of the page: files, cells by tile, events, one cell, moments, a route, health.
+
+Every answer forbids what it does not need: no inline script, nothing from elsewhere, no frame around it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+from urllib.parse import urlsplit
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.middleware.gzip import GZipMiddleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Route
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from fleet_service.page import asked, colours, overlay, records, route, stopping
+from fleet_service.page.health import ServiceHealth
+from fleet_service.page.moments import Moments
+from fleet_service.page.reader import Reader
+from fleet_service.page.watchers import TooManyWatchersError, Watchers
+from fleet_service.page.world import HeldWorld
+from schemas import grid, keys
+from schemas.errors import InputError, WireError
+from schemas.thresholds import NS
+
+STATIC: Final = Path(__file__).with_name("static")
+BLOCKS: Final = "application/vnd.gripmap.blocks"
+
+
+class Sources(NamedTuple):
+    """What the routes answer from; `base_map`: address of raster tiles with {z}, {x}, {y}, or none."""
+
+    world: HeldWorld
+    reader: Reader
+    moments: Moments
+    health: ServiceHealth
+    watchers: Watchers
+    overlay: Path | None = None
+    base_map: str | None = None
+
+
+def application(sources: Sources, hosts: Iterable[str], lifespan: Callable[[Starlette], Any]) -> ASGIApp:
+    """The routes, with compression and the headers of every answer.
+
+    Args:
+        sources: what is answered from.
+        hosts: names under which the page is asked for; none: any.
+        lifespan: what runs beside it.
+    """
+    routes = Routes(sources)
+    paths: dict[str, Callable[[Request], Awaitable[Response]]] = {
+        "/": routes.index, "/static/{name}": routes.file, "/settings": routes.settings, "/tiles": routes.tiles,
+        "/blocks": routes.blocks, "/events": routes.events, "/cell/{cell}/{sector}": routes.cell,
+        "/history/{cell}/{sector}": routes.history, "/moments": routes.times, "/route": routes.route,
+        "/health": routes.health, "/overlay": routes.overlay,
+    }  # fmt: skip
+    app = Starlette(
+        routes=[Route(path, told(answer)) for path, answer in paths.items()],
+        lifespan=lifespan,
+    )
+    return Guarded(GZipMiddleware(app, minimum_size=2000, compresslevel=3), frozenset(hosts), sources.base_map)
+
+
+class Routes:
+    """The answers, a method each."""
+
+    def __init__(self, sources: Sources) -> None:
+        self._of = sources
+
+    async def index(self, _: Request) -> Response:
+        """The page."""
+        return FileResponse(STATIC / "index.html", headers={"Cache-Control": "no-cache"})
+
+    async def file(self, request: Request) -> Response:
+        """One of its files, none else."""
+        path = STATIC / request.path_params["name"]
+        if path.parent != STATIC or not path.is_file():
+            return PlainTextResponse("no such file\n", 404)
+        return FileResponse(path, headers={"Cache-Control": "no-cache"})
+
+    async def settings(self, _: Request) -> Response:
+        """Numbers and colours that the page computes with."""
+        return JSONResponse({
+            "colours": colours.told(), "reaction_s": stopping.REACTION_S, "sights_m": stopping.SIGHTS_M,
+            "mu_steps": records.MU_STEPS, "share_steps": records.SHARE_STEPS, "base_map": self._of.base_map,
+            "overlay": self._of.overlay is not None,
+        })  # fmt: skip
+
+    async def tiles(self, request: Request) -> Response:
+        """Which tiles have cells, now or `at` a moment."""
+        at = asked.moment(request)
+        found = self._of.world.tiles() if at is None else await run_in_threadpool(self._of.moments.tiles, at)
+        return JSONResponse(found)
+
+    async def blocks(self, request: Request) -> Response:
+        """Blocks of `tiles` at a `level`, now or `at` a moment; with `borrowed`, what neighbours speak for too."""
+        wanted, level, at = asked.tiles(request), asked.level(request), asked.moment(request)
+        if at is not None:
+            made = await run_in_threadpool(lambda: [self._of.moments.encoded(at, tile, level) for tile in wanted])
+        elif "borrowed" in request.query_params:
+            made = await run_in_threadpool(lambda: [self._borrowed(tile) for tile in wanted])
+        else:
+            made = [self._of.world.encoded(tile, level) for tile in wanted]
+        return Response(b"".join(made), media_type=BLOCKS, headers={"Cache-Control": "no-store"})
+
+    def _borrowed(self, tile: int) -> bytes:
+        found = self._of.reader.ask(keys.map_key(tile), {"basis": "borrowed"})
+        return b"".join(
+            records.TileBlock(told, records.CELL_LEVEL, 1, 0, 0.0, records.of_table(table)).encoded()
+            for told, table in found
+        )
+
+    async def events(self, request: Request) -> Response:
+        """What changes in `bbox` at a `level`, from now on."""
+        try:
+            stream = self._of.watchers.enter(asked.view(request))
+        except TooManyWatchersError:
+            return PlainTextResponse("too many watch already\n", 503, headers={"Retry-After": "10"})
+        headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+        return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
+
+    async def cell(self, request: Request) -> Response:
+        """One cell and heading, as the service says it now."""
+        cell, sector = asked.place(request)
+        return JSONResponse(await run_in_threadpool(self._cell, cell, sector))
+
+    def _cell(self, cell: int, sector: int) -> dict[str, Any] | None:
+        box = ",".join(f"{side:.9f}" for side in (float(edge) for edge in grid.bounds(cell)))
+        for _, table in self._of.reader.ask(keys.map_key(int(grid.tile_of(cell))), {"bbox": box}):
+            for row in table.to_pylist():
+                if row["cell"] == cell and row["sector"] == sector:
+                    measured = row["basis"] == "measured"
+                    speeds = {str(s): stopping.safe_speed(row["mu_lower"], s) for s in stopping.SIGHTS_M}
+                    times = {name: row[name].value / NS for name in ("first_time", "last_time")}
+                    return row | times | {"cell": str(cell), "safe_speed": speeds if measured else None}
+        return None
+
+    async def history(self, request: Request) -> Response:
+        """What was believed of a cell at the kept moments."""
+        return JSONResponse(await run_in_threadpool(self._of.moments.history, *asked.place(request)))
+
+    async def times(self, _: Request) -> Response:
+        """The moments that are kept."""
+        return JSONResponse(await run_in_threadpool(self._of.moments.times))
+
+    async def route(self, request: Request) -> Response:
+        """The grip along `points`."""
+        points, text = asked.route(request)
+        return JSONResponse(await run_in_threadpool(self._profile, points, text))
+
+    def _profile(self, points: list[tuple[float, float]], text: str) -> dict[str, Any]:
+        import pyarrow as pa
+
+        from schemas.tables import MAP_SCHEMA
+
+        replies = [table for _, table in self._of.reader.ask(f"{keys.ROOT}/map/**", {"route": text})]
+        return route.profile(points, pa.concat_tables(replies) if replies else MAP_SCHEMA.empty_table())
+
+    async def health(self, _: Request) -> Response:
+        """What services say of themselves, and this page of itself."""
+        services = await run_in_threadpool(self._of.health.services)
+        reader, watchers = self._of.reader, self._of.watchers
+        return JSONResponse({
+            "services": services, "names": reader.names("shard"), "vehicles": len(reader.names("alive")),
+            "regions": reader.regions(), "router": reader.connected,
+            "watchers": len(watchers), "reloads": watchers.reloads,
+        })  # fmt: skip
+
+    async def overlay(self, _: Request) -> Response:
+        """The other map, or null."""
+        return JSONResponse(await run_in_threadpool(overlay.cells, self._of.overlay))
+
+
+def told(answer: Callable[[Request], Awaitable[Response]]) -> Callable[[Request], Awaitable[Response]]:
+    """An answer that says what was wrong with a question, and how to mend it."""
+
+    async def wrapped(request: Request) -> Response:
+        try:
+            return await answer(request)
+        except (InputError, WireError) as error:
+            return PlainTextResponse(f"{error}\n", 400)
+
+    return wrapped
+
+
+class Guarded:
+    """Headers of every answer; another host's name is refused, so that no page from elsewhere reads this one by DNS."""
+
+    def __init__(self, app: ASGIApp, hosts: frozenset[str], base_map: str | None) -> None:
+        self._app, self._hosts = app, hosts
+        pictures = "'self' data:" + (f" {origin(base_map)}" if base_map else "")
+        policy = (
+            f"default-src 'none'; script-src 'self'; style-src 'self'; img-src {pictures}; connect-src 'self'; "
+            "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+        )
+        self._headers = [
+            (b"content-security-policy", policy.encode()), (b"x-content-type-options", b"nosniff"),
+            (b"referrer-policy", b"no-referrer"), (b"cross-origin-resource-policy", b"same-origin"),
+            (b"x-frame-options", b"DENY"),
+        ]  # fmt: skip
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass on, with the headers."""
+
+        async def sent(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                message["headers"] = [*message["headers"], *self._headers]
+            await send(message)
+
+        if scope["type"] == "http" and self._hosts and _host(scope) not in self._hosts:
+            refusal = PlainTextResponse("this page is not served under that name; see --name\n", 421)
+            await refusal(scope, receive, sent)
+        else:
+            await self._app(scope, receive, sent)
+
+
+def _host(scope: Scope) -> str:
+    named = next((value.decode("latin-1") for name, value in scope["headers"] if name == b"host"), "")
+    with contextlib.suppress(ValueError):
+        return urlsplit(f"//{named}").hostname or ""
+    return ""
+
+
+def origin(address: str) -> str:
+    """Scheme, host and port of an address; what lies on this host itself has none."""
+    parts = urlsplit(address)
+    return f"{parts.scheme}://{parts.netloc}" if parts.netloc else "'self'"
+
+
+@contextlib.asynccontextmanager
+async def pushing(watchers: Watchers) -> AsyncIterator[None]:
+    """Push changes while the block runs; then let all go."""
+    import asyncio
+
+    task = asyncio.create_task(watchers.run())
+    try:
+        yield
+    finally:
+        watchers.close()
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task

@@ -1,0 +1,154 @@
+"""What the page knows of now: tiles as records, alerts as stretches, which regions are served. No network in it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_service.client.stretches import StretchAlert, Stretches
+from fleet_service.page import records
+from fleet_service.page.records import Records, TileBlock
+from schemas import grid
+from schemas.wire import Alert
+
+_EMPTY: Final = np.zeros(0, records.RECORD)
+
+
+@dataclass
+class HeldTile:
+    """A tile: its records, how often they changed, when they were heard [s since 1970], blocks made of them."""
+
+    cells: Records = field(default_factory=lambda: _EMPTY)
+    version: int = 0
+    heard: float = 0.0
+    made: dict[int, bytes] = field(default_factory=dict)
+
+
+class _Before(NamedTuple):
+    cells: Records
+    version: int
+
+
+class HeldWorld:
+    """All tiles and alerts that were heard of; any thread may call."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._tiles: dict[int, HeldTile] = {}
+        self._before: dict[int, _Before] = {}  # of the tiles that changed since `changes` was asked
+        self._stretches = Stretches()
+        self._standing: dict[tuple[int, int], Alert] = {}
+        self._alerts: dict[str, StretchAlert] = {}
+        self.heard = 0.0  # when any service said anything [s since 1970]
+
+    def take_tile(self, tile: int, table: pa.Table, now: float) -> None:
+        """A tile is so now."""
+        cells = records.of_table(table)
+        with self._lock:
+            self.heard = now
+            held = self._tiles.setdefault(tile, HeldTile())
+            held.heard = now
+            if np.array_equal(held.cells, cells):
+                return
+            self._before.setdefault(tile, _Before(held.cells, held.version))
+            held.cells, held.version, held.made = cells, held.version + 1, {}
+
+    def take_alert(self, alert: Alert, now: float) -> None:
+        """An alert of a cell was raised, repeated or cleared."""
+        with self._lock:
+            self.heard = now
+            self._take(alert)
+
+    def take_standing(self, standing: Iterable[Alert], served: Callable[[int], bool], now: float) -> None:
+        """These alerts stand; of the cells that are served no others do."""
+        with self._lock:
+            self.heard = now
+            told = {(alert.cell, alert.sector): alert for alert in standing}
+            for place, alert in list(self._standing.items()):
+                if place not in told and served(place[0]):
+                    self._take(replace(alert, raised=False, reason="it ended while this page could not hear"))
+            for alert in told.values():
+                self._take(alert)
+
+    def _take(self, alert: Alert) -> None:
+        self._stretches.take(alert)
+        if alert.raised:
+            self._standing[alert.cell, alert.sector] = alert
+        else:
+            self._standing.pop((alert.cell, alert.sector), None)
+
+    def changes(self) -> list[TileBlock]:
+        """What has changed of each tile since this was asked last."""
+        with self._lock:
+            before, self._before = self._before, {}
+            found = []
+            for tile, (cells, version) in before.items():
+                held = self._tiles[tile]
+                delta = records.changed(cells, held.cells)
+                block = TileBlock(tile, records.CELL_LEVEL, held.version, version, held.heard, delta)
+                found.append(block)
+            return found
+
+    def alerts_changed(self) -> bool:
+        """Whether stretches changed since this was asked last."""
+        with self._lock:
+            changes = self._stretches.changes()
+            for one in changes:
+                if one.state == "cleared":
+                    self._alerts.pop(one.id, None)
+                else:
+                    self._alerts[one.id] = one
+            return bool(changes)
+
+    def standing(self) -> list[dict[str, Any]]:
+        """The stretches that stand, newest first."""
+        with self._lock:
+            return [one.values() for one in sorted(self._alerts.values(), key=lambda one: -one.since)]
+
+    def tiles(self) -> list[int]:
+        """All tiles that have cells."""
+        with self._lock:
+            return [tile for tile, held in self._tiles.items() if len(held.cells)]
+
+    def oldest(self, before: float, most: int) -> list[int]:
+        """Tiles that were not heard of since `before` [s since 1970], those first that wait longest."""
+        with self._lock:
+            late = [(held.heard, tile) for tile, held in self._tiles.items() if held.heard < before and len(held.cells)]
+        return [tile for _, tile in sorted(late)[:most]]
+
+    def touch(self, tile: int, now: float) -> None:
+        """A tile was asked for and is as it was, or nobody answers for it."""
+        with self._lock:
+            if tile in self._tiles:
+                self._tiles[tile].heard = now
+
+    def encoded(self, tile: int, level: int) -> bytes:
+        """All of a tile at a level; empty where nothing is known of it."""
+        with self._lock:
+            held = self._tiles.get(tile)
+            if held is None or not held.version:
+                return b""
+            if level not in held.made:
+                held.made[level] = block_at(level, tile, held.cells, held.version, held.heard)
+            return held.made[level]
+
+    def rows(self, tiles: Iterable[int]) -> int:
+        """How many records tiles have."""
+        with self._lock:
+            return sum(len(self._tiles[tile].cells) for tile in tiles if tile in self._tiles)
+
+
+def block_at(level: int, tile: int, cells: Records, version: int, moment: float) -> bytes:
+    """All of a tile at a level, as bytes."""
+    seen = cells if level == records.CELL_LEVEL else records.worst(cells, level)
+    return TileBlock(tile, level, version, 0, moment, seen).encoded()
+
+
+def box_of(tile: int, zoom: int = grid.TILE_ZOOM) -> list[float]:
+    """West, south, east, north [deg]."""
+    return [float(side) for side in grid.bounds(tile, zoom)]

@@ -1,0 +1,73 @@
+"""A page of this process beside a router and a service, and a browser in front of it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from fleet_service.page.server import PageSettings, run
+from schemas.config import ZenohSettings
+from schemas.wire import Kind
+from tests.fleet_service.conftest import Running, running
+from tests.fleet_service.page import street
+from tests.waiting import until
+
+
+@dataclass
+class RunningPage:
+    """A page that listens, and what it is about."""
+
+    address: str
+    service: Running | None
+    archive: Path
+
+
+@contextmanager
+def page_of(connection: ZenohSettings, **changed: object) -> Iterator[str]:
+    """The address of a page in a thread of this process; it ends with the block."""
+    stop, lines = threading.Event(), list[str]()
+    settings = PageSettings(connection, port=0, **changed)  # type: ignore[arg-type]
+    thread = threading.Thread(target=run, args=(settings, stop, lines.append))
+    thread.start()
+    try:
+        until(lambda: lines)
+        yield lines[0].removeprefix("page: ")
+    finally:
+        stop.set()
+        thread.join(10.0)
+        assert not thread.is_alive(), "the page does not leave"
+
+
+@pytest.fixture
+def page(router: ZenohSettings, tmp_path: Path) -> Iterator[RunningPage]:
+    """A page beside a service that keeps a snapshot each second."""
+    archive = tmp_path / "archive"
+    with running(router, archive, snapshot_s=1.0) as service, page_of(router, archive=archive) as address:
+        yield RunningPage(address, service, archive)
+
+
+Drive = Callable[..., None]
+
+
+@pytest.fixture
+def drive(session: zenoh.Session, page: RunningPage) -> Drive:
+    """Let the cars drive over parts of the crossing; returns when the service knows of it."""
+    seq = 1
+
+    def go(*parts: str) -> None:
+        nonlocal seq
+        assert page.service is not None
+        before = page.service.service.engine.counts[Kind.OBSERVATION]
+        named = parts or tuple(street.PARTS)
+        seq = street.put(session, named, time.time_ns(), seq)
+        wanted = before + street.known(*named) * len(street.CARS)
+        until(lambda: page.service and page.service.service.engine.counts[Kind.OBSERVATION] >= wanted)
+
+    return go

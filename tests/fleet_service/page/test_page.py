@@ -1,0 +1,375 @@
+"""The page in a real browser, before a real service: what a person sees, does and may not miss."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+
+from fleet_service.archive import snapshots
+from fleet_service.page import colours
+from schemas import grid
+from tests.browser import Opened, opened
+from tests.fleet_service.page import street
+from tests.fleet_service.page.conftest import Drive, RunningPage
+from tests.house import ROOT
+from tests.waiting import until
+
+PICTURES: Final = ROOT / ".page"
+READY: Final = "body[data-ready]"
+ICE, SNOW, WET, DRY, RATHER, RATHER_NOT, LITTLE, HOLLOW = range(8)
+
+
+def look(seen: Opened, name: str) -> None:
+    """Keep a picture, for people."""
+    PICTURES.mkdir(exist_ok=True)
+    seen.page.screenshot(path=PICTURES / f"{name}.png")
+
+
+@contextmanager
+def shown(page: RunningPage, state: str = "", *, phone: bool = False, errors: bool = False) -> Iterator[Opened]:
+    """The page, when it is ready; no foreign request and nothing on the console when it is left."""
+    with opened(page.address + state, phone=phone) as seen:
+        seen.page.wait_for_selector(READY, state="attached")
+        yield seen
+        foreign = [url for url in seen.requests if not url.startswith((page.address, "blob:", "data:"))]
+        assert foreign == []
+        assert errors or seen.errors == []
+
+
+def data(seen: Opened, name: str) -> str:
+    return str(seen.page.evaluate("name => document.body.dataset[name] ?? ''", name))
+
+
+def kinds(seen: Opened) -> list[int]:
+    """How many places of each kind were drawn."""
+    return [int(n) for n in data(seen, "kinds").split(",") if n] or [0] * 8
+
+
+def near(seen: Opened, cell: int, zoom: float = 18.0) -> None:
+    """Look at a cell, near enough for headings."""
+    latitude, longitude = (float(v) for v in grid.centre(cell))
+    seen.page.evaluate("([x, y, z]) => { gripmap.goTo(x, y); gripmap.view.go(gripmap.view.x, gripmap.view.y, z) }",
+                       [longitude, latitude, zoom])  # fmt: skip
+
+
+def waits(seen: Opened, script: str) -> None:
+    """Return as soon as a script says true."""
+    until(lambda: seen.page.evaluate(script))  # the page's own policy forbids Playwright to poll inside it
+
+
+def cell_of(part: str, index: int = 1) -> int:
+    return int(street.cells(street.PARTS[part])[index])
+
+
+def read(seen: Opened, sector: int) -> dict[str, str]:
+    """What the panel says of one heading."""
+    found: dict[str, str] = seen.page.evaluate(
+        "s => Object.fromEntries([...document.querySelectorAll(`[data-sector='${s}'] dd`)]"
+        ".map(one => [one.dataset.value, one.textContent]))",
+        sector,
+    )
+    return found
+
+
+def test_all_cells_of_the_map_are_drawn_in_their_class_and_bounds_are_hollow(page: RunningPage, drive: Drive) -> None:
+    drive("dry", "snow", "ice", "wet", "passed", "avenue")
+    with shown(page) as seen:
+        near(seen, cell_of("ice"), 17.2)
+        waits(seen, f"document.body.dataset.drawn === '{street.known()}'")
+        found = kinds(seen)
+        assert found[ICE] == street.known("ice")
+        assert found[SNOW] + found[RATHER] == street.known("snow")
+        assert found[HOLLOW] == street.known("passed")
+        assert sum(found[WET : DRY + 1]) + found[RATHER_NOT] == street.known("wet", "dry", "avenue")
+        look(seen, "near")
+        ice = colours.FOUR[0]
+        named = ",".join(str(int(ice[k : k + 2], 16)) for k in (1, 3, 5))
+        painted: int = seen.page.evaluate(_POINTS, named)
+        assert painted > 100
+        near(seen, cell_of("passed", 3), 21)
+        waits(seen, f"document.body.dataset.kinds.split(',')[{HOLLOW}] > 0")
+        assert sum(kinds(seen)[:HOLLOW]) == 0
+        assert seen.page.evaluate(_COLOURED) == 0, "a bound has no colour"
+        look(seen, "bounds")
+
+
+_POINTS: Final = """colour => {
+  const map = document.getElementById("map");
+  const points = map.getContext("2d").getImageData(0, 0, map.width, map.height).data;
+  let n = 0;
+  for (let k = 0; k < points.length; k += 4) n += [points[k], points[k + 1], points[k + 2]].join() === colour;
+  return n;
+}"""
+_COLOURED: Final = """() => {
+  const map = document.getElementById("map");
+  const points = map.getContext("2d").getImageData(0, 0, map.width, map.height).data;
+  let n = 0;
+  for (let k = 0; k < points.length; k += 4) {
+    const point = [points[k], points[k + 1], points[k + 2]];
+    n += Math.max(...point) - Math.min(...point) > 8;
+  }
+  return n;
+}"""
+
+
+def test_far_away_the_ice_is_still_what_is_seen(page: RunningPage, drive: Drive) -> None:
+    drive()
+    with shown(page) as seen:
+        for zoom, level in ((12.0, 18), (6.0, 14)):
+            near(seen, cell_of("ice"), zoom)
+            waits(seen, f"document.body.dataset.level === '{level}' && document.body.dataset.kinds.split(',')[0] > 0")
+            waits(seen, f"[...gripmap.now.tiles.values()].every(tile => tile.block.level === {level})")
+        look(seen, "far")
+
+
+def test_the_rule_of_colours_is_the_same_here_and_there(page: RunningPage) -> None:
+    steps = range(10, 230, 9)
+    triples = [(mu, max(mu - a, 0), mu + b) for mu in steps for a in (3, 30, 90) for b in (3, 30, 90)]
+    with shown(page) as seen:
+        there: list[int] = seen.page.evaluate(
+            "async triples => { const { kindOf } = await import('/static/colours.js'); "
+            "return triples.map(([m, l, u]) => kindOf(1, m, l, u)) }",
+            triples,
+        )
+        hollow = seen.page.evaluate(
+            "async () => { const { kindOf } = await import('/static/colours.js'); return kindOf(0, 160, 150, 170) }"
+        )
+    names = [*colours.FOUR, *colours.TWO, colours.LITTLE]
+    assert [names[k] for k in there] == [colours.colour_of(*(v / 200 for v in one)) for one in triples]
+    assert hollow == HOLLOW
+    assert len(set(there)) == 7
+
+
+def test_a_place_says_its_interval_basis_vehicles_and_safe_speed(page: RunningPage, drive: Drive) -> None:
+    drive("ice", "passed")
+    with shown(page) as seen:
+        near(seen, cell_of("ice"))
+        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
+        seen.page.locator("#map").click()
+        waits(seen, "document.querySelectorAll('[data-value=observations]').length === 2")
+        told = read(seen, street.EAST)
+        assert told["basis"] == "measured"
+        assert told["vehicles"] == str(len(street.CARS)) == told["observations"]
+        assert "km/h with 50 m of sight" in told["speed"]
+        assert f"{len(street.CARS)} vehicles found it slippery; P(mu < 0.4)" in told["alert"]
+        assert seen.page.locator(".chart .density").count() == 2
+        look(seen, "place")
+        near(seen, cell_of("passed"))
+        waits(seen, f"gripmap.cells.at_place(...Object.values({_place('passed')})).length")
+        seen.page.locator("#map").click()
+        waits(seen, "document.querySelector('[data-value=basis]')?.textContent.startsWith('only passed')")
+        told = read(seen, street.EAST)
+        assert told["speed"] == "unknown: nobody measured here"
+        assert told["grip"].startswith("at least 0.")
+        assert "slippery" not in told
+        assert seen.page.locator(".chart .density").count() == 0
+        seen.page.evaluate("gripmap.choose(0, 0); gripmap.open('cell')")
+        assert seen.page.locator("#panel .nobody").inner_text() == "Nobody was here: nothing is known."
+
+
+def _place(part: str) -> str:
+    cell = cell_of(part)
+    return json.dumps([cell >> 14, cell & 0x3FFF])
+
+
+def test_what_happens_is_pushed_and_an_alert_appears_with_its_reason(page: RunningPage, drive: Drive) -> None:
+    with shown(page) as seen:
+        near(seen, cell_of("ice"))
+        waits(seen, "gripmap.live.state")
+        drive("ice")
+        waits(seen, "document.body.dataset.alerts === '1'")
+        waits(seen, f"document.body.dataset.kinds?.split(',')[0] == {street.known('ice')}")
+        waits(seen, "document.getElementById('live').dataset.state === 'live'")
+        seen.page.locator("#tab-alerts").click()
+        said = seen.page.locator("[data-alert]").inner_text()
+        assert "P(mu < 0.4)" in said
+        assert " vehicles" in said
+        assert not seen.page.evaluate("gripmap.show.sound"), "off unless it was asked for"
+        seen.page.evaluate("gripmap.view.go(.1, .1, 5)")
+        seen.page.get_by_role("button", name="show on the map").click()
+        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
+        look(seen, "alerts")
+
+
+def test_a_service_that_went_is_said_and_its_region_is_not_emptiness(page: RunningPage, drive: Drive) -> None:
+    drive("ice")
+    with shown(page) as seen:
+        near(seen, cell_of("ice"))
+        waits(seen, "document.getElementById('live').dataset.state === 'live'")
+        assert page.service is not None
+        page.service.end()
+        waits(seen, "!document.getElementById('away').hidden")
+        waits(seen, "document.getElementById('live').dataset.state === 'late'")
+        assert "No service for 1 region" in seen.page.locator("#away").inner_text()
+        assert kinds(seen)[ICE] == street.known("ice")
+        look(seen, "away")
+
+
+def test_silence_of_the_server_is_seen_by_the_pages_own_clock(page: RunningPage) -> None:
+    with shown(page) as seen:
+        waits(seen, "gripmap.live.state")
+        seen.page.evaluate("gripmap.live.source.close()")  # no error event comes of that
+        waits(seen, "document.getElementById('live').textContent.startsWith('○ last heard')")
+
+
+def test_the_slider_shows_a_known_cell_as_it_was_and_two_moments_side_by_side(page: RunningPage, drive: Drive) -> None:
+    drive("snow")
+    until(lambda: kept(page.archive))
+    before = kept(page.archive)[-1]
+    drive("ice")
+    until(lambda: kept(page.archive)[-1] > before + 1)
+    with shown(page) as seen:
+        near(seen, cell_of("ice"))
+        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
+        seen.page.evaluate("gripmap.timeline.load()")
+        seen.page.evaluate("at => { gripmap.timeline.put(at); return gripmap.timeline.chosen() }", before)
+        waits(seen, f"document.body.dataset.at === '{before}'")
+        assert kinds(seen)[ICE] == 0
+        assert sum(kinds(seen)) == street.known("snow")
+        assert seen.page.locator("#live").inner_text().startswith("▮▮ showing 20")
+        seen.page.evaluate("gripmap.timeline.put(null); gripmap.timeline.chosen()")
+        waits(seen, "document.body.dataset.at === 'now'")
+        seen.page.locator("#compare").click()
+        seen.page.evaluate("at => { gripmap.timeline.put(at); gripmap.timeline.chosen() }", before)
+        waits(seen, f"document.body.dataset.at === '{before}'")
+        waits(seen, "document.getElementById('moment-right').textContent === 'now'")
+        assert seen.page.locator("#moment-left").inner_text().startswith("20")
+        look(seen, "compare")
+
+
+def kept(archive: Path) -> list[int]:
+    """The moments of the snapshots."""
+    return sorted(snapshots.time_of(path) // 10**9 for path in archive.glob(f"{snapshots.TABLE}/*/*.parquet"))
+
+
+def test_a_route_is_clicked_or_dropped_and_tells_what_is_unknown(
+    page: RunningPage, drive: Drive, tmp_path: Path
+) -> None:
+    drive("ice", "wet")
+    west, east = (grid.centre(street.cells(street.PARTS[name])[k]) for name, k in (("ice", 0), ("passed", 3)))
+    points = "".join(f'<trkpt lat="{float(lat):.7f}" lon="{float(lon):.7f}"/>' for lat, lon in (west, east))
+    gpx = tmp_path / "way.gpx"
+    gpx.write_text(f'<gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>{points}</trkseg></trk></gpx>')
+    with shown(page) as seen:
+        seen.page.locator("#tab-route").click()
+        seen.page.locator("#gpx").set_input_files(gpx)
+        waits(seen, "document.getElementById('route-share')")
+        share = seen.page.locator("#route-share").inner_text()
+        assert "% unknown" in share
+        assert " 0 % unknown" not in share
+        assert "km/h with 50 m of sight" in seen.page.locator("#route-worst").inner_text()
+        assert seen.page.locator(".chart .unknown").count() >= 1
+        look(seen, "route")
+        seen.page.locator("#route-clear").click()
+        near(seen, cell_of("ice"))
+        for x in (300, 500):
+            seen.page.locator("#map").click(position={"x": x, "y": 300})
+        waits(seen, "document.getElementById('route-worst')")
+        assert "nobody knows" in seen.page.locator("#route-worst").inner_text()
+
+
+def test_a_link_holds_the_whole_state(page: RunningPage, drive: Drive) -> None:
+    drive("ice")
+    with shown(page) as seen:
+        near(seen, cell_of("ice"), 18.5)
+        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
+        seen.page.locator("#map").click()
+        seen.page.locator("#tab-legend").click()
+        seen.page.locator("#show-bounds").click()
+        seen.page.locator("#tab-share").click()
+        link = seen.page.locator("#link").input_value()
+    with shown(page, link.removeprefix(page.address)) as again:
+        waits(again, "gripmap.chosen")
+        state: dict[str, Any] = again.page.evaluate(
+            "({ x: gripmap.view.x, zoom: gripmap.view.zoom, tab: gripmap.tab, bounds: gripmap.show.bounds,"
+            " cell: gripmap.chosen.tile * 16384 + gripmap.chosen.local })"
+        )
+        assert state["cell"] == cell_of("ice")
+        assert (state["zoom"], state["tab"], state["bounds"]) == (18.5, "share", False)
+        with again.page.expect_download() as waiting:
+            again.page.locator("#geojson").click()
+        features = json.loads(Path(waiting.value.path()).read_text())["features"]
+        assert len(features) == street.known("ice")
+        assert all(one["properties"]["basis"] == "measured" for one in features)
+        with again.page.expect_download() as waiting:
+            again.page.locator("#csv").click()
+        assert len(Path(waiting.value.path()).read_text().splitlines()) == street.known("ice") + 1
+
+
+def test_a_file_that_leaves_has_no_mu_for_a_bound(page: RunningPage, drive: Drive) -> None:
+    drive("passed")
+    with shown(page) as seen:
+        near(seen, cell_of("passed", 3), 17)
+        waits(seen, f"document.body.dataset.kinds?.split(',')[{HOLLOW}] == {street.known('passed')}")
+        seen.page.locator("#tab-share").click()
+        with seen.page.expect_download() as waiting:
+            seen.page.locator("#geojson").click()
+        rows = [one["properties"] for one in json.loads(Path(waiting.value.path()).read_text())["features"]]
+        assert len(rows) == street.known("passed")
+        assert all(row["mu"] is None and row["basis"] == "bound" for row in rows)
+
+
+def test_keys_alone_are_enough(page: RunningPage, drive: Drive) -> None:
+    drive("ice")
+    with shown(page) as seen:
+        waits(seen, "document.body.dataset.alerts === '1'")
+        for _ in range(20):
+            seen.page.keyboard.press("Tab")
+            if seen.page.evaluate("document.activeElement.id") == "map":
+                break
+        assert seen.page.evaluate("document.activeElement.id") == "map"
+        seen.page.keyboard.press("a")
+        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
+        for key in ("ArrowLeft", "ArrowRight", "+", "-", "Enter"):
+            seen.page.keyboard.press(key)
+        waits(seen, "document.querySelector('[data-value=basis]')?.textContent === 'measured'")
+        seen.page.locator("#tab-cell").focus()
+        seen.page.keyboard.press("ArrowRight")
+        assert seen.page.evaluate("gripmap.tab") == "alerts"
+
+
+def test_a_phone_shows_map_and_words_without_scrolling_sideways(page: RunningPage, drive: Drive) -> None:
+    drive()
+    with shown(page, phone=True) as seen:
+        near(seen, cell_of("ice"), 17)
+        waits(seen, "document.body.dataset.kinds.split(',')[0] > 0")
+        size = seen.page.evaluate("[document.documentElement.scrollWidth, innerWidth, gripmap.view.height]")
+        assert size[0] <= size[1]
+        assert size[2] > 200
+        seen.page.locator("#map").tap()
+        waits(seen, "document.querySelector('[data-value=basis]')")
+        look(seen, "phone")
+
+
+def test_every_word_stands_in_the_table_and_every_entry_is_used() -> None:
+    static = ROOT / "fleet_service/page/static"
+    table: dict[str, str] = json.loads((static / "texts.en.json").read_text())
+    source = "\n".join(path.read_text() for path in static.glob("*.js"))
+    families = (
+        "tab.",
+        "heading.",
+        "basis.",
+        "legend.class.",
+        "legend.two.",
+        "show.",
+        "share.",
+        "ago.",
+        "health.router.",
+    )
+    unused = [key for key in table if f'"{key}"' not in source and not key.startswith(families)]
+    assert unused == []
+    assert all(f'"{key}"' not in source or key in table for key in table)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "fleet_service/page/static").glob("*.js")), ids=lambda path: path.name)
+def test_a_module_is_short_enough_to_be_read_and_takes_nothing_from_elsewhere(path: Path) -> None:
+    text = path.read_text()
+    assert text.count("\n") <= 400
+    assert "http://" not in text.replace("http://www.w3.org/2000/svg", "")
+    assert "https://" not in text
+    assert "innerHTML" not in text

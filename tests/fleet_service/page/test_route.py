@@ -1,0 +1,86 @@
+"""Grip along a route: what is unknown stays unknown, and speed comes from the lower end."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from fleet_service.fusion import Fusion
+from fleet_service.page.route import profile
+from fleet_service.page.stopping import REACTION_S, safe_speed
+from fleet_service.serve.encode import cell_table
+from schemas import grid
+from schemas.errors import InputError
+from schemas.tables import MAP_SCHEMA
+from schemas.thresholds import GRAVITY
+from tests.fleet_service.examples import START, at_least, observations, value
+from tests.fleet_service.page import street
+
+
+def told() -> pa.Table:
+    """Ice for five cells eastward, then cells that were only passed."""
+    ice, passed = street.cells(street.PARTS["ice"]), street.cells(street.PARTS["passed"])
+    cells = np.concatenate([ice, passed])
+    found = np.concatenate([value([0.12] * len(ice)), at_least([0.25] * len(passed))])
+    fusion = Fusion(120.0)
+    fusion.update(observations(np.arange(len(cells)) * 0.1, np.arange(len(cells)), found, cells))
+    return cell_table(fusion, np.arange(fusion.size), START + 10**10)
+
+
+def ends(first: int, last: int) -> list[tuple[float, float]]:
+    """From the middle of one cell of the street to that of another."""
+    x = street.MIDDLE[0] + np.array([first, last])
+    latitude, longitude = grid.centre(grid.interleave(x, np.array([street.MIDDLE[1]] * 2)))
+    return list(zip(longitude.tolist(), latitude.tolist(), strict=True))
+
+
+def shares(found: dict[str, Any]) -> dict[str, float]:
+    lengths: dict[str, float] = {}
+    for one in found["stretches"]:
+        lengths[one["basis"]] = lengths.get(one["basis"], 0.0) + one["to_m"] - one["from_m"]
+    return {basis: length / found["length_m"] for basis, length in lengths.items()}
+
+
+def test_stretches_follow_each_other_and_what_nobody_measured_has_no_number() -> None:
+    found = profile(ends(-20, 30), told())
+    stretches = found["stretches"]
+    assert stretches[0]["from_m"] == 0.0
+    assert stretches[-1]["to_m"] == pytest.approx(found["length_m"], abs=0.1)
+    assert all(a["to_m"] == b["from_m"] for a, b in pairwise(stretches))
+    assert {one["basis"] for one in stretches} == {"unknown", "measured", "bound"}
+    for one in stretches:
+        assert (one.get("mu") is not None) == (one.get("safe_speed") is not None) == (one["basis"] == "measured")
+    assert found["share"]["measured"] == pytest.approx(5 / 50, abs=0.02)
+    assert found["share"]["unknown"] > 0.5
+    assert sum(found["share"].values()) == pytest.approx(1.0, abs=1e-3)
+    assert shares(found) == pytest.approx({k: v for k, v in found["share"].items() if v}, abs=0.01)
+    assert stretches[found["worst"]]["basis"] == "measured"
+
+
+def test_the_other_direction_is_another_road() -> None:
+    found = profile(ends(10, -10), told())
+    assert found["share"]["unknown"] == pytest.approx(1.0)
+    assert found["worst"] is None
+
+
+def test_a_route_that_nobody_knows_is_unknown_and_not_dry() -> None:
+    assert profile(ends(-5, 5), MAP_SCHEMA.empty_table())["share"]["unknown"] == pytest.approx(1.0)
+
+
+def test_a_point_or_a_continent_is_refused() -> None:
+    for points in ([(11.0, 57.0)], [(11.0, 57.0), (11.0, 57.0)], [(11.0, 57.0), (11.0, 67.0)]):
+        with pytest.raises(InputError, match="route"):
+            profile(points, MAP_SCHEMA.empty_table())
+
+
+@pytest.mark.parametrize("lower", [0.05, 0.2, 0.8])
+@pytest.mark.parametrize("sight", [50, 100])
+def test_from_the_safe_speed_one_stops_within_the_sight(lower: float, sight: float) -> None:
+    speed = safe_speed(lower, sight)
+    assert speed * REACTION_S + speed**2 / (2 * GRAVITY * lower) == pytest.approx(sight)
+    assert math.isclose(safe_speed(0.0, sight), 0.0)

@@ -1,0 +1,283 @@
+"""The page's server: what it refuses, what it says on connect, how many watch, who is told to reload."""
+
+from __future__ import annotations
+
+import asyncio
+import http.client
+import json
+import signal
+import sys
+import time
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import urlsplit
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import zenoh
+
+from fleet_service.archive import snapshots
+from fleet_service.fusion import Fusion
+from fleet_service.page.health import values
+from fleet_service.page.records import HEAD
+from fleet_service.page.watchers import WAITING, TooManyWatchersError, View, Watchers
+from fleet_service.page.world import HeldWorld
+from fleet_service.serve.encode import cell_table
+from schemas.config import ZenohSettings
+from tests.faults.processes import Part
+from tests.fleet_service.conftest import running
+from tests.fleet_service.examples import START, TILE, observations, value
+from tests.fleet_service.page import street
+from tests.fleet_service.page.conftest import Drive, RunningPage, page_of
+from tests.waiting import until
+
+WORLD: Final = View((-180.0, -90.0, 180.0, 90.0), 21)
+
+
+def ask(address: str, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
+    """Status, headers and body of a question."""
+    connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
+    connection.request("GET", path, headers=headers)
+    answer = connection.getresponse()
+    try:
+        return answer.status, {name.lower(): value for name, value in answer.getheaders()}, answer.read()
+    finally:
+        answer.close()
+        connection.close()
+
+
+@contextmanager
+def listening(address: str, path: str = "/events") -> Iterator[Iterator[tuple[str, Any]]]:
+    """Events as they come."""
+    connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
+    connection.request("GET", path)
+    answer = connection.getresponse()
+
+    def events() -> Iterator[tuple[str, Any]]:
+        name, lines = "", list[str]()
+        for line in answer:
+            text = line.decode().rstrip("\n")
+            if text.startswith("event: "):
+                name = text.removeprefix("event: ")
+            elif text.startswith("data: "):
+                lines.append(text.removeprefix("data: "))
+            elif not text:
+                yield name, lines if name == "tiles" else json.loads(lines[0])
+                lines = []
+
+    try:
+        yield events()
+    finally:
+        answer.close()
+        connection.close()
+
+
+@pytest.fixture(scope="module")
+def bare(router: ZenohSettings) -> Iterator[str]:
+    """The address of a page that no service speaks to."""
+    with page_of(router) as address:
+        yield address
+
+
+def test_every_answer_forbids_what_the_page_does_not_need(bare: str) -> None:
+    for path in ("/", "/static/main.js", "/settings", "/nothing", "/blocks?tiles=x"):
+        _, headers, _ = ask(bare, path)
+        policy = headers["content-security-policy"]
+        assert "default-src 'none'; script-src 'self'; style-src 'self'" in policy
+        assert "unsafe" not in policy
+        assert headers["x-content-type-options"] == "nosniff"
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/blocks?tiles=x", "/blocks?tiles=-1", "/blocks?level=22", "/tiles?at=yesterday", "/tiles?at=1", "/cell/7/9",
+     "/events?bbox=1,2", "/route?points=1,2", "/route?points=1,2|3,95|x", "/blocks?tiles=" + "1," * 300],
+)  # fmt: skip
+def test_a_wrong_question_is_told_its_field_and_the_fix(bare: str, path: str) -> None:
+    status, _, body = ask(bare, path)
+    assert status == 400
+    assert b": " in body
+    assert b"; " in body
+
+
+def test_a_file_outside_the_page_and_another_hosts_name_are_refused(bare: str) -> None:
+    for path in ("/static/../web.py", "/static/%2e%2e%2fweb.py", "/static/nothing.js"):
+        assert ask(bare, path)[0] == 404
+    assert ask(bare, "/", Host="elsewhere.example")[0] == 421
+    assert ask(bare, "/", Host="localhost:1")[0] == 200
+
+
+def test_who_connects_is_told_what_stands_and_then_what_changes(page: RunningPage, drive: Drive) -> None:
+    drive("ice")
+    until(lambda: json.loads(ask(page.address, "/tiles")[2]))
+    with listening(page.address) as events:
+        first, second = next(events), next(events)
+        assert (first[0], second[0]) == ("alerts", "beat")
+        assert second[1]["router"]
+        drive("avenue")
+        changed = next(value for name, value in events if name == "tiles")
+        assert changed
+    tiles = json.loads(ask(page.address, "/tiles")[2])
+    _, headers, body = ask(page.address, f"/blocks?tiles={','.join(map(str, tiles))}")
+    assert headers["content-type"] == "application/vnd.gripmap.blocks"
+    heads, at = 0, 0
+    while at < len(body):
+        count = HEAD.unpack_from(body, at)[3]
+        heads, at = heads + count, at + HEAD.size + (13 * count + 3) // 4 * 4
+    assert heads >= street.known("ice")
+
+
+def test_an_alert_reaches_who_listens_with_its_reason(page: RunningPage, drive: Drive) -> None:
+    with listening(page.address) as events:
+        assert next(events) == ("alerts", [])
+        drive("ice")
+        (alert, *_) = next(value for name, value in events if name == "alerts" and value)
+    assert alert["vehicles"] >= 2
+    assert "P(mu < 0.4)" in alert["reason"]
+
+
+def test_as_many_watch_as_may_and_the_next_is_told_to_come_again(router: ZenohSettings) -> None:
+    with page_of(router, most=1) as address:
+        with listening(address) as events:
+            next(events)
+            status, headers, _ = ask(address, "/events")
+            assert status == 503
+            assert headers["retry-after"]
+        until(lambda: ask_briefly(address) == 200)
+
+
+def ask_briefly(address: str) -> int:
+    """Status of a stream that is left at once."""
+    connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=20)
+    connection.request("GET", "/events")
+    answer = connection.getresponse()
+    answer.close()
+    connection.close()
+    return answer.status
+
+
+def test_a_region_whose_service_went_is_told_and_its_cells_stay(page: RunningPage, drive: Drive) -> None:
+    drive("dry")
+    until(lambda: json.loads(ask(page.address, "/tiles")[2]))
+    until(lambda: json.loads(ask(page.address, "/health")[2])["regions"])
+    assert page.service is not None
+    page.service.end()
+    until(lambda: not json.loads(ask(page.address, "/health")[2])["regions"][0]["served"])
+    with listening(page.address) as events:
+        beat = next(value for name, value in events if name == "beat" and value["away"] and not value["served"])
+    assert beat["away"][0]["since"] <= time.time()
+    assert json.loads(ask(page.address, "/tiles")[2]), "what was known is not emptiness"
+
+
+def test_one_cell_is_told_as_the_service_has_it(page: RunningPage, drive: Drive) -> None:
+    drive("ice", "passed")
+    ice, passed = (int(street.cells(street.PARTS[name])[1]) for name in ("ice", "passed"))
+    told = json.loads(ask(page.address, f"/cell/{ice}/{street.EAST}")[2])
+    assert told["mu_lower"] < told["mu"] < 0.25
+    assert told["safe_speed"]["50"] < told["safe_speed"]["100"] < 15.0
+    assert told["observations"] == len(street.CARS)
+    bound = json.loads(ask(page.address, f"/cell/{passed}/{street.EAST}")[2])
+    assert (bound["mu"], bound["safe_speed"], bound["basis"]) == (None, None, "bound")
+    assert json.loads(ask(page.address, f"/cell/{ice}/{street.NORTH}")[2]) is None
+    middle = (told["south"] + told["north"]) / 2
+    points = f"{told['west'] - 0.001},{middle}|{told['east'] + 0.001},{middle}"
+    found = json.loads(ask(page.address, f"/route?points={points}")[2])
+    assert 0 < found["share"]["measured"] < 1
+    assert found["share"]["unknown"] > 0
+
+
+def test_a_page_without_a_router_says_so(router: ZenohSettings) -> None:
+    nowhere = ZenohSettings(connect=["tcp/127.0.0.1:1"])
+    with page_of(nowhere) as address:
+        assert not json.loads(ask(address, "/health")[2])["router"]
+        assert ask(address, "/cell/1/1")[0] == 400
+        assert json.loads(ask(address, "/tiles")[2]) == []
+
+
+def test_a_slow_watcher_is_told_to_reload_and_nothing_else_piles_up() -> None:
+    async def slow() -> list[bytes]:
+        world = HeldWorld()
+        watchers = Watchers(world, dict, most=1)
+        stream = watchers.enter(WORLD)
+        with pytest.raises(TooManyWatchersError):
+            watchers.enter(WORLD)
+        fusion = Fusion(120.0)
+        for k in range(2 * WAITING):
+            fusion.update(observations([float(k)], [k], value([0.3 if k % 2 else 0.8])))
+            world.take_tile(TILE, cell_table(fusion, np.arange(1), START), 1.0 + k)
+            watchers.push(world.changes())
+        assert watchers.reloads
+        watchers.close()
+        return [event async for event in _all(stream)]
+
+    events = asyncio.run(slow())
+    assert len(events) <= WAITING
+    assert any(event.startswith(b"event: reload") for event in events)
+
+
+async def _all(stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+    async for event in stream:
+        yield event
+
+
+def test_metrics_are_read_by_name_and_label() -> None:
+    text = '# HELP x\ngripmap_rows_total{kind="observation"} 12.0\ngripmap_cells 5.0\nother 1\n# EOF\n'
+    assert values(text) == {"rows": {"observation": 12.0}, "cells": {"": 5.0}}
+
+
+def test_a_stranger_on_the_map_ends_nothing(page: RunningPage, session: zenoh.Session, drive: Drive) -> None:
+    for key in ("gripmap/v1/map/1202/310/201/2222", "gripmap/v1/alert/1202/310/201/2222", "gripmap/v1/map/x"):
+        session.put(key, b"\x00rubbish")
+    drive("dry")
+    until(lambda: json.loads(ask(page.address, "/tiles")[2]))
+
+
+@pytest.mark.parametrize("way", ["connect", "config"])
+def test_every_option_of_the_command_does_what_it_says(router: ZenohSettings, tmp_path: Path, way: str) -> None:
+    archive, overlay, config = tmp_path / "archive", tmp_path / "truth.parquet", tmp_path / "reader.json"
+    with running(router, archive):
+        pass
+    fusion = Fusion(120.0)
+    fusion.update(observations([0.0], [1], value([0.3])))
+    snapshots.write(archive, cell_table(fusion, np.arange(1), START), START)
+    pq.write_table(pa.table({"cell": [7, 7], "sector": [1, 1], "mu": [0.2, 0.4]}), overlay)
+    config.write_text(json.dumps({"zenoh": router.model_dump()}))
+    to = ["--connect", router.connect[0]] if way == "connect" else ["--config", str(config)]
+    words = [
+        "--archive",
+        str(archive),
+        "--host",
+        "127.0.0.1",
+        "--port",
+        "0",
+        "--name",
+        "map.example",
+        "--metrics",
+        "http://127.0.0.1:1",
+        "--overlay",
+        str(overlay),
+        "--base-map",
+        "https://t.example/{z}/{x}/{y}.png",
+    ]
+    page = Part("page", [sys.executable, "-m", "fleet_service.cli", "page", *words, *to], tmp_path)
+    page.start()
+    try:
+        address = page.line_with("page: ").removeprefix("page: ")
+        assert address.startswith("http://127.0.0.1:")
+        until(lambda: json.loads(ask(address, "/health")[2])["router"])
+        assert json.loads(ask(address, "/moments")[2]) == [START // 10**9]
+        assert json.loads(ask(address, "/overlay")[2]) == {"cell": ["7"], "sector": [1], "mu": [0.3]}
+        assert json.loads(ask(address, "/health")[2])["services"] == [
+            {"address": "http://127.0.0.1:1", "answers": False}
+        ]
+        status, headers, _ = ask(address, "/", Host="map.example")
+        assert (status, ask(address, "/", Host="other.example")[0]) == (200, 421)
+        assert "img-src 'self' data: https://t.example;" in headers["content-security-policy"]
+        page.send(signal.SIGTERM)
+        page.wait(30.0)
+    finally:
+        page.kill()
