@@ -44,6 +44,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
         published={}, acknowledged={}, rejected={}, late={}, resent_batches=0, bad_acks=0, failures=0
     )
     publisher: Any = SimpleNamespace(
+        unanswered=0,
         clock_behind_s=0.0,
         counts=counts,
         dropped=0,
