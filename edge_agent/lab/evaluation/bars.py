@@ -113,6 +113,16 @@ BARS: Final = (
         for name in SURFACES
     ),
     EstimatorBar("real_world.width", in_the_world("width"), SHARE, 0.5, "less"),
+    *(
+        EstimatorBar(
+            f"real_world.contradiction_share.{name}.excited",
+            in_the_world(f"contradiction_share.{name}.excited"),
+            SHARE,
+            0.2,
+            "less",
+        )
+        for name in SURFACES
+    ),
 )
 
 UNITS: Final = {

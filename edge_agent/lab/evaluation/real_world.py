@@ -10,6 +10,7 @@ Legend
                   met any: who drives off the ice learns of it when he uses the grip
     below         share of all samples whose upper end lies below the grip in use: certainly wrong
     excited       some wheel used EXCITED_SHARE of its grip within the last second
+    contradiction share of the samples in which the estimator says that no friction explains its data (health)
     lost          share of the samples whose speed is off by more than LOST_M_S
 """
 
@@ -30,7 +31,7 @@ from edge_agent.lab.simulation.scenarios import drawn
 from schemas.errors import InputError
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import BoolArray, FloatArray
-from schemas.signals import S, per_wheel
+from schemas.signals import Health, S, per_wheel
 from schemas.thresholds import EXCITED_SHARE, GRAVITY, SLIPPERY_MU, UTILISED_WINDOW_S, Z_95
 
 SURFACES: Final = {"ice": (0.0, 0.2), "snow": (0.2, 0.45), "wet": (0.45, 0.75), "dry": (0.75, 2.0)}
@@ -108,6 +109,11 @@ def count(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatArray) 
     for name, (above, most) in SURFACES.items():
         tally.add(f"coverage90.{name}", inside, (mu > above) & (mu <= most))
     tally.add("coverage90.excited", inside, excited)
+    contradicted = (reported.health.astype(np.int64) & Health.CONTRADICTION) > 0
+    tally.add("contradiction_share", contradicted)
+    for name, (above, most) in SURFACES.items():
+        for kind, among in (("excited", excited), ("calm", ~excited)):
+            tally.add(f"contradiction_share.{name}.{kind}", contradicted, (mu > above) & (mu <= most) & among)
     tally.add("coverage90.no_torque", inside[:, np.isnan(batch.signals[:, :, S.TORQUE]).all(axis=0)])
     icy, grips = reported.mu_upper < SLIPPERY_MU, mu > SURFACES["wet"][0]
     tally.add("false_ice", icy & (mu > SURE_GRIP))

@@ -45,6 +45,7 @@ ASKED = {
     "real_world.false_ice": (0.002, "less"), "real_world.below": (0.002, "less"),
     "real_world.coverage90": (0.88, "more"),
     **{f"real_world.coverage90.{name}": (0.80, "more") for name in ("ice", "snow", "wet", "dry")},
+    **{f"real_world.contradiction_share.{name}.excited": (0.2, "less") for name in ("ice", "snow", "wet", "dry")},
 }  # fmt: skip
 
 

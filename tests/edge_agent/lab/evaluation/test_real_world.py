@@ -14,7 +14,7 @@ from edge_agent.lab.evaluation.scenarios import PAPERS
 from edge_agent.lab.seeds import FIGURES
 from edge_agent.lab.tuning import objectives, study
 from schemas.numeric import FloatArray
-from schemas.signals import S
+from schemas.signals import Health, S
 from schemas.thresholds import GRAVITY
 
 
@@ -53,6 +53,17 @@ def test_the_prior_is_always_right_and_never_tells_anything(driven: tuple[DriveS
     assert found["false_ice"] == found["below"] == found["rmse_vx"] == found["lost"] == 0.0
     assert found["score"] == pytest.approx(1.035) == baseline.means()["score"]
     assert 0.0 < baseline.means()["rmse_vx"] < 0.5
+
+
+def test_contradiction_is_counted_by_surface_and_by_whether_grip_is_used(
+    driven: tuple[DriveSet, FloatArray],
+) -> None:
+    reported, excited = saying(driven[0], *PRIOR), real_world.lately(driven[1]) >= 0.6
+    assert figures(driven, reported)["contradiction_share"] == 0.0
+    reported.values[..., Column.HEALTH] = np.where(excited & (driven[0].mu > 0.75), Health.CONTRADICTION, Health.OK)
+    found = figures(driven, reported)
+    assert 0.0 < found["contradiction_share"] < found["contradiction_share.dry.excited"] == 1.0
+    assert found["contradiction_share.dry.calm"] == found["contradiction_share.snow.excited"] == 0.0
 
 
 def test_who_says_ice_of_every_road_is_right_on_ice_alone(driven: tuple[DriveSet, FloatArray]) -> None:
