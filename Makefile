@@ -16,7 +16,7 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $@
 
 demo: setup  ## router, fleet service and simulated vehicles; ends with the map beside the truth
-	$(BIN)/python -m deploy.demo
+	$(BIN)/python -m deploy.demo $(ARGS)
 
 test: setup  ## the tests that take seconds, a process a core; says what the slowest cost
 	$(TESTS) --durations 10 -m 'not long and not campaign'

@@ -15,10 +15,11 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 
-from deploy.demo import compare, page, picture, processes
+from deploy.demo import compare, page, picture, processes, screenshot
 from deploy.demo.listener import Listener
 from edge_agent.lab.simulation.scenarios import scenario_named
 from fleet_service.archive.compaction import compact
+from fleet_service.cli.common import stop_on_signals
 from schemas.config import ZenohSettings
 from schemas.runtime import figures
 from schemas.runtime.zenoh_session import open_session
@@ -66,29 +67,41 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--duration", type=float, default=150.0, help="seconds of driving (default 150)")
     parser.add_argument("--seed", type=int, default=1, help="of vehicles, sensors and routes (default 1)")
     parser.add_argument("--warned", type=float, default=0.5, help="share of the drivers who hear the map (default 0.5)")
+    parser.add_argument("--stay", action="store_true", help="keep map and page running after it, until Ctrl-C")
+    parser.add_argument("--page-port", type=int, default=8080, help="of the live page; 0: a free one (default 8080)")
+    parser.add_argument("--screenshot", type=Path, metavar="FILE", help="keep a picture of the page, by Chromium")
     args = parser.parse_args(argv)
     began = time.monotonic()
     shutil.rmtree(FOLDER, ignore_errors=True)
     FOLDER.mkdir()
     appears_s = scenario_named(processes.SCENARIO).events[0].start
     print(f"{args.vehicles} vehicles drive for {args.duration:.0f} s; after {appears_s:.0f} s an ice patch appears.")
-    with processes.system(FOLDER) as (endpoint, _):
+    with (
+        processes.system(FOLDER) as (endpoint, service),
+        processes.page(FOLDER, endpoint, service, args.page_port) as address,
+    ):
+        print(f"\n  See it: {address}\n", flush=True)
         listener, counts = drive(FOLDER, endpoint, args)
         visits = pq.read_table(FOLDER / "truth.parquet")
         changed_ns = compare.started(visits) + int(appears_s * NS)
         comparison = compare.compare(listener.whole_map(), visits, changed_ns)
+        compare.write_truth(visits, changed_ns, FOLDER / "overlay.parquet")
         show(FOLDER, endpoint, comparison)
         listener.close()
-    wall_s = time.monotonic() - began
-    found = compare.figures(comparison, visits, listener.alerts, changed_ns, counts, FOLDER / "archive", wall_s)
-    grip = compare.lost_grip(visits, listener.alerts, changed_ns, args.warned)
-    found += grip.figures()
-    figures.write(FOLDER / "figures.json", "demo", [args.seed], found)
-    table = figures.markdown(found)
-    picture.draw(comparison, FOLDER / "map.png", grip)
-    page.write(comparison, found, FOLDER / "map.html")
-    print(f"\n{grip.line()}")
-    print(f"\n{table}\n\npicture {FOLDER}/map.png, page {FOLDER}/map.html, figures {FOLDER}/figures.json")
+        wall_s = time.monotonic() - began
+        found = compare.figures(comparison, visits, listener.alerts, changed_ns, counts, FOLDER / "archive", wall_s)
+        figures.write(FOLDER / "figures.json", "demo", [args.seed], found)
+        picture.draw(comparison, FOLDER / "map.png")
+        page.write(comparison, found, FOLDER / "map.html")
+        if args.screenshot is not None:
+            screenshot.take(address, args.screenshot)
+        table = figures.markdown(found)
+        print(
+            f"\n{table}\n\npicture {FOLDER}/map.png, page {FOLDER}/map.html, figures {FOLDER}/figures.json", flush=True
+        )
+        if args.stay:
+            print(f"\n{address} stays until Ctrl-C; the truth can be laid over it.", flush=True)
+            stop_on_signals().wait()
     return 0 if all(figure.holds for figure in found) else 1
 
 

@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
 
 from edge_agent.lab.simulation.listeners import warned_ones
 from fleet_service.archive import reading
@@ -66,6 +67,18 @@ def final_truth(visits: pa.Table, changed_ns: int) -> dict[tuple[int, int], floa
     for row, key in enumerate(keys):
         groups.setdefault(key, []).append(row)
     return {key: float(np.mean(mu[[r for r in rows if after[r]] or rows])) for key, rows in groups.items()}
+
+
+def write_truth(visits: pa.Table, changed_ns: int, path: Path) -> None:
+    """The final truth as a file that the live page lays over its map."""
+    truth = final_truth(visits, changed_ns)
+    cell, sector = zip(*truth, strict=True)
+    table = pa.table(
+        {"cell": pa.array(cell, pa.int64()), "sector": pa.array(sector, pa.int8()), "mu": list(truth.values())}
+    )
+    part = path.with_suffix(".part")
+    pq.write_table(table, part)
+    part.rename(path)
 
 
 def compare(cells: pa.Table, visits: pa.Table, changed_ns: int) -> MapComparison:

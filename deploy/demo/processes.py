@@ -14,6 +14,7 @@ from pathlib import Path
 START_S = 300.0  # the first start after a change compiles the kernels, on a busy machine
 STOP_S = 10.0
 SCENARIO = "hills"
+SHOWN = {"snapshot_s": 10.0, "metrics_port": 0}  # for the page: a past within minutes, and what the service says
 
 
 class DemoError(RuntimeError):
@@ -90,7 +91,7 @@ def system(folder: Path) -> Iterator[tuple[str, ManagedProcess]]:
     try:
         endpoint = router.line_with("router: ").removeprefix("router: ").split()[0]
         zenoh = {"connect": [endpoint]}
-        (folder / "service.json").write_text(json.dumps({"zenoh": zenoh, "name": "demo"}))
+        (folder / "service.json").write_text(json.dumps({"zenoh": zenoh, "name": "demo", **SHOWN}))
         (folder / "agent.json").write_text(json.dumps({"zenoh": zenoh, "spool": str(folder / "spool.sqlite")}))
         command = ["run", "--config", str(folder / "service.json"), "--archive", str(folder / "archive")]
         service = ManagedProcess("service", [str(scripts / "fleet-service"), *command], folder)
@@ -101,6 +102,20 @@ def system(folder: Path) -> Iterator[tuple[str, ManagedProcess]]:
             service.stop()
     finally:
         router.stop()
+
+
+@contextmanager
+def page(folder: Path, endpoint: str, service: ManagedProcess, port: int) -> Iterator[str]:
+    """The live page; yields its address. Truth that comes to lie in `folder/overlay.parquet` can be laid over."""
+    metrics = service.line_with("ready").rpartition(", ")[2]
+    options = {"--connect": endpoint, "--archive": folder / "archive", "--port": port,
+               "--metrics": metrics, "--overlay": folder / "overlay.parquet"}  # fmt: skip
+    words = [str(word) for option in options.items() for word in option]
+    shown = ManagedProcess("page", [str(Path(sys.executable).parent / "fleet-service"), "page", *words], folder)
+    try:
+        yield shown.line_with("page: ").removeprefix("page: ")
+    finally:
+        shown.stop()
 
 
 def fleet(folder: Path, vehicles: int, duration_s: float, seed: int, warned: float) -> ManagedProcess:

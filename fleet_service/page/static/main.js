@@ -122,6 +122,7 @@ class App {
     if (this.live.look(this.view)) this.draw();
     const level = this.view.level, box = this.view.box, stores = this.comparing ? [this.cells, this.pinned] : [this.cells];
     try { await Promise.all(stores.map(store => store.show(box, level))); } catch { this.note(say("error.asked")); }
+    if (this.chosen && this.chosen.level !== level) this.choose(this.chosen.tile, this.chosen.local);
     this.remember();
     this.draw();
   }
@@ -218,7 +219,7 @@ class App {
   choose(tile, local) {
     const level = this.cells.tiles.get(tile)?.block.level ?? CELL_LEVEL, side = 2 ** (CELL_LEVEL - level) / CELLS;
     const { x, y } = middleOf(cellOf(tile, local));
-    this.chosen = { tile, local, x, y, side, records: this.cells.at_place(tile, local) };
+    this.chosen = { tile, local, x, y, side, level, records: this.cells.at_place(tile, local) };
     this.chosen.x = Math.floor(x / side) * side;
     this.chosen.y = Math.floor(y / side) * side;
     Object.assign(this.chosen, { middleX: x, middleY: y });

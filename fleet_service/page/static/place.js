@@ -46,7 +46,7 @@ function one(app, chosen, cell) {
   for (const alert of alertsAt(app, chosen)) line(say("cell.alert"), say("cell.alert.value", { count: alert.vehicles, reason: alert.reason }), "alert");
   const past = make("div", { class: "history" });
   const section = make("section", { class: "heading", "data-sector": cell.sector },
-    make("h2", {}, whole ? say("cell.heading", { heading: say(`heading.${cell.sector}`) }) : say("share.zoomed_out")), list,
+    make("h2", {}, whole ? say("cell.heading", { heading: say(`heading.${cell.sector}`) }) : say("cell.square")), list,
     cell.basis === "measured" ? make("p", { class: "note" }, say("cell.speed.note", { reaction: app.settings.reaction_s })) : null,
     make("figure", {}, density(cell, limit), make("figcaption", {}, say(cell.mu === null ? "cell.density.bound" : "cell.density"))), past);
   if (whole) fillIn(app, chosen, cell, list, past);
