@@ -7,6 +7,7 @@ Z_95                95 % quantile of the standard normal: half a 90 % interval i
 GRAVITY             [m/s²], rounded; standard gravity is 9.80665 (ISO 80000-3)
 EARTH_RADIUS_M      [m] of the sphere that Web Mercator tiles are cut from: WGS 84, semi-major axis
 METRES_PER_DEGREE   [m/°] of latitude on that sphere, π/180 · EARTH_RADIUS_M, rounded
+REACTION_S          [s] of a driver who is told (Green, Transportation Human Factors 2, 2000: 1.2 to 1.5 s)
 NS                  nanoseconds of a second
 """
 
@@ -22,4 +23,5 @@ Z_95: Final = NormalDist().inv_cdf(0.95)
 GRAVITY: Final = 9.81
 EARTH_RADIUS_M: Final = 6_378_137.0
 METRES_PER_DEGREE: Final = 111_320.0
+REACTION_S: Final = 1.5
 NS: Final = 1_000_000_000

@@ -14,9 +14,8 @@ from edge_agent.ahead.known import MEASURED, UNKNOWN, HeardMap, PlaceBelief
 from edge_agent.ahead.path import NONE, Path
 from schemas import mugrid
 from schemas.numeric import BoolArray, FloatArray, IntArray
-from schemas.thresholds import GRAVITY
+from schemas.thresholds import GRAVITY, REACTION_S
 
-REACTION_S: Final = 1.5  # of a driver who is told (Green, Transportation Human Factors 2, 2000: 1.2 to 1.5 s)
 MARGIN_M: Final = 10.0  # a cell: where a stretch begins is known no better
 COMFORT: Final = 3.0  # [m/s^2] braking that is not felt as hard; adaptive cruise may brake with 3.5 (ISO 15622)
 COMFORT_ACROSS: Final = 3.0  # [m/s^2] in bends
@@ -41,7 +40,7 @@ class Horizon(NamedTuple):
         basis: known.UNKNOWN, BOUND, MEASURED, BORROWED.
         slippery: worth a warning.
         alerted: an alert stands.
-        safe_speed: [m/s]; infinite where nothing limits it.
+        safe_speed: [m/s]; NaN where nobody knows: an unknown road is no fast one.
     """
 
     path: Path
@@ -98,7 +97,7 @@ def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
     """Speed [m/s] at each metre (M,) at which bends are held and one can stop within SIGHT_M, on the lower end of grip.
 
     Before a slower place it falls with a comfortable deceleration, or with what the road bears beside cornering. Where
-    nothing is measured (NaN) the road limits nothing by itself, and nobody is asked to brake harder than it may bear.
+    nothing is measured (NaN) none is advised (NaN) but before a slower place, with no more braking than it may bear.
     """
     measured, bend = np.isfinite(mu_lower), np.abs(np.nan_to_num(curvature))
     grip = GRAVITY * np.where(measured, mu_lower, UNKNOWN_LOWER)
@@ -110,7 +109,8 @@ def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
         if squares[k + 1] < squares[k]:
             across = min(squares[k + 1] * bends[k] / brakes[k], 1.0)
             squares[k] = min(squares[k], squares[k + 1] + 2.0 * brakes[k] * math.sqrt(1.0 - across * across))
-    return np.asarray(np.sqrt(np.array(squares)))
+    found = np.sqrt(np.array(squares))
+    return np.asarray(np.where(np.isinf(found), np.nan, found))
 
 
 def braking_from(horizon: Horizon) -> FloatArray:

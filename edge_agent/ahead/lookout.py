@@ -225,5 +225,5 @@ def runs(horizon: Horizon) -> Runs:
     return Runs(
         starts.astype(np.float64), ends.astype(np.float64), place // grid.SECTORS, place % grid.SECTORS,
         horizon.mu[starts], horizon.mu_lower[starts], horizon.mu_upper[starts], horizon.p_slippery[starts],
-        horizon.age_s[starts], horizon.basis[starts], np.minimum.reduceat(horizon.safe_speed, starts),
+        horizon.age_s[starts], horizon.basis[starts], np.fmin.reduceat(horizon.safe_speed, starts),
     )  # fmt: skip

@@ -12,12 +12,12 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.ahead.horizon import MARGIN_M, REACTION_S, Horizon, braking_from, worth_a_warning
+from edge_agent.ahead.horizon import MARGIN_M, Horizon, braking_from, worth_a_warning
 from edge_agent.ahead.known import HeardMap
 from edge_agent.ahead.path import Pose
 from schemas import grid
 from schemas.numeric import BoolArray
-from schemas.thresholds import NS
+from schemas.thresholds import NS, REACTION_S
 from schemas.wire.ahead import GripWarning, WarningState
 
 UPDATE_S: Final = 1.0  # between two looks: a stretch may come by so much nearer before it is told
@@ -139,7 +139,7 @@ def _warning(name: str, state: WarningState, stretch: _Stretch, pose: Pose, sure
         id=name, state=state, time=pose.time, distance_m=stretch.start, length_m=stretch.end - stretch.start,
         time_s=stretch.start / pose.speed if pose.speed > SLOWEST else math.inf,
         mu=float(horizon.mu[k]), mu_lower=float(horizon.mu_lower[k]), p_slippery=float(horizon.p_slippery[k]),
-        age_s=age, safe_speed=float(horizon.safe_speed[first:last].min()), way=horizon.path.kind, sure=sure,
+        age_s=age, safe_speed=float(np.nanmin(horizon.safe_speed[first:last])), way=horizon.path.kind, sure=sure,
         reason=reason,
     )  # fmt: skip
 

@@ -20,10 +20,10 @@ from typing import Final, Literal
 from fleet_service.client.stretches import StretchAlert, iso
 from schemas import grid
 from schemas.errors import InputError
-from schemas.thresholds import NS, SLIPPERY_MU
+from schemas.thresholds import NS, SLIPPERY_MU, Z_95
 
 KEPT_S: Final = 3600  # for which an ended situation is told: who pulls every few minutes does not miss the end
-INTERVAL_STD: Final = 3.29  # of a 90 % interval of a Gaussian
+INTERVAL_STD: Final = 2.0 * Z_95  # of a 90 % interval of a Gaussian
 CERTAIN, PROBABLE = 0.97, 0.8  # of P(slippery), from which on it is said
 DIGITS: Final = 6  # a tenth of a metre; a cell is ten
 _XSI: Final = "http://www.w3.org/2001/XMLSchema-instance"

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from schemas.thresholds import GRAVITY
+from schemas.thresholds import GRAVITY, REACTION_S
 
-REACTION_S: Final = 1.5  # of a driver who is told (Green, Transportation Human Factors 2, 2000: 1.2 to 1.5 s)
 SIGHTS_M: Final = (50, 100)
 
 

@@ -27,7 +27,7 @@ from fleet_service.page.watchers import TooManyWatchersError, Watchers
 from fleet_service.page.world import HeldWorld
 from schemas import grid, keys
 from schemas.errors import InputError, WireError
-from schemas.thresholds import NS
+from schemas.thresholds import NS, REACTION_S
 
 STATIC: Final = Path(__file__).with_name("static")
 BLOCKS: Final = "application/vnd.gripmap.blocks"
@@ -87,7 +87,7 @@ class Routes:
     async def settings(self, _: Request) -> Response:
         """Numbers and colours that the page computes with."""
         return JSONResponse({
-            "colours": colours.told(), "reaction_s": stopping.REACTION_S, "sights_m": stopping.SIGHTS_M,
+            "colours": colours.told(), "reaction_s": REACTION_S, "sights_m": stopping.SIGHTS_M,
             "mu_steps": records.MU_STEPS, "share_steps": records.SHARE_STEPS, "base_map": self._of.base_map,
             "overlay": self._of.overlay is not None,
         })  # fmt: skip

@@ -44,7 +44,11 @@ def test_it_loads_nothing_but_the_contract_and_its_libraries(found: dict[str, An
 def test_its_batches_are_acknowledged_as_durable_and_can_be_read_again(found: dict[str, Any]) -> None:
     sent, (first, second) = found["sent"], found["sent"]["vehicles"]
     durable = [[1, 1]]
-    assert found["acks"] == {first: [[41, sent["region"], durable, []]], second: [[42, sent["region"], durable, []]]}
+    acks = {vehicle: [stream[:4] for stream in streams] for vehicle, streams in found["acks"].items()}
+    assert acks == {first: [[41, sent["region"], durable, []]], second: [[42, sent["region"], durable, []]]}
+    late, told = zip(*(stream[4:] for streams in found["acks"].values() for stream in streams), strict=True)
+    assert late == ([], [])
+    assert min(told) > 0, "the service's time"
     assert sorted(found["batches"]) == [[vehicle, sent["visits"], sent["region"]] for vehicle in (first, second)]
     assert not found["errors"]
 

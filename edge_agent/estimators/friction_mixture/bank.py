@@ -9,7 +9,7 @@ from edge_agent.estimators.estimates import FOUR_FRICTIONS, Column
 from edge_agent.estimators.friction_mixture.constants import NODES, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.friction_grid import quantile, visit_evidence
-from edge_agent.estimators.friction_mixture.grip_guard import told_upper
+from edge_agent.estimators.friction_mixture.grip_guard import reported_upper
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles, new_filters
 from edge_agent.estimators.friction_mixture.split_sides import BOTH, project
 from edge_agent.estimators.friction_mixture.step import step, velocity
@@ -88,10 +88,10 @@ def report(memory: MixtureMemory, design: MixtureDesign, output: FloatArray) -> 
     var_y = memory.overall_covariance[NodeState.VY, NodeState.VY]
     var_rate = last.yaw_rate_var + YAW_RATE_OFFSET_STD**2
     write_motion(output, vx, vy, last.yaw_rate, var_x, var_y, var_rate)
-    _report_friction(memory.friction, told_upper(memory.grip, memory.friction), output, Column.MU)
+    _report_friction(memory.friction, reported_upper(memory.grip, memory.friction), output, Column.MU)
     for wheel in range(4):
         side = memory.friction_left if wheel % 2 == 0 else memory.friction_right
-        upper = side.upper if memory.split else told_upper(memory.grip, side)
+        upper = side.upper if memory.split else reported_upper(memory.grip, side)
         _report_friction(side, upper, output, Column.WHEELS + 3 * wheel)
     adaptation = max(memory.factor[0], memory.factor[1])
     write_quality(output, memory.excitation.largest, memory.nis, adaptation, memory.log_likelihood)

@@ -38,6 +38,6 @@ def guard(grip: GripInUse, constants: Constants, side_mu: FloatArray) -> float:
 
 
 @compiled
-def told_upper(grip: GripInUse, friction: Quantiles) -> float:
+def reported_upper(grip: GripInUse, friction: Quantiles) -> float:
     """The upper end of a friction, never below the grip in use: racing tyres pass the grid's 1.2."""
     return max(friction.upper, grip.held + ABOVE)

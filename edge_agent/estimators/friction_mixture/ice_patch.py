@@ -39,7 +39,7 @@ def refute(patch: FloatArray, weight: FloatArray, log_likelihood: FloatArray) ->
 
 
 @compiled
-def told_lower(
+def reported_lower(
     patch: FloatArray, design: MixtureDesign, weight: FloatArray, lower: float, blended: FloatArray
 ) -> float:  # fmt: skip
     """`lower` of the nodes of one friction with weight (NODES,), or less where a patch may be; blended is scratch."""

@@ -17,7 +17,7 @@ from edge_agent.estimators.friction_mixture.block_features import block_features
 from edge_agent.estimators.friction_mixture.constants import NODES, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.drive_split import learn_drive
-from edge_agent.estimators.friction_mixture.ice_patch import drive_onto, told_lower
+from edge_agent.estimators.friction_mixture.ice_patch import drive_onto, reported_lower
 from edge_agent.estimators.friction_mixture.intake import begin_block, take_sample
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles
 from edge_agent.estimators.friction_mixture.mixing import awake, drive_on, match_moments, wake_or_sleep
@@ -120,7 +120,7 @@ def _find_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scratc
     else:
         find_quantiles(design, memory.weight, memory.friction)
         lower = memory.friction.lower
-        memory.friction.lower = told_lower(memory.patch, design, memory.weight[:NODES], lower, scratch.blended)
+        memory.friction.lower = reported_lower(memory.patch, design, memory.weight[:NODES], lower, scratch.blended)
         for side in (memory.friction_left, memory.friction_right):
             both = memory.friction
             side.median, side.lower, side.upper = both.median, both.lower, both.upper
@@ -132,7 +132,7 @@ def _find_side(
 ) -> None:  # fmt: skip
     project(memory.weight, design.sides.share[side], scratch.projected)
     find_quantiles(design, scratch.projected, friction)
-    friction.lower = told_lower(memory.patch, design, scratch.projected, friction.lower, scratch.blended)
+    friction.lower = reported_lower(memory.patch, design, scratch.projected, friction.lower, scratch.blended)
 
 
 @compiled

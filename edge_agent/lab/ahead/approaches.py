@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.ahead.horizon import COMFORT, REACTION_S, horizon_length, look_ahead
+from edge_agent.ahead.horizon import COMFORT, horizon_length, look_ahead
 from edge_agent.ahead.known import HeardMap
 from edge_agent.ahead.path import GivenRoute, Path, Pose, corridor
 from edge_agent.ahead.roads import ways_on
@@ -23,7 +23,7 @@ from edge_agent.lab.simulation import SimulatedFleet
 from edge_agent.observe.cell_tracker import locate, new_tracks
 from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
-from schemas.thresholds import GRAVITY, NS
+from schemas.thresholds import GRAVITY, NS, REACTION_S
 
 RATE_HZ: Final = 50.0
 AFTER_S: Final = 80.0  # of the scenario's clock: all its events have happened

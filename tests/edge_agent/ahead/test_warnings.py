@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
-from edge_agent.ahead.horizon import MARGIN_M, REACTION_S, UNKNOWN_LOWER, look_ahead
+from edge_agent.ahead.horizon import MARGIN_M, UNKNOWN_LOWER, look_ahead
 from edge_agent.ahead.known import HeardMap
 from edge_agent.ahead.path import GivenRoute, Pose, corridor
 from edge_agent.ahead.warnings import ABSENT_S, UPDATE_S, Active, warn
 from schemas.numeric import IntArray
-from schemas.thresholds import GRAVITY, NS
+from schemas.thresholds import GRAVITY, NS, REACTION_S
 from schemas.wire.ahead import GripWarning
 from tests.edge_agent.ahead.roads import HOME, NOW, alert, cells, keys_on, line, told
 

@@ -12,12 +12,12 @@ import pytest
 
 from fleet_service.fusion import Fusion
 from fleet_service.page.route import profile
-from fleet_service.page.stopping import REACTION_S, safe_speed
+from fleet_service.page.stopping import safe_speed
 from fleet_service.serve.encode import cell_table
 from schemas import grid
 from schemas.errors import InputError
 from schemas.tables import MAP_SCHEMA
-from schemas.thresholds import GRAVITY
+from schemas.thresholds import GRAVITY, REACTION_S
 from tests.fleet_service.examples import START, at_least, observations, value
 from tests.fleet_service.page import street
 
