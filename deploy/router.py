@@ -20,6 +20,7 @@ from schemas.errors import InputError
 from schemas.runtime.process import end_now
 
 CLOSE_S = 2.0
+ENDING = (signal.SIGINT, signal.SIGTERM)
 CONFIG = Path(__file__).with_name("router.json5")
 
 
@@ -64,16 +65,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--config", type=Path, default=CONFIG, help="Zenoh configuration file (JSON5)")
     parser.add_argument("--listen", help="endpoint instead of the file's, e.g. tcp/127.0.0.1:0 for a free port")
     args = parser.parse_args(argv)
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    # Zenoh's threads inherit the mask: a signal that one of them took would never wake Python's main thread.
+    signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     try:
         session, endpoints = open_router(args.config, args.listen)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     print(f"router: {' '.join(endpoints)}", flush=True)
-    stop.wait()
+    signal.sigwait(ENDING)
     closing = threading.Thread(target=session.close, daemon=True)
     closing.start()
     closing.join(CLOSE_S)

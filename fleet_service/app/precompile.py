@@ -12,9 +12,10 @@ import numpy as np
 
 from fleet_service.fusion import Fusion, Observations
 from fleet_service.fusion.constants import EPOCH_NS
-from fleet_service.fusion.likelihoods import at_least, levelled
+from fleet_service.fusion.likelihoods import at_least, levelled, supported
 from fleet_service.fusion.reported import as_reported
 from fleet_service.fusion.space import shares
+from fleet_service.ingest.grouping import grouped, largest_of
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.encode import cell_table
 from schemas import mugrid
@@ -46,7 +47,11 @@ def live() -> None:
         Alerts(fusion).updated(fusion.update(o).slots)
         fusion.slots_of(o.cell, o.sector)
     at_least(np.zeros(1))
-    levelled(np.zeros((1, mugrid.BINS), np.uint8), np.zeros(1))
+    supported(levelled(np.zeros((1, mugrid.BINS), np.uint8), np.zeros(1)), np.zeros(1))
+    column = np.zeros(1, np.int64)  # as Arrow hands it out: not to be written to
+    column.flags.writeable = False
+    group, _ = grouped(np.zeros(1, np.int64), column, column)
+    largest_of(column, group, 1)
     shares(np.ones(1), np.ones(1))
     cell_table(fusion, np.arange(2), 10 * EPOCH_NS)
 

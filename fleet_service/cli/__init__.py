@@ -43,7 +43,8 @@ COMMANDS: Final = (
             "fleet-service roads city.osm.pbf --out roads.parquet"),
     Command(
         "analyze", "fleet_service.cli.analyze",
-        "ask the archive: grip, worst, spells, before-after, vehicles, calibration, weather, change-rates, contract, …",
+        "ask the archive: grip, worst, spells, before-after, vehicles, calibration, weather, change-rates, "
+        "contract, replay",
         "fleet-service analyze worst --archive archive --from 2026-01-01 --out worst.html",
     ),
     Command("certs", "fleet_service.cli.certs", "certificates and router configurations for everyone on a list",
