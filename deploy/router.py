@@ -66,14 +66,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--listen", help="endpoint instead of the file's, e.g. tcp/127.0.0.1:0 for a free port")
     args = parser.parse_args(argv)
     # Zenoh's threads inherit the mask: a signal that one of them took would never wake Python's main thread.
-    signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     try:
         session, endpoints = open_router(args.config, args.listen)
+        print(f"router: {' '.join(endpoints)}", flush=True)
+        signal.sigwait(ENDING)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    print(f"router: {' '.join(endpoints)}", flush=True)
-    signal.sigwait(ENDING)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     closing = threading.Thread(target=session.close, daemon=True)
     closing.start()
     closing.join(CLOSE_S)

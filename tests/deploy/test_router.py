@@ -47,7 +47,9 @@ def test_a_router_process_tells_its_endpoint_and_ends_on_a_signal() -> None:
 def test_a_wrong_configuration_names_the_field_and_the_fix(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "router.json5"
     path.write_text("{ mode: 'wanderer' }")
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
     assert router.main(["--config", str(path)]) == 2
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == before, "who called it hears signals as before"
     assert capsys.readouterr().err.startswith("error: config: cannot use")
 
 
