@@ -76,7 +76,7 @@ SANS_IO = (
     "edge_agent/ahead/hearing.py",
     *(f"fleet_service/ingest/{name}.py" for name in ("acks", "validation")),
     *(f"fleet_service/serve/{name}.py" for name in ("encode", "query", "tile_cache")),
-    *(f"fleet_service/page/{name}.py" for name in ("colours", "records", "route", "stopping")),
+    *(f"fleet_service/page/{name}.py" for name in ("colours", "records", "route")),
 )
 IMPURE = {
     "asyncio", "datetime", "duckdb", "http", "logging", "multiprocessing", "os", "pathlib", "pyarrow", "random",
@@ -85,8 +85,8 @@ IMPURE = {
 IMPURE_CALLS = {"open", "print", "input"}
 # What the pure core may use of the contract: numbers, names and errors, no messages, tables or transport.
 PURE_SCHEMAS = {
-    "config", "errors", "grid", "mugrid", "numeric", "runtime.jit", "runtime.records", "signals", "thresholds",
-    "vehicle", "wire",
+    "config", "errors", "grid", "mugrid", "numeric", "runtime.jit", "runtime.records", "signals", "stopping",
+    "thresholds", "vehicle", "wire",
 }  # fmt: skip
 
 # Top-level entries of the design, section 2; dot files and lock files may lie beside them.

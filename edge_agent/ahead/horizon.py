@@ -14,6 +14,7 @@ from edge_agent.ahead.known import MEASURED, UNKNOWN, HeardMap, PlaceBelief
 from edge_agent.ahead.path import NONE, Path
 from schemas import mugrid
 from schemas.numeric import BoolArray, FloatArray, IntArray
+from schemas.stopping import stopping_speed
 from schemas.thresholds import GRAVITY, REACTION_S
 
 MARGIN_M: Final = 10.0  # a cell: where a stretch begins is known no better
@@ -100,10 +101,10 @@ def safe_speed(curvature: FloatArray, mu_lower: FloatArray) -> FloatArray:
     nothing is measured (NaN) none is advised (NaN) but before a slower place, with no more braking than it may bear.
     """
     measured, bend = np.isfinite(mu_lower), np.abs(np.nan_to_num(curvature))
-    grip = GRAVITY * np.where(measured, mu_lower, UNKNOWN_LOWER)
+    expected = np.where(measured, mu_lower, UNKNOWN_LOWER)
+    grip = GRAVITY * expected
     held = np.minimum(grip, COMFORT_ACROSS) / np.maximum(bend, 1e-6)
-    stop = grip * (np.sqrt(REACTION_S**2 + 2.0 * SIGHT_M / grip) - REACTION_S)
-    squares = np.where(measured, np.minimum(held, stop**2), np.inf).tolist()
+    squares = np.where(measured, np.minimum(held, stopping_speed(expected, SIGHT_M) ** 2), np.inf).tolist()
     brakes, bends = np.minimum(grip, COMFORT).tolist(), bend.tolist()
     for k in range(len(squares) - 2, -1, -1):
         if squares[k + 1] < squares[k]:

@@ -16,6 +16,7 @@ from fleet_service.analytics.questions import Question
 from fleet_service.archive import export, geo
 from schemas import grid
 from schemas.errors import InputError
+from schemas.runtime import commandline
 from schemas.runtime.durable import written
 
 SHOWN_ROWS: Final = 20
@@ -80,7 +81,7 @@ def write(table: pa.Table, question: Question, path: Path) -> None:
         InputError: an unknown ending, an answer that has no place, or a file that cannot be written.
     """
     table = ordered(table, question)
-    try:
+    with commandline.writing(path):
         if path.suffix == ".parquet" and not path.name.endswith(".geo.parquet"):
             with written(path) as file:
                 pq.write_table(table, file, compression="zstd")
@@ -93,8 +94,6 @@ def write(table: pa.Table, question: Question, path: Path) -> None:
             export.write(placed(table, question), path)
         else:
             export.write(table, path)
-    except OSError as error:
-        raise InputError("out", f"cannot write {path} ({error.strerror})", "name a file you may write") from error
 
 
 def placed(table: pa.Table, question: Question) -> pa.Table:

@@ -21,6 +21,7 @@ from fleet_service.archive.load import load
 from schemas import grid, tables
 from schemas.errors import InputError
 from schemas.numeric import BoolArray
+from schemas.runtime import commandline
 from schemas.runtime.durable import written
 from schemas.wire import Kind
 
@@ -125,10 +126,8 @@ def write(table: pa.Table, path: Path) -> None:
     writer = _WRITERS.get(path.suffix)
     if writer is None:
         raise InputError("out", f"{path.name} has no known ending", f"use one of {', '.join(_WRITERS)}")
-    try:
+    with commandline.writing(path):
         writer(table, path)
-    except OSError as error:
-        raise InputError("out", f"cannot write {path} ({error.strerror})", "name a file you may write") from error
 
 
 def _geojson(table: pa.Table, path: Path) -> None:

@@ -26,7 +26,6 @@ def run(arguments: argparse.Namespace) -> int:
 
     from fleet_service.analytics.roads.join import joined
     from fleet_service.analytics.roads.network import read_network
-    from schemas.errors import InputError
     from schemas.runtime.durable import written
 
     commandline.ending("out", commandline.out_folder("out", arguments.out), (".parquet",))
@@ -34,12 +33,8 @@ def run(arguments: argparse.Namespace) -> int:
     network = read_network(arguments.extract, arguments.id, arguments.name)
     talk.doing(f"joining {len(network.links)} directed links")
     table = joined(network)
-    try:
-        with written(arguments.out) as file:
-            pq.write_table(table, file, compression="zstd")
-    except OSError as error:
-        problem = f"cannot write {arguments.out} ({error.strerror})"
-        raise InputError("out", problem, "name a file you may write") from error
+    with commandline.writing(arguments.out), written(arguments.out) as file:
+        pq.write_table(table, file, compression="zstd")
     licence = network.source.get("licence")
     print(f"{table.num_rows} places on {len(network.links)} directed links in {arguments.out}"
           + (f"; {licence}" if licence else ""))  # fmt: skip

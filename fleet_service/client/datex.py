@@ -96,9 +96,10 @@ def publication(
     for name, record in old.items():
         if name in told:
             continue
-        shown = _found(record, "sit:locationReference/loc:coordinatesForDisplay")
-        heard = is_heard(*(float(child.text or "nan") for child in shown))
-        ended = _ended(record, now) if heard else record
+        place = (
+            float(child.text or "nan") for child in _found(record, "sit:locationReference/loc:coordinatesForDisplay")
+        )
+        ended = _ended(record, now) if _has_ended(record) or is_heard(*place) else record
         if ended is not None:
             root.append(_situation(supplier, ended))
     ET.indent(root)
@@ -195,11 +196,15 @@ def _ended(record: ET.Element, now: int) -> ET.Element | None:
     return record
 
 
+def _has_ended(record: ET.Element) -> bool:
+    return record.find(".//com:overallEndTime", _SPACES) is not None
+
+
 def _same_place(alert: StretchAlert, old: dict[str, ET.Element], told: set[str]) -> str | None:
     """The situation that has a cell of a stretch, where a reader began anew and names it otherwise."""
     cells = {f"{latitude:.{DIGITS}f} {longitude:.{DIGITS}f}" for latitude, longitude in alert.points}
     for name, record in old.items():
-        if name not in told and record.find(".//com:overallEndTime", _SPACES) is None and cells & _cells(record):
+        if name not in told and not _has_ended(record) and cells & _cells(record):
             return name
     return None
 

@@ -17,6 +17,7 @@ from fleet_service.client.watching import GATHER_S, standing_alerts
 from schemas import grid, keys, query, wire
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
+from schemas.runtime import commandline
 from schemas.runtime.durable import written
 
 REFRESH_S: Final = 60.0  # between two looks at all that stands, and at the most between two times of publication
@@ -38,7 +39,7 @@ class DatexFeed:
         self._supplier, self._path, self._say = supplier, path, say
         self._stretches, self._lock = Stretches(), threading.Lock()
         self._before = path.read_bytes() if path.exists() else None
-        self._written = 0.0
+        self._has_news, self._written = True, 0.0
         self._heard: dict[int, bool] = {}
         self._is_heard: Callable[[float, float], bool] = lambda *_: False
         if self._before is not None:
@@ -48,11 +49,11 @@ class DatexFeed:
         """An alert was raised or cleared, or still stands."""
         with self._lock:
             self._stretches.take(alert)
+            self._has_news = True
 
     def look(self, session: zenoh.Session) -> None:
         """Ask for all that stands. What a service no longer speaks for has not ended."""
-        found = standing_alerts(session)
-        places, self._heard = {(alert.cell, alert.sector) for alert in found}, {}
+        found, self._heard = standing_alerts(session), {}
 
         def is_heard(latitude: float, longitude: float) -> bool:
             tile = int(grid.tile_of(int(grid.cell_of(latitude, longitude))))
@@ -62,11 +63,8 @@ class DatexFeed:
 
         self._is_heard = is_heard
         with self._lock:
-            self._stretches.keep(
-                lambda alert: (alert.cell, alert.sector) in places or not is_heard(alert.latitude, alert.longitude)
-            )
-            for alert in found:
-                self._stretches.take(alert)
+            self._stretches.take_all(found, lambda alert: is_heard(alert.latitude, alert.longitude))
+            self._has_news = True
 
     def write(self) -> None:
         """Write the publication where it says something new, or has not been written for long.
@@ -75,19 +73,17 @@ class DatexFeed:
             InputError: the file cannot be written.
         """
         with self._lock:
+            if not self._has_news and time.monotonic() < self._written + REFRESH_S:
+                return
+            self._has_news = False
             self._stretches.changes()
             standing = self._stretches.standing
         new = publication(self._supplier, standing, time.time_ns(), self._before, self._is_heard)
         changed = self._before is None or not same_but_for_time(new, self._before)
         if not changed and time.monotonic() < self._written + REFRESH_S:
             return
-        try:
-            with written(self._path) as file:
-                file.write(new)
-        except OSError as error:
-            raise InputError(
-                "out", f"cannot write {self._path} ({error.strerror})", "name a file you may write"
-            ) from error
+        with commandline.writing(self._path), written(self._path) as file:
+            file.write(new)
         self._before, self._written = new, time.monotonic()
         if changed:
             self._say(f"{len(standing)} slippery stretches in {self._path}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -16,10 +16,11 @@ from schemas import grid, keys, query, tables
 from schemas.config import ServiceConfig, ZenohSettings, load
 from schemas.errors import InputError
 from schemas.query import Format
-from schemas.runtime import zenoh_session
+from schemas.runtime import commandline, zenoh_session
 from schemas.wire.tile import decode_tile
 
 TIMEOUT_S: Final = 10.0
+EVERYWHERE: Final = f"{keys.ROOT}/map/**"
 SERVED_S: Final = 1.0  # for a router to say who answers
 SHOWN: Final = ("latitude", "longitude", "sector", "mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehicles",
                 "observations", "age_s")  # fmt: skip
@@ -47,17 +48,25 @@ def ask(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
         InputError: the query is refused, here or by a service, or no router answers.
     """
     form = query.parse(parameters).format
-    selector = f"{keys.ROOT}/map/**" + ("?" + ";".join(f"{k}={v}" for k, v in parameters.items()) if parameters else "")
-    payloads = []
     with joined(connection) as session:
-        for reply in session.get(selector, timeout=TIMEOUT_S):
-            if reply.ok is None:
-                problem = reply.err.payload.to_string() if reply.err else "no reply"
-                field, _, rest = problem.partition(": ")
-                raise InputError(field if rest else "query", rest or problem, "see above")
-            payloads.append((str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
+        payloads = sorted(replies(session, EVERYWHERE, parameters))
         served = bool(payloads) or is_served(session, query.parse(parameters))
-    return replace(_joined(form, [payload for _, payload in sorted(payloads)]), served=served)
+    return replace(_joined(form, [payload for _, payload in payloads]), served=served)
+
+
+def replies(session: zenoh.Session, key: str, parameters: Mapping[str, str]) -> Iterator[tuple[str, bytes]]:
+    """Key and payload of every reply for a key expression of the map.
+
+    Raises:
+        InputError: a service refused the question.
+    """
+    text = ";".join(f"{name}={value}" for name, value in parameters.items())
+    for reply in session.get(f"{key}?{text}" if text else key, timeout=TIMEOUT_S):
+        if reply.ok is None:
+            problem = reply.err.payload.to_string() if reply.err else "no reply"
+            field, _, rest = problem.partition(": ")
+            raise InputError(field if rest else "query", rest or problem, "see above")
+        yield str(reply.ok.key_expr), reply.ok.payload.to_bytes()
 
 
 def served_table(answer: Answer) -> pa.Table:
@@ -76,16 +85,19 @@ def is_served(session: zenoh.Session, asked: query.MapQuery) -> bool:
 
     A service has a token, which not every reader may see; and it answers for the tiles of its regions.
     """
-    point = asked.route[0] if asked.route else asked.bbox[:2] if asked.bbox else (0.0, 0.0)
-    if is_place_served(session, point[1], point[0]):
+    point = asked.route[0] if asked.route else asked.bbox[:2] if asked.bbox else None
+    if _is_matched(session, EVERYWHERE) if point is None else is_place_served(session, point[1], point[0]):
         return True
     return any(reply.ok is not None for reply in session.liveliness().get(f"{keys.ROOT}/shard/*", timeout=SERVED_S))
 
 
 def is_place_served(session: zenoh.Session, latitude: float, longitude: float) -> bool:
     """Whether a service answers for the tile of a place [deg]; no takes SERVED_S."""
-    tile = grid.tile_of(int(grid.cell_of(latitude, longitude)))
-    querier: Any = session.declare_querier(keys.map_key(int(tile)))
+    return _is_matched(session, keys.map_key(int(grid.tile_of(int(grid.cell_of(latitude, longitude))))))
+
+
+def _is_matched(session: zenoh.Session, expression: str) -> bool:
+    querier: Any = session.declare_querier(expression)
     deadline = time.monotonic() + SERVED_S
     while not querier.matching_status.matching:
         if time.monotonic() > deadline:
@@ -123,14 +135,12 @@ def write(answer: Answer, path: Path) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    try:
+    with commandline.writing(path):
         if answer.table is None:
             path.write_text(json.dumps(answer.document))
         else:
             with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_stream(sink, answer.table.schema) as writer:
                 writer.write_table(answer.table)
-    except OSError as error:
-        raise InputError("out", f"cannot write {path} ({error.strerror})", "name a file you may write") from error
 
 
 def text(answer: Answer) -> str:

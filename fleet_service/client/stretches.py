@@ -8,7 +8,7 @@ the larger part keeps it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from typing import Any, Final, Literal
@@ -102,9 +102,12 @@ class Stretches:
             self._standing.pop(place, None)
         self._last = alert
 
-    def keep(self, is_standing: Callable[[Alert], bool]) -> None:
-        """Drop the alerts that ended while nobody heard of it."""
-        self._standing = {place: alert for place, alert in self._standing.items() if is_standing(alert)}
+    def take_all(self, standing: Iterable[Alert], is_heard: Callable[[Alert], bool]) -> None:
+        """These stand; of the others those ended, unheard, for whose place a service speaks."""
+        told = {(alert.cell, alert.sector): alert for alert in standing}
+        self._standing = {place: one for place, one in self._standing.items() if place in told or not is_heard(one)}
+        for alert in told.values():
+            self.take(alert)
 
     @property
     def standing(self) -> list[StretchAlert]:

@@ -10,6 +10,7 @@ from typing import Final, NamedTuple
 import pyarrow as pa
 import zenoh
 
+from fleet_service.client.map_client import TIMEOUT_S
 from fleet_service.client.stretches import StretchAlert, Stretches
 from schemas import grid, keys, query, wire
 from schemas.config import ZenohSettings
@@ -92,7 +93,7 @@ def watch(
 
 def standing_alerts(session: zenoh.Session) -> list[wire.Alert]:
     """The alerts that stand, of all services that answer."""
-    replies = (reply.ok for reply in session.get(f"{keys.ROOT}/alert/**") if reply.ok is not None)
+    replies = (reply.ok for reply in session.get(f"{keys.ROOT}/alert/**", timeout=TIMEOUT_S) if reply.ok is not None)
     return [alert for reply in replies for alert in wire.decode_standing(reply.payload.to_bytes())]
 
 

@@ -15,6 +15,8 @@ from typing import Any, Final
 import pyarrow as pa
 import zenoh
 
+from fleet_service.client import map_client
+from fleet_service.client.watching import standing_alerts
 from fleet_service.page.world import HeldWorld, box_of
 from schemas import grid, keys, tables, wire
 from schemas.config import ZenohSettings
@@ -24,7 +26,6 @@ from schemas.wire.tile import decode_tile
 
 log = logging.getLogger(__name__)
 ROUND_S: Final = 0.5
-ASK_S: Final = 10.0
 REFRESH_S: Final = 60.0  # a tile is put when it changes; that its intervals widen with time must be asked for
 REFRESHED: Final = 20  # tiles in a round: 40 a second, 2 400 in the minute; more are renewed more rarely
 REGIONS: Final = 256  # that are watched for a service
@@ -54,7 +55,7 @@ class Reader:
             return
         with session:
             self._session = session
-            session.declare_subscriber(f"{keys.ROOT}/map/**", self._tile)
+            session.declare_subscriber(map_client.EVERYWHERE, self._tile)
             session.declare_subscriber(f"{keys.ROOT}/alert/**", self._alert)
             for kind in self._names:
                 session.liveliness().declare_subscriber(f"{keys.ROOT}/{kind}/*", self._token, history=True)
@@ -99,15 +100,10 @@ class Reader:
         session = self._session
         if session is None:
             raise InputError("connect", "no router answers", "see that one runs")
-        text = ";".join(f"{name}={value}" for name, value in parameters.items())
-        for reply in session.get(f"{selector}?{text}" if text else selector, timeout=ASK_S):
-            if reply.ok is None:
-                problem = reply.err.payload.to_string() if reply.err else "no reply"
-                field, _, rest = problem.partition(": ")
-                raise InputError(field if rest else "query", rest or problem, "see above")
-            tile = keys.parse(str(reply.ok.key_expr)).quadint
+        for key, payload in map_client.replies(session, selector, parameters):
+            tile = keys.parse(key).quadint
             if tile is not None:
-                yield tile, decode_tile(reply.ok.payload.to_bytes())
+                yield tile, decode_tile(payload)
 
     def _tile(self, sample: zenoh.Sample) -> None:
         with _told(sample):
@@ -128,14 +124,11 @@ class Reader:
     def _ask_all(self, session: zenoh.Session) -> None:
         """What was there before this page; it subscribed first, so that nothing is missed in between."""
         try:
-            for tile, table in self.ask(f"{keys.ROOT}/map/**", {}):
+            for tile, table in self.ask(map_client.EVERYWHERE, {}):
                 self._world.take_tile(tile, table, time.time())
         except (InputError, WireError) as error:
             log.warning("the map was not told: %s", error)
-        standing = []
-        for reply in session.get(f"{keys.ROOT}/alert/**", timeout=ASK_S):
-            if reply.ok is not None:
-                standing += wire.decode_standing(reply.ok.payload.to_bytes())
+        standing = standing_alerts(session)
         self._world.take_standing(standing, lambda cell: self._answers(int(grid.region_of(cell))), time.time())
 
     def _refresh(self, session: zenoh.Session) -> None:
@@ -176,7 +169,7 @@ class Reader:
         if session is None:
             return False
         if self._anything is None:
-            self._anything = session.declare_querier(f"{keys.ROOT}/map/**")
+            self._anything = session.declare_querier(map_client.EVERYWHERE)
         return bool(self._anything.matching_status.matching)
 
 

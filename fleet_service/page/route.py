@@ -12,14 +12,15 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.page.stopping import SIGHTS_M, safe_speed
 from schemas import grid
 from schemas.errors import InputError
+from schemas.stopping import stopping_speed
 from schemas.thresholds import METRES_PER_DEGREE
 
 STEP_M: Final = 4.0  # well below a cell's side
 MOST_M: Final = 200_000.0  # what a picture can show
 UNKNOWN: Final = "unknown"
+SIGHTS_M: Final = (50, 100)
 Points = Sequence[tuple[float, float]]
 
 
@@ -60,12 +61,17 @@ def profile(points: Points, table: pa.Table) -> dict[str, Any]:
     return {"length_m": length, "share": share, "stretches": stretches, "worst": worst}
 
 
+def safe_speeds(mu_lower: float) -> dict[str, float]:
+    """Speed [m/s] from which one stops on the lower end of what is known, by metres of sight."""
+    return {str(sight): float(stopping_speed(mu_lower, sight)) for sight in SIGHTS_M}
+
+
 def _told(cell: dict[str, Any]) -> dict[str, Any]:
     measured = cell["basis"] == "measured"
     names = ("cell", "sector", "basis", "mu_lower", "mu_upper", "p_slippery", "vehicles", "age_s")
-    speeds = {str(sight): safe_speed(cell["mu_lower"], sight) for sight in SIGHTS_M} if measured else None
     return {name: cell[name] for name in names} | {
-        "mu": cell["mu"] if measured else None, "cell": str(cell["cell"]), "safe_speed": speeds,
+        "mu": cell["mu"] if measured else None, "cell": str(cell["cell"]),
+        "safe_speed": safe_speeds(cell["mu_lower"]) if measured else None,
     }  # fmt: skip
 
 

@@ -19,7 +19,7 @@ from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from fleet_service.page import asked, colours, overlay, records, route, stopping
+from fleet_service.page import asked, colours, overlay, records, route
 from fleet_service.page.health import ServiceHealth
 from fleet_service.page.moments import Moments
 from fleet_service.page.reader import Reader
@@ -87,7 +87,7 @@ class Routes:
     async def settings(self, _: Request) -> Response:
         """Numbers and colours that the page computes with."""
         return JSONResponse({
-            "colours": colours.told(), "reaction_s": REACTION_S, "sights_m": stopping.SIGHTS_M,
+            "colours": colours.told(), "reaction_s": REACTION_S, "sights_m": route.SIGHTS_M,
             "mu_steps": records.MU_STEPS, "share_steps": records.SHARE_STEPS, "base_map": self._of.base_map,
             "overlay": self._of.overlay is not None,
         })  # fmt: skip
@@ -136,9 +136,9 @@ class Routes:
             for row in table.to_pylist():
                 if row["cell"] == cell and row["sector"] == sector:
                     measured = row["basis"] == "measured"
-                    speeds = {str(s): stopping.safe_speed(row["mu_lower"], s) for s in stopping.SIGHTS_M}
+                    speeds = route.safe_speeds(row["mu_lower"]) if measured else None
                     times = {name: row[name].value / NS for name in ("first_time", "last_time")}
-                    return row | times | {"cell": str(cell), "safe_speed": speeds if measured else None}
+                    return row | times | {"cell": str(cell), "safe_speed": speeds}
         return None
 
     async def history(self, request: Request) -> Response:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.client.stretches import StretchAlert, Stretches
+from fleet_service.client.stretches import Stretches
 from fleet_service.page import records
 from fleet_service.page.records import Records, TileBlock
 from schemas import grid
@@ -42,8 +42,6 @@ class HeldWorld:
         self._tiles: dict[int, HeldTile] = {}
         self._before: dict[int, _Before] = {}  # of the tiles that changed since `changes` was asked
         self._stretches = Stretches()
-        self._standing: dict[tuple[int, int], Alert] = {}
-        self._alerts: dict[str, StretchAlert] = {}
         self.heard = 0.0  # when any service said anything [s since 1970]
 
     def take_tile(self, tile: int, table: pa.Table, now: float) -> None:
@@ -62,25 +60,13 @@ class HeldWorld:
         """An alert of a cell was raised, repeated or cleared."""
         with self._lock:
             self.heard = now
-            self._take(alert)
+            self._stretches.take(alert)
 
     def take_standing(self, standing: Iterable[Alert], served: Callable[[int], bool], now: float) -> None:
         """These alerts stand; of the cells that are served no others do."""
         with self._lock:
             self.heard = now
-            told = {(alert.cell, alert.sector): alert for alert in standing}
-            for place, alert in list(self._standing.items()):
-                if place not in told and served(place[0]):
-                    self._take(replace(alert, raised=False, reason="it ended while this page could not hear"))
-            for alert in told.values():
-                self._take(alert)
-
-    def _take(self, alert: Alert) -> None:
-        self._stretches.take(alert)
-        if alert.raised:
-            self._standing[alert.cell, alert.sector] = alert
-        else:
-            self._standing.pop((alert.cell, alert.sector), None)
+            self._stretches.take_all(standing, lambda alert: served(alert.cell))
 
     def changes(self) -> list[TileBlock]:
         """What has changed of each tile since this was asked last."""
@@ -97,18 +83,12 @@ class HeldWorld:
     def alerts_changed(self) -> bool:
         """Whether stretches changed since this was asked last."""
         with self._lock:
-            changes = self._stretches.changes()
-            for one in changes:
-                if one.state == "cleared":
-                    self._alerts.pop(one.id, None)
-                else:
-                    self._alerts[one.id] = one
-            return bool(changes)
+            return bool(self._stretches.changes())
 
     def standing(self) -> list[dict[str, Any]]:
         """The stretches that stand, newest first."""
         with self._lock:
-            return [one.values() for one in sorted(self._alerts.values(), key=lambda one: -one.since)]
+            return [one.values() for one in sorted(self._stretches.standing, key=lambda one: -one.since)]
 
     def tiles(self) -> list[int]:
         """All tiles that have cells."""

@@ -9,7 +9,8 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -123,6 +124,19 @@ def out_folder(field: str, path: Path) -> Path:
             field, f"cannot write {path} (No such file or directory)", "name a file in a folder that is there"
         )
     return path
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Write the file that `--out` names in this block.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise InputError("out", f"cannot write {path} ({error.strerror})", "name a file you may write") from error
 
 
 def ending(field: str, path: Path, known: Sequence[str]) -> str:

@@ -139,14 +139,13 @@ def _judged(found: pa.Table, roads: pa.Table, seen: pa.Table, span: tuple[int, i
              for row in roads.group_by(["link", "direction"], use_threads=False).aggregate(
                  [("name", "first"), ("length_m", "first")]).to_pylist()}  # fmt: skip
     share = _measured(roads, seen)
-    names = [
-        (str(row["link"]), str(row["direction"]), int(row["piece"]), int(row["slot"])) for row in found.to_pylist()
-    ]
+    rows = found.to_pylist()
+    names = [(str(row["link"]), str(row["direction"]), int(row["piece"]), int(row["slot"])) for row in rows]
     number = {key: k for k, key in enumerate(sorted(set(names)))}
     found = found.append_column("key", pa.array([number[key] for key in names], pa.int64()))
     each, keys = slots(found), sorted(number)
     links: dict[tuple[str, str], _Measured] = {}
-    for (link, direction, _, _), row in zip(names, found.to_pylist(), strict=True):
+    for (link, direction, _, _), row in zip(names, rows, strict=True):
         own = links.setdefault((link, direction), _Measured({}, set(), []))
         own.vehicles.add(row["vehicle"])
         own.values.append(int(row["values"]))
@@ -155,13 +154,13 @@ def _judged(found: pa.Table, roads: pa.Table, seen: pa.Table, span: tuple[int, i
     out = []
     for key, own in links.items():
         found_breaches = []
-        for rows in own.pieces.values():
-            slot = np.array([keys[k][3] for k in rows], np.int64)
-            lower, mu, upper = (each[name][rows] for name in ("lower", "mu", "upper"))
+        for of_piece in own.pieces.values():
+            slot = np.array([keys[k][3] for k in of_piece], np.int64)
+            lower, mu, upper = (each[name][of_piece] for name in ("lower", "mu", "upper"))
             found_breaches.append(breach(slot, lower, mu, upper, level, span))
         by_mean, begin = max((one[0], one[3]) for one in found_breaches)
         least, most = (max(one[k] for one in found_breaches) for k in (1, 2))
-        worst = min((k for rows in own.pieces.values() for k in rows), key=lambda k: float(each["mu"][k]))
+        worst = min((k for of_piece in own.pieces.values() for k in of_piece), key=lambda k: float(each["mu"][k]))
         enough = share[key] >= LEAST_SHARE and len(own.vehicles) >= options.least_vehicles
         verdict = BROKEN if least > within else KEPT if most <= within and enough else UNKNOWN
         out.append(

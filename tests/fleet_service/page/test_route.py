@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from itertools import pairwise
 from typing import Any
 
@@ -12,12 +11,10 @@ import pytest
 
 from fleet_service.fusion import Fusion
 from fleet_service.page.route import profile
-from fleet_service.page.stopping import safe_speed
 from fleet_service.serve.encode import cell_table
 from schemas import grid
 from schemas.errors import InputError
 from schemas.tables import MAP_SCHEMA
-from schemas.thresholds import GRAVITY, REACTION_S
 from tests.fleet_service.examples import START, at_least, observations, value
 from tests.fleet_service.page import street
 
@@ -76,11 +73,3 @@ def test_a_point_or_a_continent_is_refused() -> None:
     for points in ([(11.0, 57.0)], [(11.0, 57.0), (11.0, 57.0)], [(11.0, 57.0), (11.0, 67.0)]):
         with pytest.raises(InputError, match="route"):
             profile(points, MAP_SCHEMA.empty_table())
-
-
-@pytest.mark.parametrize("lower", [0.05, 0.2, 0.8])
-@pytest.mark.parametrize("sight", [50, 100])
-def test_from_the_safe_speed_one_stops_within_the_sight(lower: float, sight: float) -> None:
-    speed = safe_speed(lower, sight)
-    assert speed * REACTION_S + speed**2 / (2 * GRAVITY * lower) == pytest.approx(sight)
-    assert math.isclose(safe_speed(0.0, sight), 0.0)

@@ -1,0 +1,18 @@
+"""How fast one may go and still stop within what one sees. Pure."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from schemas.numeric import FloatArray
+from schemas.thresholds import GRAVITY, REACTION_S
+
+
+def stopping_speed(mu: FloatArray | float, sight_m: float) -> FloatArray:
+    """Speed [m/s] from which one stops within a sight [m] on a level road, after the reaction, at g·mu; 0 at no grip.
+
+    v·REACTION_S + v²/(2·g·mu) = sight_m, solved for v.
+    """
+    grip = GRAVITY * np.asarray(mu, np.float64)
+    during = grip * REACTION_S
+    return np.asarray(np.sqrt(during**2 + 2.0 * grip * sight_m) - during)
