@@ -2,8 +2,11 @@
 PYTHON ?= python3
 BIN := .venv/bin
 STAMP := .venv/.installed
+PAPERS := .venv/.papers
 
-TESTS := $(BIN)/python -m pytest -q --numprocesses auto --dist loadfile
+# one process more than cores, for many tests wait for processes of their own
+TESTS := $(BIN)/python -m pytest -q --numprocesses $$(( $$(getconf _NPROCESSORS_ONLN) + 1 )) --dist loadfile
+export PYTHONDONTWRITEBYTECODE :=  # what was parsed once is kept: tests start hundreds of processes
 
 .PHONY: setup demo test test-all test-shuffled check package docs lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test usability figures roads-bench browser-test
 
@@ -15,16 +18,20 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m deploy.precompile
 	touch $@
 
+$(PAPERS): $(STAMP)
+	$(BIN)/python -m deploy.precompile papers
+	touch $@
+
 demo: setup  ## router, fleet service and simulated vehicles; ends with the map beside the truth
 	$(BIN)/python -m deploy.demo $(ARGS)
 
-test: setup  ## the tests that take seconds, a process a core; says what the slowest cost
+test: $(PAPERS)  ## the tests that take seconds; says what the slowest cost
 	$(TESTS) --durations 10 -m 'not long and not campaign'
 
-test-all: setup  ## these, and the campaigns in their quick form
+test-all: $(PAPERS)  ## these, and the campaigns in their quick form
 	$(TESTS) --durations 10
 
-test-shuffled: setup  ## all ten times in an order drawn anew: none may lean on another
+test-shuffled: $(PAPERS)  ## all ten times in an order drawn anew: none may lean on another
 	for round in 1 2 3 4 5 6 7 8 9 10; do $(TESTS) --random-order || exit 1; done
 
 browser-test: setup  ## pages in the system's Chromium; pictures in .page

@@ -1,37 +1,54 @@
-"""`python -m deploy.precompile`: compile what service, agent and simulated vehicle need, once on this machine.
+"""`python -m deploy.precompile [papers]`: compile what is needed often, once on this machine.
 
-`make setup` ends with it, so that the first start of anything does not wait. What cannot be compiled here is
-compiled at the first start, which says so.
+`make setup` ends with what service, agent and simulated vehicle need, so that the first start of anything does not
+wait. The tests need the papers' filters too. What cannot be compiled here is compiled at the first start, which says
+so.
 """
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Final
 
-SERVICE = "from fleet_service.app.precompile import warm_up; warm_up()"
-AGENT = "import sys; from edge_agent.cli import main; sys.exit(main())"
-DRIVE = ("straight", "--duration", "1", "--seed", "0", "--out", "drive.parquet", "--vehicle-out", "car.json")
-ESTIMATE = ("drive.parquet", "--vehicle", "car.json", "--out", "estimates.parquet")
+from edge_agent import known_estimators
+
+SERVICE: Final = "from fleet_service.app.precompile import warm_up; warm_up()"
+AGENT: Final = "import sys; from edge_agent.cli import main; sys.exit(main())"
+DRIVE: Final = ("straight", "--duration", "1", "--seed", "0", "--out", "drive.parquet", "--vehicle-out", "car.json")
+DEFAULT: Final = "aco-fckf"
 
 
-def main() -> int:
-    """Compile, both halves side by side; 0 whatever comes of it."""
+def main(words: list[str]) -> int:
+    """Compile, a process a core; 0 whatever comes of it."""
     began = time.monotonic()
-    print("compiling kernels, once on this machine", flush=True)
-    with tempfile.TemporaryDirectory() as folder, (Path(folder) / "log").open("w+") as log:
-        service = subprocess.Popen([sys.executable, "-c", SERVICE], stdout=log, stderr=log)
-        for command in (("simulate", *DRIVE), ("replay", *ESTIMATE)):
-            subprocess.run([sys.executable, "-c", AGENT, *command], cwd=folder, stdout=log, stderr=log, check=False)
-        service.wait()
-        log.seek(0)
-        said = [line for line in log if "error" in line.lower()]
+    papers = words == ["papers"]
+    print(f"compiling {'the filters of the papers' if papers else 'kernels'}, once on this machine", flush=True)
+    names = [name for name, _ in known_estimators() if name != DEFAULT] if papers else [DEFAULT]
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count()) as workers:
+        service = [] if papers else [workers.submit(_run, folder, SERVICE)]
+        said = _run(folder, AGENT, "simulate", *DRIVE)
+        replays = [workers.submit(_run, folder, AGENT, "replay", *_estimate(name)) for name in names]
+        for done in (*service, *replays):
+            said += done.result()
     print(f"compiled in {time.monotonic() - began:.0f} s", *said, sep="\n", flush=True)
     return 0
 
 
+def _estimate(name: str) -> tuple[str, ...]:
+    return "drive.parquet", "--vehicle", "car.json", "--estimator", name, "--out", f"{name}.parquet"
+
+
+def _run(folder: str, code: str, *words: str) -> list[str]:
+    """Run a process; its lines that tell of an error."""
+    done = subprocess.run([sys.executable, "-c", code, *words], cwd=Path(folder), capture_output=True, text=True)
+    return [line for line in (done.stdout + done.stderr).splitlines() if "error" in line.lower()]
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1:]))
