@@ -11,7 +11,9 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
 from itertools import chain, compress
 from pathlib import Path
 
@@ -111,10 +113,16 @@ class Engine:
         restored = np.array_split(np.arange(self.fusion.size), self.fusion.size // SNAPSHOT_SLOTS + 1)
         matters = Begin(first_day(root), begin.cut)
         rest = replay(root, self.fusion, Since(matters, streams if begin.cut else None), set_aside)
-        for slots in chain(restored, (updated.slots for updated in rest)):
-            self._alerts.updated(slots)
-            self.map.changed(slots)
-        restore_streams(root, streams, matters, set_aside)
+        with ThreadPoolExecutor(1, "streams") as beside:
+            noted = partial(restore_streams, root, streams, matters, set_aside)
+            noting = None if begin.cut else beside.submit(noted)  # what a checkpoint knows, the replay asks
+            for slots in chain(restored, (updated.slots for updated in rest)):
+                self._alerts.updated(slots)
+                self.map.changed(slots)
+            if noting is None:
+                noted()
+            else:
+                noting.result()
         self.seen = streams.newest
         self.counts["files_set_aside"] = count_set_aside(root)
         if config.weather is not None:

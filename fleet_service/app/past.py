@@ -1,7 +1,7 @@
 """The map of a past moment, rebuilt in a process of its own: its memory is bounded before it reads, and goes with it.
 
-`python -m fleet_service.app.past ARCHIVE` reads the question as JSON and writes the replies, each after its tile and
-length; an error is a tile of -1.
+That process (`past_process`) reads the question as JSON and writes the replies, each after its tile and length; an
+error is a tile of -1.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import BinaryIO, Final, NamedTuple
 
 import pyarrow as pa
 
@@ -51,13 +51,12 @@ def ask(root: Path, question: PastQuery, wanted: Callable[[int], bool]) -> Itera
     most = MOST_ROWS if box is None else LOOKED_ROWS
     if rows_near(root, question.at, box, most) > most:
         raise too_much()
-    told = {**question._asdict(), "query": question.query.model_dump_json()}
-    command = [sys.executable, "-m", "fleet_service.app.past", str(root)]
+    command = [sys.executable, "-m", "fleet_service.app.past_process", str(root)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
         assert child.stdin
         assert child.stdout
         with child.stdin as pipe:
-            pipe.write(json.dumps(told).encode())
+            pipe.write(told(question))
         try:
             while head := child.stdout.read(_HEAD.size):
                 tile, size = _HEAD.unpack(head)
@@ -98,22 +97,21 @@ def replies(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
     yield from answer(cache, question.query, lambda _: True, question.at, question.only)
 
 
-def main() -> int:
-    """Answer one question."""
-    pa.set_memory_pool(pa.system_memory_pool())  # gives back what a file took before the next is read
+def told(question: PastQuery) -> bytes:
+    """A question for `answer_one`."""
+    return json.dumps({**question._asdict(), "query": question.query.model_dump_json()}).encode()
+
+
+def answer_one(root: Path, asked: BinaryIO, out: BinaryIO) -> None:
+    """Answer the one question of a process that was begun for it."""
     pa.set_cpu_count(1)
-    told = json.loads(sys.stdin.buffer.read())
-    question = PastQuery(**{**told, "query": MapQuery.model_validate_json(told["query"])})
-    out = sys.stdout.buffer
+    pa.set_io_thread_count(1)  # each thread that reads keeps memory of its own: 20 MB
+    heard = json.loads(asked.read())
+    question = PastQuery(**{**heard, "query": MapQuery.model_validate_json(heard["query"])})
     try:
-        for tile, payload in replies(Path(sys.argv[1]), question):
+        for tile, payload in replies(root, question):
             out.write(_HEAD.pack(tile, len(payload)) + payload)
     except InputError as error:
         payload = json.dumps([error.field, error.problem, error.fix]).encode()
         out.write(_HEAD.pack(_ERROR, len(payload)) + payload)
     out.flush()
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

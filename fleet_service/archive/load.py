@@ -8,7 +8,8 @@ it over and changes nothing.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -24,6 +25,8 @@ from schemas.errors import InputError
 
 log = logging.getLogger(__name__)
 BAD: Final = ".bad"
+BATCH_ROWS: Final = 1 << 14  # that are held at once where a file is gone through: a row group takes ten times as much
+BUFFER_BYTES: Final = 1 << 16  # of a column's file then
 
 # Without them a row is none, whatever version wrote it.
 NEEDED: Final = frozenset(
@@ -42,7 +45,8 @@ def pass_over(path: Path, problem: str) -> None:
 def set_aside(path: Path, problem: str) -> None:
     """Rename a damaged file so that it is not read again, and say so: the way of who writes the archive."""
     log.warning("%s is damaged and set aside: %s", path, problem)
-    path.rename(path.with_name(path.name + BAD))
+    with suppress(FileNotFoundError):  # another reader of this process saw it at the same time
+        path.rename(path.with_name(path.name + BAD))
 
 
 def count_set_aside(root: Path) -> int:
@@ -106,7 +110,8 @@ def load_groups(
     damaged: Damaged = pass_over,
 ) -> bool:
     """As `load`, with the rows handed to `take` a row group at a time: a whole file takes several times their memory
-    while it is read. False if the file is damaged: what was taken of it is to be forgotten.
+    while it is read. Of a row group that holds none that are wanted only the columns of `where` are read. False if
+    the file is damaged: what was taken of it is to be forgotten.
 
     Raises:
         as `load`.
@@ -115,13 +120,22 @@ def load_groups(
 
     def read(file: pq.ParquetFile) -> pa.Table:
         names = [name for name in columns if name in file.schema_arrow.names]
+        own = [one for one in where if one.column in names]
+        looked = list({one.column: None for one in own})
         for group in groups(file.metadata, where):
-            part = file.read_row_group(group, names)
-            part.validate(full=True)
-            take(those(conformed(part, known), where))
+            if own and not any(those(part, own).num_rows for part in _batches(file, group, looked)):
+                continue
+            take(pa.concat_tables([those(conformed(part, known), where) for part in _batches(file, group, names)]))
         return file.schema_arrow.empty_table().select(names)
 
-    return _content(path, read, damaged) is not None
+    return _content(path, read, damaged, BUFFER_BYTES) is not None
+
+
+def _batches(file: pq.ParquetFile, group: int, names: list[str]) -> Iterator[pa.Table]:
+    for batch in file.iter_batches(BATCH_ROWS, [group], names, use_threads=False):
+        table = pa.Table.from_batches([batch])
+        table.validate(full=True)
+        yield table
 
 
 def _some(file: pq.ParquetFile, names: list[str] | None, where: Where) -> pa.Table:
@@ -141,9 +155,11 @@ def content(path: Path, damaged: Damaged = pass_over) -> Content | None:
     return _content(path, lambda file: file.read(), damaged)
 
 
-def _content(path: Path, read: Callable[[pq.ParquetFile], pa.Table], damaged: Damaged) -> Content | None:
+def _content(
+    path: Path, read: Callable[[pq.ParquetFile], pa.Table], damaged: Damaged, buffer_bytes: int = 0
+) -> Content | None:  # fmt: skip
     try:
-        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+        with pq.ParquetFile(path, page_checksum_verification=True, buffer_size=buffer_bytes) as file:
             entries = entries_of(file.metadata.metadata)
             if newer(entries):  # before it is read: it may be written in a way that is not known here
                 judge(path, file.schema_arrow, entries)

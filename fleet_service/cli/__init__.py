@@ -13,14 +13,12 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from typing import Final
 
+from fleet_service.app import UNUSED
 from schemas.runtime import commandline, talk
 from schemas.runtime.commandline import Command
 
 BAD_INPUT: Final = commandline.BAD_INPUT
 LIVE: Final = ("run", "watch", "page")  # commands that go on until a signal
-# 25 MB that a running service's libraries load where they find them: for matrix products in kernels, of which there are
-# none, and for file systems that only a compaction writes to, which is a process of its own.
-UNUSED = ("scipy", "pyarrow._s3fs", "pyarrow._gcsfs", "pyarrow._azurefs", "pyarrow._hdfs")
 
 COMMANDS: Final = (
     Command("run", "fleet_service.cli.run", "take observations in, serve the map, keep the archive",

@@ -28,7 +28,7 @@ SECOND = 10**9
 START = 1_800_000_000 * SECOND
 CELLS = 1_000_000
 RESIDENT = """
-from fleet_service.cli import UNUSED
+from fleet_service.app import UNUSED
 from schemas.runtime.process import limit_memory
 limit_memory(*UNUSED)  # as a service's process begins
 from tests.benchmarks.fusion import resident

@@ -11,9 +11,7 @@ import json
 import shutil
 import subprocess
 import sys
-import threading
 import time
-from contextlib import closing
 from pathlib import Path
 from typing import Final
 
@@ -21,14 +19,11 @@ import numpy as np
 
 from fleet_service.analytics import synthetic
 from fleet_service.analytics.synthetic import LATITUDE, LONGITUDE, START_NS, SyntheticFleet
-from fleet_service.app.engine import Engine
-from fleet_service.app.past import LOOKED_ROWS, PastQuery, box_of, replies
+from fleet_service.app.past import LOOKED_ROWS, PastQuery, box_of, told
 from fleet_service.archive.layout import CHECKPOINTS, DAY_NS
 from fleet_service.archive.segments import SCHEMAS, Writer
-from fleet_service.replay import checkpoints
 from fleet_service.replay.rebuild import rows_near
 from schemas import query
-from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind
 from tests.faults.bars import figure
@@ -51,7 +46,7 @@ def run(site: Site) -> list[Figure]:
     synthetic.write(root, SyntheticFleet(SINCE, 1, vehicles=50, seed=int(time.time())), SEGMENT)
     warm = _measured("ready", root)
     site.say(f"from a checkpoint: {warm}")
-    then = _measured("past", root)
+    then = _measured("past", root, _asked(root))
     site.say(f"a question about the past: {then}")
     return [
         figure("faults.age.ready_s", warm["seconds"]),
@@ -59,9 +54,11 @@ def run(site: Site) -> list[Figure]:
         figure("faults.age.at_mb", then["mb"]),
         figure("faults.age.cold_s", cold["seconds"]),
         figure("faults.age.cold_mb", cold["mb"]),
-        figure("faults.age.cells", min(cold["cells"], warm["cells"], 1e5 * then["tiles"])),
+        figure("faults.age.cells", min(cold["cells"], warm["cells"])),
+        figure("faults.age.at_bytes", then["bytes"]),
         Figure("faults.age.observations", millions, "10^6 observations"),
         Figure("faults.age.at_s", then["seconds"], "s"),
+        Figure("faults.age.cold_processor_s", cold["processor_s"], "s"),
     ]
 
 
@@ -103,45 +100,16 @@ def _states(root: Path, rows: int) -> None:
         at += n
 
 
-def _measured(what: str, root: Path) -> dict[str, float]:
-    """What a process says of itself; see `main`."""
-    command = [sys.executable, "-m", "tests.faults.age", what, str(root)]
-    done = subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True)
+def _asked(root: Path) -> bytes:
+    """The question about the past, which the service would let through."""
+    question = PastQuery(query.parse({"bbox": NEAR}), START_NS + (DAYS - 1) * DAY_NS, 120.0, None)
+    assert 0 < rows_near(root, question.at, box_of(question), LOOKED_ROWS) <= LOOKED_ROWS
+    return told(question)
+
+
+def _measured(what: str, root: Path, asked: bytes = b"") -> dict[str, float]:
+    """What a process says of itself; see `age_process`."""
+    command = [sys.executable, "-m", "tests.faults.age_process", what, str(root)]
+    done = subprocess.run(command, input=asked, stdout=subprocess.PIPE, check=True)
     found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])
     return found
-
-
-def main() -> None:
-    """`ready`: begin from the archive; `checkpoint`: and take one; `past`: ask about it. Says seconds and megabytes."""
-    what, root, began = sys.argv[1], Path(sys.argv[2]), time.perf_counter()
-    if what == "past":
-        asked = PastQuery(query.parse({"bbox": NEAR}), START_NS + (DAYS - 1) * DAY_NS, 120.0, None)
-        assert rows_near(root, asked.at, box_of(asked), LOOKED_ROWS) <= LOOKED_ROWS
-        found = {"tiles": len(list(replies(root, asked)))}  # as the process of its own does
-    else:
-        with closing(Engine(ServiceConfig(), root)) as engine:
-            if what == "checkpoint":
-                _checkpoint(engine, root)
-        found = {"cells": engine.fusion.size}
-    print(json.dumps({"seconds": time.perf_counter() - began, "mb": _most_mb(), **found}))
-
-
-def _most_mb() -> float:
-    """The most memory that this process had; what `getrusage` says holds its parent's too."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1024
-
-
-def _checkpoint(engine: Engine, root: Path) -> None:
-    taken: list[checkpoints.Taken | None] = []
-    thread = threading.Thread(target=lambda: taken.append(engine.checkpoint(threading.Event())))
-    thread.start()
-    while thread.is_alive():
-        engine.flush()
-        thread.join(0.1)
-    assert taken[0] is not None
-    checkpoints.save(root, taken[0])
-
-
-if __name__ == "__main__":
-    main()

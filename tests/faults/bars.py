@@ -73,6 +73,7 @@ BARS: Final = {
     "faults.age.cold_s": Bar("s", 180),
     "faults.age.cold_mb": Bar("MB", 1500),
     "faults.age.cells": Bar("cells", 50_000, "more"),
+    "faults.age.at_bytes": Bar("bytes of the answer", 10_000, "more"),
     "faults.disk.false_acks": Bar("batches", 0),
     "faults.disk.stuck": Bar("times", 0),
     "faults.disk.times_full": Bar("times", 3, "more"),

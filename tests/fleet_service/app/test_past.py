@@ -18,7 +18,7 @@ from fleet_service.app.engine import Engine
 from fleet_service.archive import files, layout, segments
 from fleet_service.archive.between import Between
 from fleet_service.archive.compaction import compact
-from fleet_service.archive.load import load
+from fleet_service.archive.load import load, load_groups
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay.rebuild import rows_near
 from schemas import query, wire
@@ -93,6 +93,10 @@ def test_a_filter_finds_the_same_rows_however_they_are_grouped(
             assert found is not None
             names = columns or schema.names
             assert repr(found.to_pylist()) == repr(table.filter(pa.array(right)).select(names).to_pylist()), where
+            taken: list[pa.Table] = []
+            assert load_groups(path, schema, names, [where], taken.append)
+            assert all(part.num_rows for part in taken), "a row group that holds none is not read"
+            assert repr(pa.concat_tables([found.slice(0, 0), *taken]).to_pylist()) == repr(found.to_pylist())
     assert 0 < wanted[0][1].sum() < 400
 
 

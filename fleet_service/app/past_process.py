@@ -1,0 +1,22 @@
+"""`python -m fleet_service.app.past_process ARCHIVE`: one question about the past from stdin, its replies to stdout."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from fleet_service.app import UNUSED
+from schemas.runtime.process import limit_memory
+
+
+def main() -> int:
+    """Answer it."""
+    limit_memory(*UNUSED)  # before anything loads what it keeps out: 40 MB
+    from fleet_service.app.past import answer_one
+
+    answer_one(Path(sys.argv[1]), sys.stdin.buffer, sys.stdout.buffer)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

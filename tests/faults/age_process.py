@@ -1,0 +1,71 @@
+"""`python -m tests.faults.age_process WHAT ARCHIVE`: a process as the service begins it, measured by itself.
+
+`ready`: begin from the archive; `checkpoint`: and take one; `past`: answer the question on stdin. Says seconds and the
+most megabytes that it ever had.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from contextlib import closing
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fleet_service.app import UNUSED
+from schemas.runtime.process import limit_memory
+
+if TYPE_CHECKING:
+    from fleet_service.app.engine import Engine
+
+
+def main() -> None:
+    """Do it, and say what it cost."""
+    what, root, began = sys.argv[1], Path(sys.argv[2]), time.perf_counter()
+    limit_memory(*UNUSED)
+    found = _past(root) if what == "past" else _begun(root, what == "checkpoint")
+    print(json.dumps({"seconds": time.perf_counter() - began, "mb": _most_mb(), **found}))
+
+
+def _past(root: Path) -> dict[str, float]:
+    from fleet_service.app.past import answer_one
+
+    out = BytesIO()
+    answer_one(root, sys.stdin.buffer, out)
+    return {"bytes": len(out.getvalue())}
+
+
+def _begun(root: Path, and_checkpoint: bool) -> dict[str, float]:
+    from fleet_service.app.engine import Engine
+    from schemas.config import ServiceConfig
+
+    with closing(Engine(ServiceConfig(), root)) as engine:
+        if and_checkpoint:
+            _checkpoint(engine, root)
+        return {"cells": engine.fusion.size, "processor_s": time.process_time()}
+
+
+def _most_mb() -> float:
+    """The most memory that this process had; what `getrusage` says holds its parent's too."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1024
+
+
+def _checkpoint(engine: Engine, root: Path) -> None:
+    from fleet_service.replay import checkpoints
+
+    taken: list[checkpoints.Taken | None] = []
+    thread = threading.Thread(target=lambda: taken.append(engine.checkpoint(threading.Event())))
+    thread.start()
+    while thread.is_alive():
+        engine.flush()
+        thread.join(0.1)
+    assert taken[0] is not None
+    checkpoints.save(root, taken[0])
+
+
+if __name__ == "__main__":
+    main()
