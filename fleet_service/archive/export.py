@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -130,15 +130,19 @@ def write(table: pa.Table, path: Path) -> None:
         writer(table, path)
 
 
-def _geojson(table: pa.Table, path: Path) -> None:
+def features(table: pa.Table) -> Iterator[dict[str, Any]]:
+    """The rows of a GeoParquet table as GeoJSON has them; binary and nested columns are left out."""
     flat = _flat(table)
+    for geometry, *values in zip(geo.shapes(table), *(_texts(flat, name) for name in flat.schema.names), strict=True):
+        properties = dict(zip(flat.schema.names, values, strict=True))
+        yield {"type": "Feature", "geometry": geometry, "properties": properties}
+
+
+def _geojson(table: pa.Table, path: Path) -> None:
     with written(path) as raw:
         file = io.TextIOWrapper(raw, encoding="utf-8")
         file.write('{"type": "FeatureCollection", "features": [\n')
-        rows = zip(geo.shapes(table), *(_texts(flat, name) for name in flat.schema.names), strict=True)
-        for place, (geometry, *values) in enumerate(rows):
-            feature = {"type": "Feature", "geometry": geometry}
-            feature["properties"] = dict(zip(flat.schema.names, values, strict=True))
+        for place, feature in enumerate(features(table)):
             file.write((",\n" if place else "") + json.dumps(feature, allow_nan=False))
         file.write("\n]}\n")
         file.detach()  # flushes it; `written` closes it

@@ -20,6 +20,7 @@ from schemas.runtime import commandline, zenoh_session
 from schemas.wire.tile import decode_tile
 
 TIMEOUT_S: Final = 10.0
+PAST_S: Final = 60.0  # a moment of the past is rebuilt from the archive
 EVERYWHERE: Final = f"{keys.ROOT}/map/**"
 SERVED_S: Final = 1.0  # for a router to say who answers
 SHOWN: Final = ("latitude", "longitude", "sector", "mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehicles",
@@ -61,7 +62,8 @@ def replies(session: zenoh.Session, key: str, parameters: Mapping[str, str]) -> 
         InputError: a service refused the question.
     """
     text = ";".join(f"{name}={value}" for name, value in parameters.items())
-    for reply in session.get(f"{key}?{text}" if text else key, timeout=TIMEOUT_S):
+    timeout = PAST_S if "at" in parameters else TIMEOUT_S
+    for reply in session.get(f"{key}?{text}" if text else key, timeout=timeout):
         if reply.ok is None:
             problem = reply.err.payload.to_string() if reply.err else "no reply"
             field, _, rest = problem.partition(": ")

@@ -7,12 +7,15 @@ from typing import Final
 
 from starlette.requests import Request
 
+from fleet_service.page.features import FEW, MOST, FeatureQuestion
 from fleet_service.page.records import CELL_LEVEL, LEAST_LEVEL
 from fleet_service.page.watchers import View
 from schemas import grid, query
+from schemas.config import nanoseconds
 from schemas.errors import InputError
 
 MOST_TILES: Final = 256  # in one question
+_OF_FEATURES: Final = ("bbox", "datetime", "limit", "after", "f")
 WORLD: Final = (-180.0, -90.0, 180.0, 90.0)
 
 
@@ -39,6 +42,53 @@ def view(request: Request) -> View:
     text = request.query_params.get("bbox")
     box = WORLD if text is None else query.parse({"bbox": text}).bbox or WORLD
     return View(box, level(request))
+
+
+def features(request: Request, now: int) -> FeatureQuestion:
+    """A question for features, now [ns].
+
+    Raises:
+        InputError: a parameter that the interface does not know, or that cannot be read.
+    """
+    given = request.query_params
+    if unknown := [name for name in given if name not in _OF_FEATURES]:
+        raise InputError(unknown[0][:40], "is no parameter", f"use {', '.join(_OF_FEATURES)}")
+    box = query.parse({"bbox": given["bbox"]}).bbox if "bbox" in given else None
+    since, at = _interval(given.get("datetime", "../.."), now)
+    limit = _whole("limit", given["limit"], 1, 1 << 31) if "limit" in given else FEW
+    after = feature(given["after"]) if "after" in given else -1
+    return FeatureQuestion(box, since, at, min(limit, MOST), after)
+
+
+def feature(text: str) -> int:
+    """Place (cell · 4 + sector) of a feature's id."""
+    cell, _, sector = text.partition("-")
+    found = _whole("feature", cell, 0, 4**grid.CELL_ZOOM - 1) * grid.SECTORS
+    return found + _whole("feature", sector, 0, grid.SECTORS - 1)
+
+
+def _interval(text: str, now: int) -> tuple[int, int | None]:
+    """Begin [ns] of what is wanted, and the moment [ns] of the map; None: now.
+
+    RFC 3339: an instant, or an interval of which a side may be open (`..` or nothing).
+    """
+    first, is_interval, last = text.partition("/")
+    begin, end = _instant(first), _instant(last if is_interval else first)
+    if begin is None and end is None and not is_interval:
+        raise InputError("datetime", f"{text[:40]!r} is no time", "give 2026-01-31T07:00:00Z, or two with / between")
+    if begin is not None and end is not None and begin > end:
+        raise InputError("datetime", "ends before it begins", "give the earlier time first")
+    return (begin or 0) if is_interval else 0, None if end is None or end >= now else end
+
+
+def _instant(text: str) -> int | None:
+    if text in ("", ".."):
+        return None
+    try:
+        found = query.parse({"at": text}).at
+    except InputError as error:
+        raise InputError("datetime", error.problem, "give 2026-01-31T07:00:00Z, or two with / between") from error
+    return None if found is None else nanoseconds(found)
 
 
 def place(request: Request) -> tuple[int, int]:

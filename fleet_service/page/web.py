@@ -19,9 +19,10 @@ from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from fleet_service.page import asked, colours, overlay, records, route
+from fleet_service.page import asked, colours, ogc, overlay, records, route
 from fleet_service.page.health import ServiceHealth
 from fleet_service.page.moments import Moments
+from fleet_service.page.ogc import FeatureRoutes
 from fleet_service.page.reader import Reader
 from fleet_service.page.watchers import TooManyWatchersError, Watchers
 from fleet_service.page.world import HeldWorld
@@ -58,7 +59,7 @@ def application(sources: Sources, hosts: Iterable[str], lifespan: Callable[[Star
         "/": routes.index, "/static/{name}": routes.file, "/settings": routes.settings, "/tiles": routes.tiles,
         "/blocks": routes.blocks, "/events": routes.events, "/cell/{cell}/{sector}": routes.cell,
         "/history/{cell}/{sector}": routes.history, "/moments": routes.times, "/route": routes.route,
-        "/health": routes.health, "/overlay": routes.overlay,
+        "/health": routes.health, "/overlay": routes.overlay, **routes.features.paths(),
     }  # fmt: skip
     app = Starlette(
         routes=[Route(path, told(answer)) for path, answer in paths.items()],
@@ -72,10 +73,13 @@ class Routes:
 
     def __init__(self, sources: Sources) -> None:
         self._of = sources
+        self.features = FeatureRoutes(sources.world, sources.reader)
 
-    async def index(self, _: Request) -> Response:
-        """The page."""
-        return FileResponse(STATIC / "index.html", headers={"Cache-Control": "no-cache"})
+    async def index(self, request: Request) -> Response:
+        """The page; to a program the landing page of OGC API Features."""
+        if ogc.wants_json(request):
+            return await self.features.landing(request)
+        return FileResponse(STATIC / "index.html", headers={"Cache-Control": "no-cache", "Vary": "Accept"})
 
     async def file(self, request: Request) -> Response:
         """One of its files, none else."""

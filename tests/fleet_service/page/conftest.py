@@ -45,6 +45,13 @@ def page_of(connection: ZenohSettings, **changed: object) -> Iterator[str]:
         assert not thread.is_alive(), "the page does not leave"
 
 
+@pytest.fixture(scope="module")
+def bare(router: ZenohSettings) -> Iterator[str]:
+    """The address of a page that no service speaks to."""
+    with page_of(router) as address:
+        yield address
+
+
 @pytest.fixture
 def page(router: ZenohSettings, tmp_path: Path) -> Iterator[RunningPage]:
     """A page beside a service that keeps a snapshot each second."""

@@ -76,13 +76,6 @@ def listening(address: str, path: str = "/events") -> Iterator[Iterator[tuple[st
         connection.close()
 
 
-@pytest.fixture(scope="module")
-def bare(router: ZenohSettings) -> Iterator[str]:
-    """The address of a page that no service speaks to."""
-    with page_of(router) as address:
-        yield address
-
-
 def test_every_answer_forbids_what_the_page_does_not_need(bare: str) -> None:
     for path in ("/", "/static/main.js", "/settings", "/nothing", "/blocks?tiles=x"):
         _, headers, _ = ask(bare, path)

@@ -1,0 +1,189 @@
+"""The documents of OGC API Features, Part 1: Core (OGC 17-069r4), of one collection: `grip`, the map's cells. Pure.
+
+A feature is a cell and heading; its geometry is the quarter of the cell on the side that is headed for. A bound has no
+`mu`, what is unknown is null or not there. The time of a feature is that of its newest observation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, Final, NamedTuple
+
+import pyarrow as pa
+
+from schemas import grid, tables
+
+COLLECTION: Final = "grip"
+GEOJSON: Final = "application/geo+json"
+JSON: Final = "application/json"
+SCHEMA_JSON: Final = "application/schema+json"
+OPENAPI: Final = "application/vnd.oai.openapi+json;version=3.0"
+CRS84: Final = "http://www.opengis.net/def/crs/OGC/1.3/CRS84"
+CONFORMANCE: Final = tuple(
+    f"http://www.opengis.net/spec/ogcapi-features-1/1.0/conf/{name}" for name in ("core", "geojson")
+)
+FEW, MOST = 1000, 10_000  # features in an answer: unless asked otherwise, and at the most
+TITLE: Final = "Grip of the road, measured by vehicles"
+ABOUT: Final = (
+    "Peak tyre-road friction per cell of some ten metres and heading, with its 5 % and 95 % quantiles. basis: "
+    "measured, or bound where only a lower bound is known; a bound has no mu. Where nobody was there is no feature: "
+    "that is unknown, not dry. datetime: an instant is the map as it was then; of an interval, the map as it was at "
+    "its end, and of that what was observed since its begin."
+)
+# Columns that are not told: the geometry says them.
+_PLACE: Final = ("latitude", "longitude", "west", "south", "east", "north")
+COLUMNS: Final = tuple(field for field in tables.MAP_CELL if field.name not in _PLACE)
+_TYPES: Final[dict[pa.DataType, dict[str, str]]] = {
+    pa.string(): {"type": "string"}, tables.NS: {"type": "string", "format": "date-time"},
+    **{kind: {"type": "number"} for kind in (pa.float32(), pa.float64())},
+    **{kind: {"type": "integer"} for kind in (pa.int8(), pa.int32(), pa.int64())},
+}  # fmt: skip
+Box = tuple[float, float, float, float]
+
+
+class FeatureQuestion(NamedTuple):
+    """A question for features.
+
+    Attributes:
+        bbox: west, south, east, north [deg]; None: everywhere.
+        since: nothing whose newest observation is older [ns]; 0: everything.
+        at: the map as it was [ns]; None: now.
+        limit: features at the most.
+        after: place (cell · 4 + sector) after which to go on.
+    """
+
+    bbox: Box | None = None
+    since: int = 0
+    at: int | None = None
+    limit: int = FEW
+    after: int = -1
+
+
+def identity(cell: int, sector: int) -> str:
+    """Id of a feature."""
+    return f"{cell}-{sector}"
+
+
+def _link(href: str, rel: str, kind: str, title: str) -> dict[str, str]:
+    return {"href": href, "rel": rel, "type": kind, "title": title}
+
+
+def landing(base: str) -> dict[str, Any]:
+    """What there is; `base` is the address without a slash at its end."""
+    return {
+        "title": "GripMap", "description": ABOUT,
+        "links": [
+            _link(f"{base}/?f=json", "self", JSON, "this document"),
+            _link(f"{base}/", "alternate", "text/html", "the live page"),
+            _link(f"{base}/api", "service-desc", OPENAPI, "the definition of this interface"),
+            _link(f"{base}/conformance", "conformance", JSON, "what it conforms to"),
+            _link(f"{base}/collections", "data", JSON, "the collections"),
+        ],
+    }  # fmt: skip
+
+
+def conformance() -> dict[str, Any]:
+    """The parts of the standard that are kept."""
+    return {"conformsTo": list(CONFORMANCE)}
+
+
+def collections(base: str, extent: Box | None) -> dict[str, Any]:
+    """The collections: one."""
+    links = [_link(f"{base}/collections", "self", JSON, "this document")]
+    return {"links": links, "collections": [collection(base, extent)]}
+
+
+def collection(base: str, extent: Box | None) -> dict[str, Any]:
+    """The collection; `extent` is the box of all cells, where there are any."""
+    own = f"{base}/collections/{COLLECTION}"
+    found: dict[str, Any] = {
+        "id": COLLECTION, "title": TITLE, "description": ABOUT, "itemType": "feature", "crs": [CRS84],
+        "links": [
+            _link(own, "self", JSON, "this document"),
+            _link(f"{own}/items", "items", GEOJSON, "the features"),
+            _link(f"{own}/schema", "describedby", SCHEMA_JSON, "the columns"),
+        ],
+    }  # fmt: skip
+    if extent is not None:
+        found["extent"] = {"spatial": {"bbox": [list(extent)], "crs": CRS84}}
+    return found
+
+
+def schema(base: str) -> dict[str, Any]:
+    """A feature as JSON Schema, as GDAL takes it: who sees only bounds at first knows that `mu` is a number."""
+    columns = {f.name: {**_TYPES[f.type], "description": f"{f.meaning} [{f.unit}]"} for f in COLUMNS}
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "$id": f"{base}/collections/{COLLECTION}/schema", "type": "object", "title": TITLE,
+        "properties": {
+            "type": {"type": "string"}, "geometry": {"type": "object"},
+            "properties": {"type": "object", "properties": columns},
+        },
+    }  # fmt: skip
+
+
+def api(base: str) -> dict[str, Any]:
+    """The definition of the interface, OpenAPI 3.0."""
+
+    def route(summary: str, *parameters: dict[str, Any]) -> dict[str, Any]:
+        answers = {"200": {"description": "the document"}, "400": {"description": "what was wrong, and how to mend it"}}
+        return {"get": {"summary": summary, "parameters": list(parameters), "responses": answers}}
+
+    def parameter(name: str, where: str, about: str, **form: object) -> dict[str, Any]:
+        return {"name": name, "in": where, "required": where == "path", "description": about, "schema": form}
+
+    asked = (
+        parameter("bbox", "query", "west, south, east, north [deg]", type="array", items={"type": "number"},
+                  minItems=4, maxItems=4) | {"style": "form", "explode": False},
+        parameter("datetime", "query", "instant or interval, RFC 3339", type="string"),
+        parameter("limit", "query", "of one answer", type="integer", minimum=1, maximum=MOST, default=FEW),
+        parameter("after", "query", "id after which to go on; links say it", type="string"),
+    )  # fmt: skip
+    one, own = parameter("featureId", "path", "CELL-SECTOR", type="string"), f"/collections/{COLLECTION}"
+    return {
+        "openapi": "3.0.3", "info": {"title": TITLE, "version": "1.0.0", "description": ABOUT},
+        "servers": [{"url": base}],
+        "paths": {
+            "/": route("what there is"), "/conformance": route("what it conforms to"),
+            "/collections": route("the collections"), own: route("the collection"),
+            f"{own}/schema": route("the columns"), f"{own}/items": route("features", *asked),
+            f"{own}/items/{{featureId}}": route("one feature", one),
+        },
+    }  # fmt: skip
+
+
+def page_of(features: Iterable[dict[str, Any]], more: bool, address: str, following: str, stamp: str) -> dict[str, Any]:
+    """Features as an answer.
+
+    Args:
+        features: each with its id.
+        more: whether there are more of them.
+        address: of this answer.
+        following: of the one after it.
+        stamp: when it was so, ISO 8601.
+    """
+    found = list(features)
+    links = [_link(address, "self", GEOJSON, "this document")]
+    if more:
+        links.append(_link(following, "next", GEOJSON, "what follows"))
+    return {
+        "type": "FeatureCollection", "timeStamp": stamp, "numberReturned": len(found), "links": links,
+        "features": found,
+    }  # fmt: skip
+
+
+def told(features: Iterable[dict[str, Any]]) -> Iterable[dict[str, Any]]:
+    """Features with their id, and without what the geometry says."""
+    names = {field.name for field in COLUMNS}
+    for feature in features:
+        properties = {name: value for name, value in feature["properties"].items() if name in names}
+        yield {**feature, "id": identity(properties["cell"], properties["sector"]), "properties": properties}
+
+
+def extent_of(tiles: Iterable[int]) -> Box | None:
+    """The box of tiles [deg]; None of none."""
+    sides = [grid.bounds(tile, grid.TILE_ZOOM) for tile in tiles]
+    if not sides:
+        return None
+    west, south, east, north = ([float(one[k]) for one in sides] for k in range(4))
+    return min(west), min(south), max(east), max(north)

@@ -1,0 +1,160 @@
+"""The routes of OGC API Features: the map as QGIS, ArcGIS and GDAL open it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from datetime import UTC, datetime
+from typing import Final
+from urllib.parse import urlencode
+
+import numpy as np
+import pyarrow as pa
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+
+from fleet_service.archive import export, geo
+from fleet_service.client import map_client
+from fleet_service.page import asked, features
+from fleet_service.page.features import COLLECTION, GEOJSON, FeatureQuestion
+from fleet_service.page.reader import Reader
+from fleet_service.page.world import HeldWorld
+from schemas import grid, keys
+from schemas.tables import MAP_SCHEMA
+from schemas.thresholds import NS
+
+_OWN: Final = f"/collections/{COLLECTION}"
+
+
+class FeatureRoutes:
+    """The answers, a method each.
+
+    Args:
+        world: knows which tiles have cells now.
+        reader: asks for cells.
+    """
+
+    def __init__(self, world: HeldWorld, reader: Reader) -> None:
+        self._world, self._reader = world, reader
+
+    def paths(self) -> dict[str, Callable[[Request], Awaitable[Response]]]:
+        """What answers which path."""
+        return {
+            "/conformance": self.conformance, "/collections": self.collections, _OWN: self.collection, "/api": self.api,
+            f"{_OWN}/schema": self.schema, f"{_OWN}/items": self.items, f"{_OWN}/items/{{feature}}": self.item,
+        }  # fmt: skip
+
+    async def landing(self, request: Request) -> Response:
+        """What there is, for programs."""
+        return JSONResponse(features.landing(_base(request)), headers={"Vary": "Accept"})
+
+    async def conformance(self, _: Request) -> Response:
+        """What is kept of the standard."""
+        return JSONResponse(features.conformance())
+
+    async def collections(self, request: Request) -> Response:
+        """The one collection, in a list."""
+        return JSONResponse(features.collections(_base(request), self._extent()))
+
+    async def collection(self, request: Request) -> Response:
+        """The collection."""
+        return JSONResponse(features.collection(_base(request), self._extent()))
+
+    async def schema(self, request: Request) -> Response:
+        """Its columns."""
+        return JSONResponse(features.schema(_base(request)), media_type=features.SCHEMA_JSON)
+
+    async def api(self, request: Request) -> Response:
+        """The interface."""
+        return JSONResponse(features.api(_base(request)), media_type=features.OPENAPI)
+
+    async def items(self, request: Request) -> Response:
+        """Features by place, from `after` on; `next` goes on where this ends, whatever changes meanwhile."""
+        question = asked.features(request, time.time_ns())
+        if not self._reader.served:
+            told = "no service answers for the map; that is no empty map\n"
+            return PlainTextResponse(told, 503, headers={"Retry-After": "10"})
+        return await run_in_threadpool(self._items, request, question)
+
+    def _items(self, request: Request, question: FeatureQuestion) -> Response:
+        table = self._cells(question)
+        more = table.num_rows > question.limit
+        table = table.slice(0, question.limit)
+        address, last = f"{_base(request)}{_OWN}/items", ""
+        if table.num_rows:
+            last = features.identity(table["cell"][-1].as_py(), table["sector"][-1].as_py())
+        given = {name: value for name, value in request.query_params.items() if name != "after"}
+        stamp = datetime.fromtimestamp((question.at or time.time_ns()) / NS, UTC).isoformat().replace("+00:00", "Z")
+        answer = features.page_of(
+            features.told(export.features(geo.with_cells(table))), more, str(request.url),
+            f"{address}?{urlencode(given | {'after': last})}", stamp,
+        )  # fmt: skip
+        return JSONResponse(answer, media_type=GEOJSON, headers={"Cache-Control": "no-store"})
+
+    async def item(self, request: Request) -> Response:
+        """One feature, as it is now."""
+        place = asked.feature(request.path_params["feature"])
+        table = await run_in_threadpool(self._cells, FeatureQuestion(_box(place), after=place - 1, limit=1))
+        cell, sector = divmod(place, grid.SECTORS)
+        table = table.filter((pa.compute.field("cell") == cell) & (pa.compute.field("sector") == sector))
+        for found in features.told(export.features(geo.with_cells(table))):
+            links = [{"href": f"{_base(request)}{_OWN}", "rel": "collection", "type": features.JSON}]
+            return JSONResponse({**found, "links": links}, media_type=GEOJSON)
+        return PlainTextResponse("nobody was there: nothing is known\n", 404)
+
+    def _cells(self, question: FeatureQuestion) -> pa.Table:
+        """One more row than asked for, where there are so many, by place.
+
+        Raises:
+            InputError: a service refused the question.
+        """
+        found, rows = [MAP_SCHEMA.empty_table()], 0
+        for table in self._tiles(question):
+            place = table["cell"].to_numpy() * grid.SECTORS + table["sector"].to_numpy()
+            newest = table["last_time"].cast(pa.int64()).to_numpy()
+            order = np.argsort(place, kind="stable")
+            order = order[(place[order] > question.after) & (newest[order] >= question.since)]
+            found.append(table.take(order))
+            rows += len(order)
+            if rows > question.limit:
+                break
+        return pa.concat_tables(found).slice(0, question.limit + 1)
+
+    def _tiles(self, question: FeatureQuestion) -> Iterator[pa.Table]:
+        """Cells a tile at a time, in the order of tiles."""
+        parameters = {}
+        if question.bbox is not None:
+            parameters["bbox"] = ",".join(f"{side:.9f}" for side in question.bbox)
+        if question.at is not None:  # one question: a moment of the past is rebuilt once
+            parameters["at"] = datetime.fromtimestamp(question.at / NS, UTC).isoformat()
+            tables = dict(self._reader.ask(map_client.EVERYWHERE, parameters))
+            yield from (tables[tile] for tile in sorted(tables))
+            return
+        first = int(grid.tile_of(question.after // grid.SECTORS)) if question.after >= 0 else 0
+        for tile in sorted(self._world.tiles()):
+            area = grid.bounds(tile, grid.TILE_ZOOM)
+            if tile >= first and (question.bbox is None or bool(grid.touches(question.bbox, area))):
+                for _, table in self._reader.ask(keys.map_key(tile), parameters):
+                    yield table
+
+    def _extent(self) -> features.Box | None:
+        return features.extent_of(self._world.tiles())
+
+
+def wants_json(request: Request) -> bool:
+    """Whether a program asks, which wants the landing page of the interface and not the map that people see."""
+    form = request.query_params.get("f")
+    if form is not None:
+        return form == "json"
+    accepted = request.headers.get("accept", "*/*")
+    return "json" in accepted and "text/html" not in accepted
+
+
+def _base(request: Request) -> str:
+    return str(request.base_url).rstrip("/")
+
+
+def _box(place: int) -> features.Box:
+    west, south, east, north = (float(side) for side in grid.bounds(place // grid.SECTORS))
+    return west, south, east, north

@@ -1,0 +1,171 @@
+"""The map as OGC API Features: opened by GDAL's own client, asked by hand, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import geopandas
+import numpy as np
+import pytest
+
+from fleet_service.page.features import CONFORMANCE
+from schemas import grid
+from tests.fleet_service.page import street
+from tests.fleet_service.page.conftest import Drive, RunningPage
+from tests.fleet_service.page.test_server import ask
+from tests.waiting import until
+
+ITEMS = "/collections/grip/items"
+# In a process of their own: GDAL keeps the interpreter while it waits for the page, which is in this one.
+READERS = {
+    "GDAL": "import pyogrio; found = pyogrio.read_dataframe('OAPIF:{address}', layer='grip')",
+    "geopandas": "import geopandas; found = geopandas.read_file('{address}collections/grip/items?limit=10000')",
+}
+
+
+def opened_by(reader: str, address: str, folder: Path) -> Any:  # noqa: ANN401 geopandas is untyped
+    """The features as a reader of others has them."""
+    out = folder / f"{reader}.parquet"
+    script = f"{READERS[reader].format(address=address)}; found.to_parquet({str(out)!r})"
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
+    return geopandas.read_parquet(out)
+
+
+def told(page: RunningPage, path: str) -> dict[str, Any]:
+    """A document, which must be there."""
+    status, headers, body = ask(page.address, path)
+    assert status == 200, body
+    assert "json" in headers["content-type"]
+    found: dict[str, Any] = json.loads(body)
+    return found
+
+
+def drawn(page: RunningPage, drive: Drive, *parts: str) -> None:
+    """Parts are driven, and the page knows of it."""
+    before = count(page)
+    drive(*parts)
+    until(lambda: count(page) >= before + street.known(*parts))
+
+
+def count(page: RunningPage) -> int:
+    """Features that there are; 0 before the page knows of a service."""
+    status, _, body = ask(page.address, ITEMS)
+    assert status in (200, 503), body
+    return int(json.loads(body)["numberReturned"]) if status == 200 else 0
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_readers_of_others_open_it_and_see_bounds_without_a_value(
+    page: RunningPage, drive: Drive, reader: str, tmp_path: Path
+) -> None:
+    drawn(page, drive, "passed", "ice")
+    found = opened_by(reader, page.address, tmp_path)
+    assert len(found) == street.known("passed", "ice")
+    assert found.crs.to_epsg() == 4326
+    measured = found[found["basis"] == "measured"]
+    bound = found[found["basis"] == "bound"]
+    assert (len(measured), len(bound)) == (street.known("ice"), street.known("passed"))
+    assert bound["mu"].isna().all()
+    assert measured["mu"].astype(float).between(0.1, 0.25).all()
+    assert measured.geometry.is_valid.all()
+    south, north = (grid.bounds(street.cells(street.PARTS["ice"]))[k] for k in (1, 3))
+    assert measured.total_bounds[1] == pytest.approx(south.min())
+    assert measured.total_bounds[3] == pytest.approx(north.max())
+
+
+def test_mu_is_a_number_also_to_who_sees_only_bounds_first(page: RunningPage, drive: Drive, tmp_path: Path) -> None:
+    drawn(page, drive, "passed")
+    found = opened_by("GDAL", page.address, tmp_path)
+    assert found["mu"].dtype == np.float64
+    assert found["vehicles"].dtype.kind == "i"
+
+
+def test_pages_follow_each_other_and_nothing_is_there_twice(page: RunningPage, drive: Drive) -> None:
+    drawn(page, drive, "ice", "wet")
+    found, path, pages = [], f"{ITEMS}?limit=7", 0
+    while path:
+        answer = told(page, path)
+        assert answer["numberReturned"] == len(answer["features"]) <= 7
+        found += [one["id"] for one in answer["features"]]
+        path = next((link["href"] for link in answer["links"] if link["rel"] == "next"), "").removeprefix(
+            page.address[:-1]
+        )
+        pages += 1
+    assert pages == -(-street.known("ice", "wet") // 7)
+    assert len(set(found)) == len(found) == street.known("ice", "wet")
+    one = told(page, f"{ITEMS}/{found[3]}")
+    assert one["id"] == found[3]
+    assert one["properties"]["vehicles"] == len(street.CARS)
+
+
+def test_a_box_holds_what_touches_it(page: RunningPage, drive: Drive) -> None:
+    drawn(page, drive, "ice", "avenue")
+    west, south, east, north = (float(v) for v in grid.bounds(int(street.cells(street.PARTS["ice"])[2])))
+    inside = told(page, f"{ITEMS}?bbox={west + 1e-7},{south + 1e-7},{east - 1e-7},{north - 1e-7}")
+    assert {one["properties"]["cell"] for one in inside["features"]} == {int(street.cells(street.PARTS["ice"])[2])}
+    assert told(page, f"{ITEMS}?bbox={west + 9},{south},{east + 9},{north}")["features"] == []
+
+
+def test_a_time_is_the_map_of_then_and_an_interval_what_was_observed_in_it(page: RunningPage, drive: Drive) -> None:
+    drawn(page, drive, "ice")
+    time.time_ns()
+    now = _text(time.time())
+    later = _text(time.time() + 3600)
+    drawn(page, drive, "wet")
+    everything = told(page, ITEMS)["features"]
+    assert len(told(page, f"{ITEMS}?datetime=../..")["features"]) == len(everything)
+    assert len(told(page, f"{ITEMS}?datetime={later}")["features"]) == len(everything)
+    newest = {one["properties"]["last_time"] for one in everything}
+    middle = sorted(newest)[len(newest) // 2]
+    since = told(page, f"{ITEMS}?datetime={middle}/..")["features"]
+    assert {one["properties"]["last_time"] for one in since} == {t for t in newest if t >= middle}
+    then = {one["id"] for one in told(page, f"{ITEMS}?datetime={now}")["features"]}
+    assert then < {one["id"] for one in everything}
+
+
+def _text(at: float) -> str:
+    return f"{datetime.fromtimestamp(at, UTC):%Y-%m-%dT%H:%M:%S.%fZ}"
+
+
+def test_programs_get_the_landing_page_and_people_the_map(page: RunningPage) -> None:
+    assert b"<html" in ask(page.address, "/", Accept="text/html,application/json;q=.9")[2]
+    assert b"<html" in ask(page.address, "/")[2]
+    found = json.loads(ask(page.address, "/", Accept="application/json")[2])
+    assert {"service-desc", "conformance", "data", "self"} <= {link["rel"] for link in found["links"]}
+    for link in found["links"]:
+        assert ask(page.address, link["href"].removeprefix(page.address[:-1]))[0] == 200
+    assert told(page, "/conformance")["conformsTo"] == list(CONFORMANCE)
+    (one,) = told(page, "/collections")["collections"]
+    assert one["id"] == told(page, "/collections/grip")["id"] == "grip"
+    paths = told(page, "/api")["paths"]
+    assert set(paths) >= {"/", "/conformance", "/collections", "/collections/grip", ITEMS, f"{ITEMS}/{{featureId}}"}
+
+
+@pytest.mark.parametrize(
+    "asked",
+    ["?bbox=1,2", "?bbox=9,2,1,3", "?limit=0", "?limit=x", "?datetime=yesterday",
+     "?datetime=2026-01-02T00:00Z/2026-01-01T00:00Z",
+     "?colour=red", "?after=7", "/x", "/1-9"],
+)  # fmt: skip
+def test_a_wrong_question_is_told_what_and_how_to_mend_it(bare: str, asked: str) -> None:
+    status, _, body = ask(bare, ITEMS + asked)
+    assert status == 400
+    assert b"; " in body
+
+
+def test_no_service_is_no_empty_map_and_no_visit_is_no_feature(
+    bare: str,
+    page: RunningPage,
+    drive: Drive,
+) -> None:
+    status, _, body = ask(bare, ITEMS)
+    assert (status, body[:10]) == (503, b"no service")
+    drawn(page, drive, "ice")
+    nobody = int(street.cells(street.PARTS["dry"])[0])
+    assert ask(page.address, f"{ITEMS}/{nobody}-0")[0] == 404
