@@ -1,8 +1,10 @@
 """Are cars that come to an alerted stretch warned in time, and no others? Simulated drivers, the real warnings.
 
 The link is up and the map known, within SPREAD of `known_town`: what is judged is what a car makes of it, with the
-fixes of its receiver. A car is warned in time when it could stop before the stretch from where it was told: 1.5 s of
-reaction, then braking with the true friction of the road before it, with 3 m/s² at the most.
+fixes of its receiver. A car comes to a stretch from road that is not slippery; who drives from snow onto ice is on it
+already. It is warned in time when it could stop before the stretch from where it was told: 1.5 s of reaction, then
+braking with the true friction of the road before it, with 3 m/s² at the most; and when the warning stands as it comes.
+A warning is false when nothing slippery lies within a lane's width of where the car then drove: no cell is finer.
 """
 
 from __future__ import annotations
@@ -28,9 +30,11 @@ from schemas.thresholds import GRAVITY, NS, REACTION_S
 RATE_HZ: Final = 50.0
 AFTER_S: Final = 80.0  # of the scenario's clock: all its events have happened
 SETTLE_S: Final = 10.0  # until the cars are under way
-NEW_M: Final = 60.0  # without ice before an approach counts as one
+NEW_M: Final = 60.0  # of road that is not slippery before an approach counts as one
 ALERTED: Final = 0.3  # what lies below has P(slippery) > 0.9 on such a map, and the service alerts
 NEAR_SLIPPERY: Final = 0.45  # a stretch may begin in a cell that is half ice
+BESIDE_M: Final = 3.5
+BESIDE_HZ: Final = 10.0
 START_NS: Final = 1_800_000_000 * NS
 
 
@@ -47,13 +51,24 @@ class Approaches:
 
 
 @dataclass
+class _Told:
+    """One warning: the look at which it was raised, what it said, and the look at which it ended."""
+
+    at: int
+    distance: float
+    length: float
+    ended: float = float("inf")
+
+
+@dataclass
 class _Track:
-    """One car's way: metre, speed and friction at each look, what it was told, and where it is on the ice."""
+    """One car's way: metre, speed, friction and the least beside it at each look, and what it was told, by name."""
 
     metre: list[float] = field(default_factory=list)
     speed: list[float] = field(default_factory=list)
     mu: list[float] = field(default_factory=list)
-    told: list[tuple[int, float, float]] = field(default_factory=list)  # look, distance, length
+    beside: list[float] = field(default_factory=list)
+    told: dict[str, _Told] = field(default_factory=dict)
     active: tuple[Active, ...] = ()
 
 
@@ -92,6 +107,7 @@ def drive(seed: int, seconds: float, vehicles: int, counts: Approaches, *, route
         moved = np.hypot(np.diff(true.x, axis=0), np.diff(true.y, axis=0)).sum(axis=0)
         driven += moved
         counts.metres += float(moved.sum())
+        beside = _least_beside(fleet, float(t[-1, 0]))
         for k, track in enumerate(tracks):
             latitude, longitude, yaw = (
                 float(column[-1, k]) for column in (located.latitude, located.longitude, located.yaw)
@@ -100,10 +116,20 @@ def drive(seed: int, seconds: float, vehicles: int, counts: Approaches, *, route
             track.metre.append(float(driven[k]))
             track.speed.append(pose.speed)
             track.mu.append(float(true.mu_wheel[:, k].min()))
+            track.beside.append(float(beside[k]))
             if np.isfinite([latitude, longitude, yaw]).all():
                 _look(track, pose, known, _ways(fleet, k, pose, known, routed=routed))
     for track in tracks:
         _judge(track, counts)
+
+
+def _least_beside(fleet: SimulatedFleet, t: float) -> FloatArray:
+    """Least friction (N,) within BESIDE_M of where the vehicles drove in the last second, as it is at t [s]."""
+    true, every = fleet.truth, round(RATE_HZ / BESIDE_HZ)
+    x, y, yaw = true.x[::every], true.y[::every], true.yaw[::every]
+    lanes = [(x - side * np.sin(yaw), y + side * np.cos(yaw)) for side in (-BESIDE_M, 0.0, BESIDE_M)]
+    found = [fleet.scenario.friction(t, *(column.ravel() for column in lane)).reshape(x.shape) for lane in lanes]
+    return np.asarray(np.min(found, axis=(0, 1)))
 
 
 def _ways(fleet: SimulatedFleet, k: int, pose: Pose, known: HeardMap, *, routed: bool) -> list[Path]:
@@ -116,35 +142,36 @@ def _ways(fleet: SimulatedFleet, k: int, pose: Pose, known: HeardMap, *, routed:
 
 
 def _look(track: _Track, pose: Pose, known: HeardMap, ways: list[Path]) -> None:
-    now = pose.time
-    known_now = known  # the link is up: nothing fades
-    track.active, told = warn(track.active, [look_ahead(way, known_now, now) for way in ways], pose, known_now)
+    track.active, told = warn(track.active, [look_ahead(way, known, pose.time) for way in ways], pose, known)
     look = len(track.metre) - 1
-    track.told += [(look, one.distance_m, one.length_m) for one in told if one.state == "raised"]
+    for one in told:
+        if one.state == "raised":
+            track.told[one.id] = _Told(look, one.distance_m, one.length_m)
+        elif one.state == "ended":
+            track.told[one.id].ended = look
 
 
 def _judge(track: _Track, counts: Approaches) -> None:
-    metre, speed, mu = (np.array(column) for column in (track.metre, track.speed, track.mu))
+    metre, speed, mu, beside = (np.array(column) for column in (track.metre, track.speed, track.mu, track.beside))
     slippery = mu < ALERTED
     for look in np.flatnonzero(slippery[1:] & ~slippery[:-1]) + 1:
         far = metre[look] - metre
         before = (far > 0.0) & (far <= NEW_M)
-        if look < SETTLE_S or not before.any() or slippery[before].any():
+        if look < SETTLE_S or not before.any() or (mu[before] < NEAR_SLIPPERY).any():
             continue
         counts.came += 1
         start = float(metre[look - 1])  # the ice begins after the look before, at the latest by this one
-        late = min(
-            (_short(metre, speed, mu, at, start) for at, *_ in track.told if metre[look] - 250.0 <= metre[at] <= start),
-            default=float("inf"),
-        )
+        standing = (one.at for one in track.told.values() if one.at < look < one.ended)
+        late = min((_short(metre, speed, mu, at, start) for at in standing), default=float("inf"))
         counts.warned += late <= 0.0
         if late > 0.0:
             counts.short.append(late)
     counts.raised += len(track.told)
-    for at, distance, length in track.told:
-        ahead = (metre >= metre[at] - 10.0) & (metre <= metre[at] + distance + length + 30.0)
-        whole = metre[-1] >= metre[at] + distance + length + 30.0  # the drive went on so far
-        counts.false += bool(whole and not (mu[ahead] < NEAR_SLIPPERY).any())
+    for one in track.told.values():
+        end = metre[one.at] + one.distance + one.length + 30.0
+        ahead = (metre >= metre[one.at] - 10.0) & (metre <= end)
+        whole = metre[-1] >= end  # the drive went on so far
+        counts.false += bool(whole and not (beside[ahead] < NEAR_SLIPPERY).any())
 
 
 def _short(metre: FloatArray, speed: FloatArray, mu: FloatArray, at: int, start: float) -> float:

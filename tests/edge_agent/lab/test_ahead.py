@@ -27,12 +27,22 @@ def test_cars_that_come_to_ice_are_counted_and_warned() -> None:
     assert counts.warned > 0
     assert counts.metres > 1000.0
     deaf = approaches.Approaches()
-    track = approaches._Track(metre=[10.0 * k for k in range(30)], speed=[10.0] * 30, mu=[0.9] * 20 + [0.15] * 10)
+    mu = [0.9] * 20 + [0.15] * 10
+    track = approaches._Track([10.0 * k for k in range(30)], [10.0] * 30, mu, mu)
     approaches._judge(track, deaf)
     assert (deaf.came, deaf.warned) == (1, 0), "who is not told is not warned"
-    track.told = [(12, 80.0, 50.0), (2, 30.0, 20.0)]
+    track.told = {"ice": approaches._Told(12, 80.0, 50.0), "nothing": approaches._Told(2, 30.0, 20.0, ended=8)}
     approaches._judge(track, deaf)
     assert (deaf.came, deaf.warned, deaf.false) == (2, 1, 1), "the first in time; the second of nothing"
+    track.told["ice"].ended = 18
+    approaches._judge(track, deaf)
+    assert (deaf.came, deaf.warned) == (3, 1), "a warning that was taken back is none"
+    track.told["ice"] = approaches._Told(18, 20.0, 50.0)
+    approaches._judge(track, deaf)
+    assert (deaf.came, deaf.warned) == (4, 1), "too late"
+    track.mu[16:20] = [0.3] * 4
+    approaches._judge(track, deaf)
+    assert deaf.came == 4, "who comes from snow is on it already"
 
 
 def test_warnings_are_timed_over_a_real_router() -> None:
