@@ -19,7 +19,8 @@ from tests.house import ROOT
 LASTING: Final = ("python -m deploy.router", "fleet-service run", "edge-agent run", "fleet-service watch")
 LEFT_OUT: Final = ("pip install",)
 SECTION: Final = "## Using them"
-SETTLE_S: Final = 20.0  # until what stays is up; kernels may have to be compiled
+READY: Final = {"fleet-service run": "ready: "}  # what a person waits for before the next line
+SETTLE_S: Final = 2.0  # until what says nothing is up
 LONGEST_S: Final = 300.0
 
 
@@ -62,7 +63,7 @@ def run(folder: Path) -> list[str]:
                         [str(bin_folder / typed[0]), *typed[1:]], cwd=folder, stdout=out, stderr=out
                     )
                 staying.append((command, process))
-                time.sleep(SETTLE_S if "service run" in command else 2.0)
+                _wait(command, process, log)
                 if process.poll() is not None:
                     failed.append(f"{command}: ended with {process.returncode}: {_last(log)}")
                     staying.pop()
@@ -79,6 +80,15 @@ def run(folder: Path) -> list[str]:
         for words, process in staying:
             _end(words, process, failed)
     return failed
+
+
+def _wait(command: str, process: subprocess.Popen[bytes], log: Path) -> None:
+    word = next((word for start, word in READY.items() if command.startswith(start)), None)
+    deadline = time.monotonic() + (SETTLE_S if word is None else LONGEST_S)
+    while process.poll() is None and time.monotonic() < deadline:
+        if word is not None and any(line.startswith(word) for line in log.read_text(errors="replace").splitlines()):
+            return
+        time.sleep(0.1)
 
 
 def _end(command: str, process: subprocess.Popen[bytes], failed: list[str]) -> None:
