@@ -51,7 +51,7 @@ class Approaches:
 
 
 @dataclass
-class _Told:
+class _Raised:
     """One warning: the look at which it was raised, what it said, and the look at which it ended."""
 
     at: int
@@ -68,7 +68,7 @@ class _Track:
     speed: list[float] = field(default_factory=list)
     mu: list[float] = field(default_factory=list)
     beside: list[float] = field(default_factory=list)
-    told: dict[str, _Told] = field(default_factory=dict)
+    told: dict[str, _Raised] = field(default_factory=dict)
     active: tuple[Active, ...] = ()
 
 
@@ -146,7 +146,7 @@ def _look(track: _Track, pose: Pose, known: HeardMap, ways: list[Path]) -> None:
     look = len(track.metre) - 1
     for one in told:
         if one.state == "raised":
-            track.told[one.id] = _Told(look, one.distance_m, one.length_m)
+            track.told[one.id] = _Raised(look, one.distance_m, one.length_m)
         elif one.state == "ended":
             track.told[one.id].ended = look
 
