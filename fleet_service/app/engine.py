@@ -11,19 +11,21 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
-from functools import partial
-from itertools import chain, compress
+from concurrent.futures import Future, wait
+from dataclasses import replace
+from itertools import compress
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
 
 from fleet_service.app.clock import TimeNow
+from fleet_service.app.memory import SLOTS, Memory, remember
 from fleet_service.app.past import PastQuery, ask
 from fleet_service.app.precompile import warm_up
 from fleet_service.archive.files import lock
+from fleet_service.archive.layout import Cut
 from fleet_service.archive.load import count_set_aside, set_aside
 from fleet_service.archive.log import SegmentLog
 from fleet_service.archive.pseudonyms import Pseudonyms
@@ -37,15 +39,12 @@ from fleet_service.ingest.budgets import NEW_CELLS_AT_ONCE, NEW_CELLS_PER_HOUR, 
 from fleet_service.ingest.dedup import BatchId
 from fleet_service.ingest.inbox import AcceptedBatches, BatchIntake, Message
 from fleet_service.ingest.validation import Clock
-from fleet_service.ingest.weather import WeatherInbox, archived
+from fleet_service.ingest.weather import WeatherInbox
 from fleet_service.ingest.weather import files as weather_files
 from fleet_service.replay import checkpoints
 from fleet_service.replay.checkpoints import Taken
-from fleet_service.replay.rebuild import Begin, Since, first_day, replay, restore_streams
-from fleet_service.replay.restart import image_of, restart
-from fleet_service.serve.alerts import Alerts
+from fleet_service.replay.restart import image_of
 from fleet_service.serve.encode import batch_of
-from fleet_service.serve.map_state import MapState
 from fleet_service.serve.query import answer, cells_asked
 from fleet_service.serve.tile_cache import TileCache
 from schemas import grid, wire
@@ -60,8 +59,9 @@ from schemas.wire import Alert, Kind
 # Rows that wait for the disk at the most; beyond, nothing is taken from the queue until a segment is written.
 WAITING_ROWS = 1_000_000
 CHECKPOINT_WAIT_S = 0.2  # between two looks whether the service stops
+T = TypeVar("T")
 CHECKPOINT_MOST_S = 10.0  # for a good segment; a full disk gives none, and other jobs make room
-SNAPSHOT_SLOTS = 20_000  # at once: the lock is held for 40 ms, and little memory is needed
+ERASED = "what it was raised on was erased"
 
 
 class Engine:
@@ -93,57 +93,79 @@ class Engine:
         self._turn = 0  # of the alerts that are told again
         self.failing = False  # the last segment could not be written
         self.counts["witnesses_damaged"] += mend(root / "keys")
-        begin = restart(root, config.lateness_s)
-        self.fusion, streams = begin.fusion, begin.streams
-        self.counts["checkpoints_refused"] += begin.refused
-        self.map = MapState(self.fusion)
-        self._alerts = Alerts(self.fusion)
-        self._alerts.resume(begin.standing)
         self._guard = threading.Lock()
-        self._tiles = TileCache(self.map, self._guard, config.public_vehicles)
         self._acks, self._now = Acks(), 0
-        self._streams = streams
-        self._intake = BatchIntake(streams, Pseudonyms(root / "keys"), self.counts, self._acks)
         self._log: SegmentLog[BatchId] = SegmentLog(root, config.name)
-        self.weather = WeatherInbox(root, config.name, self.fusion, self.counts)
-        self._checkpoint_wanted = threading.Event()
-        self._checkpoints: queue.SimpleQueue[Taken] = queue.SimpleQueue()
-        used = archived(root, damaged=set_aside)  # before the observations, which it acts on
-        self.fusion.update_weather(archived(root, known=begin.weather, damaged=set_aside) if begin.cut else used)
-        restored = np.array_split(np.arange(self.fusion.size), self.fusion.size // SNAPSHOT_SLOTS + 1)
-        matters = Begin(first_day(root), begin.cut)
-        rest = replay(root, self.fusion, Since(matters, streams if begin.cut else None), set_aside)
-        with ThreadPoolExecutor(1, "streams") as beside:
-            noted = partial(restore_streams, root, streams, matters, set_aside)
-            noting = None if begin.cut else beside.submit(noted)  # what a checkpoint knows, the replay asks
-            for slots in chain(restored, (updated.slots for updated in rest)):
-                self._alerts.updated(slots)
-                self.map.changed(slots)
-            if noting is None:
-                noted()
-            else:
-                noting.result()
-        self.seen = streams.newest
+        self._wanted: queue.SimpleQueue[tuple[Future[Any], Callable[[], object]]] = queue.SimpleQueue()
+        self._ended: list[Alert] = []  # alerts that nobody was told the end of yet
+        memory = remember(root, config.lateness_s, set_aside)
+        self.counts["checkpoints_refused"] += memory.refused
+        self.weather = WeatherInbox(root, config.name, memory.fusion, self.counts)
+        self._know(memory)
+        self.seen = self._streams.newest
         self.counts["files_set_aside"] = count_set_aside(root)
         if config.weather is not None:
-            self._use(self.weather.begin(config.weather, used, time.time_ns()))
+            self._use(self.weather.begin(config.weather, memory.weather, time.time_ns()))
         warm_up()
-        pa.default_memory_pool().release_unused()  # the archive went through it
+
+    def _know(self, memory: Memory) -> None:
+        """Go on with what is known of the archive."""
+        self.fusion, self.map, self._alerts, self._streams = memory.fusion, memory.map, memory.alerts, memory.streams
+        self._tiles = TileCache(self.map, self._guard, self._config.public_vehicles)
+        self._intake = BatchIntake(self._streams, Pseudonyms(self._root / "keys"), self.counts, self._acks)
+        self.weather.fusion = self.fusion
+
+    def recall(self, before: Callable[[], None]) -> None:
+        """Do something, and know what the archive tells then and nothing else; in `between`.
+
+        Raises:
+            OSError: the archive cannot be read; what was known stays.
+        """
+        stood = self._alerts.standing
+        before()
+        memory = remember(self._root, self._config.lateness_s, set_aside)
+        with self._guard:
+            self._tracks, self._places = Tracks(), Bucket(NEW_CELLS_AT_ONCE, NEW_CELLS_PER_HOUR)
+            self._know(memory)
+            still = {(alert.cell, alert.sector) for alert in self._alerts.standing}
+            gone = [alert for alert in stood if (alert.cell, alert.sector) not in still]
+            self._ended += [replace(alert, raised=False, reason=ERASED) for alert in gone]
 
     def checkpoint(self, stop: threading.Event) -> Taken | None:
         """What the service knows, and the segment up to which everything is in it; None if stopped meanwhile.
 
         The worker takes it, right after a segment: then every row that is in it is on disk. Called by another thread.
         """
-        self._checkpoint_wanted.set()
+        return self.between(self._image, stop)
+
+    def between(self, work: Callable[[], T], stop: threading.Event) -> T | None:
+        """Let the worker do something right after a segment, when every row that it took is on disk, and return what
+        that gave; None if stopped meanwhile. Called by another thread.
+
+        Raises:
+            OSError: no segment could be written for too long.
+        """
+        done: Future[T] = Future()
+        self._wanted.put((done, work))
         deadline = time.monotonic() + CHECKPOINT_MOST_S
-        while not stop.is_set():
-            with suppress(queue.Empty):
-                return self._checkpoints.get(timeout=CHECKPOINT_WAIT_S)
-            if time.monotonic() > deadline:
-                self._checkpoint_wanted.clear()
+        while True:
+            wait([done], CHECKPOINT_WAIT_S)
+            if done.done():
+                return done.result()
+            if (stop.is_set() or time.monotonic() > deadline) and done.cancel():
+                if stop.is_set():
+                    return None
                 raise OSError("no segment could be written for so long")
-        return None
+
+    def _image(self) -> Taken:
+        with self._guard:
+            tables = image_of(self.fusion, self._alerts.standing, self._streams)
+        return Taken(tables, self.written_to, tuple(path.name for path in weather_files(self._root)))
+
+    @property
+    def written_to(self) -> Cut:
+        """The segment that was written last."""
+        return self._log.newest
 
     def survived(self) -> None:
         """It has run for a while with what it began from."""
@@ -275,20 +297,21 @@ class Engine:
         A full disk is counted and tried again at the next call; nothing of it is acknowledged.
         """
         acks = self._acknowledged(self._log.flush)
-        if not self.failing and self._checkpoint_wanted.is_set():
-            self._checkpoint_wanted.clear()
-            with self._guard:
-                tables = image_of(self.fusion, self._alerts.standing, self._streams)
-            weather = tuple(path.name for path in weather_files(self._root))
-            self._checkpoints.put(Taken(tables, self._log.newest, weather))
+        while not self.failing and not self._wanted.empty():
+            done, work = self._wanted.get()
+            if done.set_running_or_notify_cancel():
+                try:
+                    done.set_result(work())
+                except Exception as error:  # noqa: BLE001 who wanted it is told
+                    done.set_exception(error)
         return acks
 
     def begin_flush(self) -> list[tuple[str, bytes]]:
         """As `flush`, but messages may be taken while segments are written; `written` gives what is acknowledged.
 
-        If a checkpoint is wanted, all of which must be on disk, it is `flush`.
+        If something is wanted in `between`, it is `flush`.
         """
-        if self._checkpoint_wanted.is_set():
+        if not self._wanted.empty():
             return self.flush()
         self._log.begin()
         return []
@@ -317,17 +340,18 @@ class Engine:
     def whole_map(self, now: int) -> pa.Table:
         """All public cells; the lock is held for a few at a time, so that ingest goes on."""
         tables = []
-        for start in range(0, self.fusion.size, SNAPSHOT_SLOTS):
+        for start in range(0, self.fusion.size, SLOTS):
             with self._guard:
-                slots = np.arange(start, min(start + SNAPSHOT_SLOTS, self.fusion.size))
+                slots = np.arange(start, min(start + SLOTS, self.fusion.size))
                 public = slots[self.fusion.live.vehicles[slots] >= self._config.public_vehicles]
                 tables.append(pa.Table.from_batches([batch_of(self._tiles.seen(public, now), now)]))
         return pa.concat_tables([*tables, MAP_SCHEMA.empty_table()])
 
     def fade_alerts(self, now: int) -> list[Alert]:
-        """Alerts that time alone cleared."""
+        """Alerts that time alone cleared, or an erasure."""
         with self._guard:
-            return self._alerts.faded(now)
+            ended, self._ended = [replace(alert, time=now) for alert in self._ended], []
+            return ended + self._alerts.faded(now)
 
     def answer(
         self, query: MapQuery, wanted: Callable[[int], bool], now: int, only: int | None = None

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import subprocess
-import sys
 import threading
 import time
 from collections import Counter
@@ -15,6 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from fleet_service.app import beside, erasing
 from fleet_service.app.clock import TimeNow
 from fleet_service.app.engine import Engine
 from fleet_service.archive import layout, reserve, segments, snapshots
@@ -30,9 +29,9 @@ from schemas.wire import Kind
 
 log = logging.getLogger(__name__)
 ROUND_ROWS: Final = 250_000  # of one round of compaction: a second of work, 150 MB
-LOOK_S: Final = 0.1  # between two looks whether a compaction has ended, or shall
 INVENTORY_S: Final = 300.0  # thousands of files are looked through in a tenth of a second
 DAY_S: Final = 86_400.0
+ASKED_S: Final = 2.0  # between two looks whether an erasure is asked for
 SOON_S: Final = 60.0  # after the start; the first turn of a job does not wait for its whole interval
 HANGS_S: Final = 1800.0  # a compaction of a day's backlog takes minutes
 _NICE: Final = 10  # the worker goes first
@@ -55,7 +54,8 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
         if not config.put_to and not any(segments.paths(root, kind) for kind in Kind):
             return None
         words = ["compact", "--archive", str(root), "--round-rows", str(ROUND_ROWS)]
-        output = _beside([*words, *(["--to", config.put_to] if config.put_to else [])], stop)
+        words += ["--to", config.put_to] if config.put_to else []
+        output = beside.run("compact", "fleet_service.cli", words, stop)
         return output and f"compacted: {output}"
 
     def snapshot(_: threading.Event) -> str | None:
@@ -102,28 +102,8 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
         Job("snapshot", config.snapshot_s, snapshot),
         Job("retention", DAY_S if config.raw_days else 0.0, with_room(retention)),
         Job("inventory", INVENTORY_S, inventory),
+        Job("erasure", ASKED_S, lambda stop: erasing.asked(engine, config, root, stop)),
     ]
-
-
-def _beside(words: Sequence[str], stop: threading.Event) -> str | None:
-    """What a command of `fleet-service` said, run as a process of its own; None if it was stopped.
-
-    Its memory goes with it, and the worker shares no interpreter with it. A compaction may die at any instant.
-
-    Raises:
-        InputError: it failed.
-    """
-    command = [sys.executable, "-m", "fleet_service.cli", *words]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:
-        while child.poll() is None and not stop.wait(LOOK_S):
-            pass
-        if child.poll() is None:
-            child.terminate()
-            return None
-        output, errors = child.communicate()
-    if child.returncode:
-        raise InputError(words[0], errors.strip() or f"ended with {child.returncode}", "it is tried again")
-    return output.strip()
 
 
 class Upkeep:

@@ -118,6 +118,15 @@ def lock(root: Path) -> BinaryIO:
     return exclusive(root / "lock", f"{root} belongs to a running service", "stop it, or give another folder")
 
 
+def held(root: Path) -> bool:
+    """Whether a service runs on an archive."""
+    try:
+        lock(root).close()
+    except InputError:
+        return True
+    return False
+
+
 def exclusive(path: Path, problem: str, fix: str) -> BinaryIO:
     """Take a lock file for as long as the handle is open.
 

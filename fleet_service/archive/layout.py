@@ -4,6 +4,7 @@
     observations/date=2026-01-31/zone=q1202310/NAME.parquet     compacted, sorted by cell and time
     states/date=…/zone=…/NAME.parquet                           likewise
     checkpoints/…                                               what a restart begins from, see `replay.checkpoints`
+    requests/…                                                  see `requests`
     drafts/                                                     what is being written; nothing there counts
 
 The date is that of the measurement (UTC). NAME is that of the newest segment whose rows the file holds.

@@ -31,12 +31,14 @@ _TURNS: Final = 100  # a reader that is overtaken by so many compactions has ano
 
 class Wanted(NamedTuple):
     """Which rows: with these columns (all, if None), where a filter holds, measured within these days (both count),
-    and written after a place in the log. May yield more than was written after it: the rest of a compacted file."""
+    and written after a place in the log. May yield more than was written after it: the rest of a compacted file. Of the
+    inbox nothing that was written after `until`."""
 
     columns: Sequence[str] | None = None
     where: Where | None = None
     days: tuple[int | None, int | None] = (None, None)
     after: layout.Cut | None = None
+    until: layout.Cut | None = None
 
     def newer(self, path: Path) -> bool:
         """Whether a segment, or a file that is named by its newest one, was written after the place."""
@@ -122,6 +124,8 @@ def _inbox(root: Path, kind: Kind, wanted: Wanted, damaged: Damaged) -> list[tup
     for _ in range(_TURNS):
         try:
             paths = [path for path in segments.paths(root, kind) if wanted.newer(path)]
+            if wanted.until is not None:
+                paths = [path for path in paths if layout.age(path.name)[:2] <= wanted.until]
             schema = segments.SCHEMAS[kind]
             loaded = [
                 (path, load(path, schema, wanted.columns, wanted.where, whole=True, damaged=damaged)) for path in paths

@@ -23,7 +23,7 @@ column are in its field metadata too. This page is generated.
 | `map/date=…/` | the map as it was, an hour apart; GeoParquet 1.1 |
 | `rollup/cell_hour/date=…/zone=…/` | parts of statistics per cell, sector and hour; they add up, and stay for ever |
 | `weather/` | reports of road weather that the map was made with |
-| `inbox/`, `drafts/`, `keys/`, `checkpoints/` | private to the service: do not read or change them |
+| `inbox/`, `drafts/`, `keys/`, `checkpoints/`, `requests/` | private to the service: do not read or change them |
 
 ```python
 import duckdb

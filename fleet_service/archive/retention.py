@@ -6,6 +6,8 @@ Only these two rewrite or remove compacted files, one file for one.
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import date, timedelta
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -84,10 +86,19 @@ def forget_period(root: Path, month: str) -> None:
         InputError: there is no such key, or a service runs on the archive.
     """
     with lock(root):
-        key = key_of(root, month)
-        witnesses.forget(key.parent, month)
-        key.unlink()
-        sync_directory(key.parent)
+        destroy_key(root, month)
+
+
+def destroy_key(root: Path, month: str) -> None:
+    """As `forget_period`, for who holds the archive and keeps nothing of the month in mind.
+
+    Raises:
+        InputError: there is no such key.
+    """
+    key = key_of(root, month)
+    witnesses.forget(key.parent, month)
+    key.unlink()
+    sync_directory(key.parent)
 
 
 class Forgotten(NamedTuple):
@@ -105,27 +116,54 @@ def forget_vehicle(root: Path, vehicle: str, month: str) -> Forgotten:
         InputError: the month's key is gone, or a service runs on the archive (it remembers more than its files).
         OSError: a file cannot be read or written.
     """
-    first = _month(month)
     with lock(root):
-        key_of(root, month)
-        compact(root)
-        begin, end = (first - date(1970, 1, 1)).days, _last_day(first) + 1
-        pseudonym = Pseudonyms(root / _KEYS).of(vehicle, begin * layout.DAY_NS + layout.DAY_NS // 2)
-        witnesses.forget(root / _KEYS, month, number(pseudonym))
-        rows, files, cells = 0, [*root.rglob(f"*{BAD}")], set[int]()
-        with compacting(root):
-            drop_checkpoints(root)  # what it reported is in them
-            for damaged in files:  # nobody can tell what is in them
-                damaged.unlink()
-            for kind in Kind:
-                # a batch has the pseudonym of its first record and may end a day later
-                for path in layout.compacted(root, kind, begin, end):
-                    if len(gone := _without(root, kind, path, pseudonym)):
-                        rows, cells = rows + len(gone), cells.union(gone)
-                        files += [path, rollup.part_of(path)] if kind is Kind.OBSERVATION else [path]
-            for folder in layout.days(root, snapshots.TABLE, begin, end):
-                files += [path for path in sorted(folder.glob("*.parquet")) if _thinned(root, path, cells)]
-    return Forgotten(rows, tuple(files))
+        with erased(root, vehicle, month) as done:
+            pass
+        forget_witness(root, vehicle, month)
+    return done
+
+
+@contextmanager
+def erased(root: Path, vehicle: str, month: str) -> Iterator[Forgotten]:
+    """What `forget_vehicle` does to the files, while a service may write to the log: of its rows those that were there.
+    Nothing is compacted before the block ends.
+
+    Raises:
+        as `forget_vehicle`, but for the service.
+    """
+    first = _month(month)
+    key_of(root, month)
+    compact(root)
+    begin, end = (first - date(1970, 1, 1)).days, _last_day(first) + 1
+    pseudonym = _pseudonym(root, vehicle, month)
+    rows, files, cells = 0, [*root.rglob(f"*{BAD}")], set[int]()
+    with compacting(root):
+        drop_checkpoints(root)  # what it reported is in them
+        for damaged in files:  # nobody can tell what is in them
+            damaged.unlink()
+        for kind in Kind:
+            # a batch has the pseudonym of its first record and may end a day later
+            for path in layout.compacted(root, kind, begin, end):
+                if len(gone := _without(root, kind, path, pseudonym)):
+                    rows, cells = rows + len(gone), cells.union(gone)
+                    files += [path, rollup.part_of(path)] if kind is Kind.OBSERVATION else [path]
+        for folder in layout.days(root, snapshots.TABLE, begin, end):
+            files += [path for path in sorted(folder.glob("*.parquet")) if _thinned(root, path, cells)]
+        yield Forgotten(rows, tuple(files))
+
+
+def forget_witness(root: Path, vehicle: str, month: str) -> None:
+    """Remove the line that tells the number by which the map knew a vehicle in a month.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    witnesses.forget(root / _KEYS, month, number(_pseudonym(root, vehicle, month)))
+
+
+def _pseudonym(root: Path, vehicle: str, month: str) -> str:
+    noon = (_month(month) - date(1970, 1, 1)).days * layout.DAY_NS + layout.DAY_NS // 2
+    return Pseudonyms(root / _KEYS).of(vehicle, noon)
 
 
 def _thinned(root: Path, path: Path, cells: set[int]) -> bool:
@@ -150,8 +188,7 @@ def rows_of_vehicle(root: Path, vehicle: str, month: str) -> int:
     """
     first = (_month(month) - date(1970, 1, 1)).days
     key_of(root, month)
-    noon = first * layout.DAY_NS + layout.DAY_NS // 2
-    pseudonym = Pseudonyms(root / _KEYS).of(vehicle, noon)
+    pseudonym = _pseudonym(root, vehicle, month)
     where = [Between("vehicle", pseudonym, pseudonym)]
     days = (first, _last_day(_month(month)) + 1)
     return sum(table.num_rows for kind in Kind for table in reading.read(root, kind, ["vehicle"], where, days))

@@ -134,7 +134,8 @@ def forget(folder: Path, month: str, pseudonym: int | None = None) -> None:
         return
     data = path.read_bytes()
     lines = [data[at : at + _LINE] for at in range(0, len(data), _LINE)]
-    path.write_bytes(b"".join(line for line in lines if int.from_bytes(line[:8], signed=True) != pseudonym))
+    with written(path, _SECRET) as file:
+        file.write(b"".join(line for line in lines if int.from_bytes(line[:8], signed=True) != pseudonym))
 
 
 def _line(pseudonym: int, number: int) -> bytes:

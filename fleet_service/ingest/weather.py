@@ -60,7 +60,7 @@ class WeatherInbox:
     """
 
     def __init__(self, root: Path, name: str, fusion: Fusion, counts: Counter[str]) -> None:
-        self._folder, self._name, self._fusion, self._counts = root / FOLDER, name, fusion, counts
+        self._folder, self._name, self.fusion, self._counts = root / FOLDER, name, fusion, counts
         self._waiting: deque[WeatherMessage] = deque(maxlen=WAITING)
         self._last = 0
 
@@ -88,13 +88,13 @@ class WeatherInbox:
         seen = set(zip(known.region.tolist(), known.time.tolist(), strict=True))
         found = []
         for region, report in read_file(path):
-            acts = max(report.time, self._fusion.next_epoch)
+            acts = max(report.time, self.fusion.next_epoch)
             if report.time > acts - VALID_NS and not {(region, report.time), (region, acts)} & seen:
                 found.append((region, report))
         return self._archived(found, now) if found else None
 
     def _archived(self, found: list[tuple[int, Report]], now: int) -> Reports | None:
-        table = _table(found, now, self._fusion.next_epoch)
+        table = _table(found, now, self.fusion.next_epoch)
         self._last = max(time.time_ns(), self._last + 1)
         try:
             make_folder(self._folder)

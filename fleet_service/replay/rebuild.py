@@ -53,6 +53,7 @@ class Begin(NamedTuple):
 
     day: int | None = None
     after: layout.Cut | None = None
+    until: layout.Cut | None = None  # of the log's segments
 
 
 def restore_streams(
@@ -68,7 +69,7 @@ def restore_streams(
     """
     for kind, first in _FIRST_TIME.items():
         columns = (*IDENTITY, "first_held", first)
-        wanted = reading.Wanted(columns, days=(begin.day, None), after=begin.after)
+        wanted = reading.Wanted(columns, days=(begin.day, None), after=begin.after, until=begin.until)
         for table in reading.read_wanted(root, kind, wanted, damaged):
             boot, region, seq, first_held = (table[name].to_numpy() for name in (*IDENTITY[1:], "first_held"))
             time = segments.nanoseconds(table[first])
@@ -157,7 +158,7 @@ def replay(
     last = None if since.until is None else since.until // layout.DAY_NS + 1
     where = since.where()
     columns = COLUMNS if where is None else [*COLUMNS, *FILTERED]
-    wanted = reading.Wanted(columns, where, (since.begin.day, last), since.begin.after)
+    wanted = reading.Wanted(columns, where, (since.begin.day, last), since.begin.after, since.begin.until)
     waiting: list[tuple[Observations, Before]] = []  # late rows that were fused after the end of their table
     known = witnesses.read(root / "keys")
     for table in in_order(reading.Listing(root, Kind.OBSERVATION, wanted, damaged), since.most):

@@ -1,0 +1,37 @@
+"""Work in a process of its own: its memory goes with it, and the worker shares no interpreter with it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from typing import Final
+
+from schemas.errors import InputError
+
+LOOK_S: Final = 0.1  # between two looks whether it shall stop
+
+
+def run(what: str, module: str, words: Sequence[str], stop: threading.Event, told: str | None = None) -> str | None:
+    """What a module said that was run as a process, with `told` on its stdin; None if it was stopped. It may die at any
+    instant.
+
+    Raises:
+        InputError: it failed.
+    """
+    command = [sys.executable, "-m", module, *words]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as child:
+        while True:
+            try:
+                output, errors = child.communicate(told, LOOK_S)
+                break
+            except subprocess.TimeoutExpired:
+                told = None  # it is on its way
+                if stop.is_set():
+                    child.terminate()
+                    return None
+    if child.returncode:
+        raise InputError(what, errors.strip() or f"ended with {child.returncode}", "it is tried again")
+    return output.strip()

@@ -1,0 +1,96 @@
+"""Erasure beside a running service: what its owner asked for in `archive.requests`, done in the thread of the upkeep.
+
+    a segment; what the service knows is on disk up to it
+    in a process of its own:  the vehicle's rows leave the files, and all others, read again, make a checkpoint
+    between two segments:     the service forgets all it knows and begins from that checkpoint and the log since
+
+Checkpoints, snapshots, retention and compaction are of the same thread, so that none of them meets a half of it; others
+wait for the lock of compaction. Messages wait for as long as a start from a checkpoint takes. A service that dies amid
+of it finds the question at its next start, and no checkpoint with the vehicle in it. What the vehicle sends afterwards
+is new.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from fleet_service.app import beside
+from fleet_service.app.engine import Engine
+from fleet_service.app.memory import remember
+from fleet_service.archive import requests
+from fleet_service.archive.layout import Cut
+from fleet_service.archive.requests import Erasure
+from fleet_service.archive.retention import destroy_key, erased, forget_witness, key_of
+from fleet_service.ingest import weather
+from fleet_service.replay import checkpoints
+from schemas.config import ServiceConfig
+from schemas.errors import InputError
+
+
+def asked(engine: Engine, config: ServiceConfig, root: Path, stop: threading.Event) -> str | None:
+    """Answer the questions that wait; returns a line for the operator."""
+    rows = answered = 0
+    for question in requests.waiting(root):
+        try:
+            told = _erase(engine, config, root, requests.read(question), stop)
+        except InputError as error:
+            requests.settle(question, error)
+            continue
+        if told is None:  # the service stops; the next one does it
+            break
+        requests.settle(question, told)
+        rows, answered = rows + told["rows"], answered + 1
+    return f"erased: {answered} requests, {rows} rows" if answered else None
+
+
+def _erase(
+    engine: Engine, config: ServiceConfig, root: Path, wanted: Erasure, stop: threading.Event
+) -> dict[str, Any] | None:  # fmt: skip
+    """What was done; None if the service stops before it is.
+
+    Raises:
+        InputError: there is no such month, or a file is damaged.
+        OSError: a file cannot be read or written; to be tried again.
+    """
+    key_of(root, wanted.month)
+    vehicle = wanted.vehicle
+    if vehicle is None:
+        gone = _recalled(engine, lambda: destroy_key(root, wanted.month), stop)
+        return {"rows": 0, "files": []} if gone else None
+    cut = engine.between(lambda: engine.written_to, stop)
+    if cut is None:
+        return None
+    told = json.dumps({**asdict(wanted), "lateness_s": config.lateness_s, "cut": cut})
+    output = beside.run("erasure", "fleet_service.app.erasing_process", [str(root)], stop, told)
+    if output is None:
+        return None
+    answer: dict[str, Any] = json.loads(output)
+    return answer if _recalled(engine, lambda: forget_witness(root, vehicle, wanted.month), stop) else None
+
+
+def _recalled(engine: Engine, before: Callable[[], None], stop: threading.Event) -> bool | None:
+    """Whether the service has done something and forgot what it knew before; None if it stops first."""
+
+    def work() -> bool:
+        engine.recall(before)
+        return True
+
+    return engine.between(work, stop)
+
+
+def apart(root: Path, told: dict[str, Any]) -> dict[str, Any]:
+    """The part of a process of its own.
+
+    Raises:
+        InputError, OSError: as of `retention.forget_vehicle`.
+    """
+    known = weather.files(root)  # one that comes meanwhile is read again, which changes nothing
+    with erased(root, told["vehicle"], told["month"]) as done:
+        cut = Cut(*told["cut"])
+        checkpoints.save(root, remember(root, told["lateness_s"], until=cut).image(cut, known))
+    return {"rows": done.rows, "files": [str(path.relative_to(root)) for path in done.files]}

@@ -1,0 +1,28 @@
+"""`python -m fleet_service.app.erasing_process ARCHIVE`: one erasure, told on stdin, as a service wants it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+from fleet_service.app import UNUSED
+from schemas.errors import InputError
+from schemas.runtime.process import limit_memory
+
+
+def main() -> int:
+    """Do it, and say what was done."""
+    limit_memory(*UNUSED)
+    from fleet_service.app.erasing import apart
+
+    try:
+        print(json.dumps(apart(Path(sys.argv[1]), json.load(sys.stdin))))
+    except (InputError, OSError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,171 @@
+"""A vehicle is erased beside a service that runs, and drives on: nothing of it is left, nothing of others is lost."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+import time
+from contextlib import closing
+from datetime import UTC, datetime
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+import zenoh
+
+from fleet_service.app import erasing
+from fleet_service.app.engine import Engine
+from fleet_service.archive import reading, requests
+from fleet_service.archive.pseudonyms import Pseudonyms
+from fleet_service.archive.requests import Erasure
+from fleet_service.archive.retention import drop_checkpoints
+from fleet_service.cli import main
+from fleet_service.ingest.inbox import Message
+from fleet_service.replay import checkpoints
+from schemas import grid, keys, wire
+from schemas.config import ServiceConfig, ZenohSettings
+from schemas.errors import InputError
+from schemas.wire import Batch, Kind
+from tests.fleet_service.app.test_kill import service
+from tests.fleet_service.app.test_service import Fleet
+from tests.fleet_service.examples import LATITUDE, LONGITUDE, SECOND, TILE, batch, key
+from tests.waiting import until
+
+GONE, OTHERS = "sim-009", ("sim-001", "sim-002", "sim-003")
+ALONE = LATITUDE - 0.002  # a cell that nobody else visits, in the same tile
+PATIENCE_S = 120.0  # a start, and a process that imports everything, on a machine that is busy
+MONTH = f"{datetime.now(UTC):%Y-%m}"
+
+
+def sent_by(vehicle: str, seq: int) -> Batch:
+    """Two visits: where all drive, and where only the one drives that is to be erased."""
+    now = time.time_ns() - SECOND
+    latitude = np.array([LATITUDE, ALONE if vehicle == GONE else LATITUDE])
+    cell = grid.cell_of(latitude, np.full(2, LONGITUDE))
+    return batch(vehicle, seq, now, [0.8, 0.8], latitude=latitude, cell=cell)
+
+
+def pseudonyms_of(root: Path) -> list[str]:
+    tables = reading.read(root, Kind.OBSERVATION, ["vehicle", "seq", "row"])
+    return sorted(map(str, pa.concat_tables(tables)["vehicle"].to_pylist()))
+
+
+def shown(session: zenoh.Session) -> dict[int, int]:
+    """Observations by cell."""
+    found: dict[int, int] = {}
+    for reply in session.get(keys.map_key(TILE)):
+        if reply.ok is not None:
+            table = pa.ipc.open_stream(BytesIO(reply.ok.payload.to_bytes())).read_all()
+            found |= zip(table["cell"].to_numpy().tolist(), table["observations"].to_numpy().tolist(), strict=True)
+    return found
+
+
+def test_a_vehicle_is_erased_while_the_service_runs_and_others_drive_on(
+    router: ZenohSettings, session: zenoh.Session, tmp_path: Path
+) -> None:
+    root, fleet = tmp_path / "archive", Fleet(session)
+    sent = [sent_by(vehicle, seq) for seq in range(1, 21) for vehicle in (GONE, *OTHERS)]
+    alone = int(grid.cell_of(ALONE, LONGITUDE))
+
+    def settled() -> bool:
+        for one in fleet.unsettled(sent)[:20]:
+            fleet.publish(one)
+        return not fleet.unsettled(sent)
+
+    with service(router, tmp_path) as process:
+        until(settled, PATIENCE_S)
+        until(lambda: alone in shown(session), PATIENCE_S)
+        words = ["forget", "--archive", str(root), "--period", MONTH, "--vehicle", GONE, "--json"]
+        command = [sys.executable, "-m", "fleet_service.cli", *words]
+        with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True) as eraser:
+            seq = 20
+            while eraser.poll() is None:
+                seq += 1
+                sent += [sent_by(vehicle, seq) for vehicle in OTHERS]
+                until(settled, PATIENCE_S)
+            output, _ = eraser.communicate()
+        assert (eraser.returncode, json.loads(output)["rows"]) == (0, 40)
+        assert seq > 20, "others drove meanwhile"
+        assert process.poll() is None
+        until(lambda: alone not in shown(session), PATIENCE_S)
+        sent += [sent_by(vehicle, seq + 1) for vehicle in OTHERS]
+        until(settled, PATIENCE_S)
+        at_last = shown(session)
+        assert not requests.waiting(root)
+        process.terminate()
+        assert process.wait(PATIENCE_S) == 0
+    names = Pseudonyms(root / "keys")
+    gone = names.of(GONE, time.time_ns()).encode()
+    theirs = sorted(names.of(vehicle, time.time_ns()) for vehicle in OTHERS for _ in range(2 * (seq + 1)))
+    assert pseudonyms_of(root) == theirs, "each acknowledged row of the others once, and no other"
+    files = [path for path in root.rglob("*") if path.is_file()]
+    number = int.from_bytes(bytes.fromhex(gone.decode()), signed=True)
+    told = (gone, GONE.encode(), number.to_bytes(8, "little", signed=True), number.to_bytes(8, "big", signed=True))
+    assert [path for path in files if any(one in path.read_bytes() for one in told)] == []
+    assert checkpoints.newest(root), "what the service began from anew"
+    drop_checkpoints(root)
+    with closing(Engine(ServiceConfig(), root)) as engine:
+        assert engine.fusion.live.visits[: engine.fusion.size].tolist() == list(at_last.values()), "as the log tells it"
+        assert sum(at_last.values()) > 2 * 3
+
+
+def filled(root: Path, *names: str) -> Engine:
+    engine = Engine(ServiceConfig(), root)
+    messages = [Message(Kind.OBSERVATION, key(one), wire.encode(sent_by(one, 1)), "") for one in names]
+    engine.ingest(messages, time.time_ns())
+    engine.flush()
+    return engine
+
+
+def answered(engine: Engine, root: Path) -> None:
+    """Do what is asked for, with a worker."""
+    thread = threading.Thread(target=erasing.asked, args=(engine, ServiceConfig(), root, threading.Event()))
+    thread.start()
+    while thread.is_alive():
+        engine.flush()
+        thread.join(0.01)
+
+
+def test_a_month_is_forgotten_beside_a_service(tmp_path: Path) -> None:
+    with closing(filled(tmp_path, *OTHERS)) as engine:
+        before = Pseudonyms(tmp_path / "keys").of("sim-001", time.time_ns())
+        question = requests.ask(tmp_path, Erasure(MONTH))
+        answered(engine, tmp_path)
+        assert requests.answer_to(question) == {"rows": 0, "files": []}
+        assert engine.fusion.size
+        assert not any(stream.vehicle for stream in engine._streams)
+        assert Pseudonyms(tmp_path / "keys").of("sim-001", time.time_ns()) != before
+
+
+def test_a_question_that_cannot_be_done_is_answered_and_taken_away(tmp_path: Path) -> None:
+    with closing(filled(tmp_path, *OTHERS)) as engine:
+        none = requests.ask(tmp_path, Erasure("1999-01", GONE))
+        (tmp_path / requests.FOLDER / "other.json").write_text("[]")
+        answered(engine, tmp_path)
+        with pytest.raises(InputError, match="no key of 1999-01"):
+            requests.answer_to(none)
+        with pytest.raises(InputError, match="other.json is none"):
+            requests.answer_to(tmp_path / requests.FOLDER / "other.json")
+        assert not requests.waiting(tmp_path)
+
+
+def test_a_question_outlives_a_service_that_ends_and_the_command_does_it_then(tmp_path: Path) -> None:
+    engine = filled(tmp_path, GONE, *OTHERS)
+    stopped = threading.Event()
+    stopped.set()
+    question = requests.ask(tmp_path, Erasure(MONTH, GONE))
+    assert erasing.asked(engine, ServiceConfig(), tmp_path, stopped) is None
+    assert requests.waiting(tmp_path) == [question]
+    engine.close()
+    with closing(Engine(ServiceConfig(), tmp_path)) as again:
+        answered(again, tmp_path)
+        told = requests.answer_to(question)
+        assert told is not None
+        assert told["rows"] == 2
+        slots = again.fusion.slots_of(np.array([grid.cell_of(ALONE, LONGITUDE)]), np.array([0]))
+        assert slots.tolist() == [-1]
+    assert main(["forget", "--archive", str(tmp_path), "--vehicle", GONE, "--period", MONTH]) == 0
