@@ -45,6 +45,7 @@ TOPICS: Final = {
         Topic("map", grid.TILE_ZOOM, False, "Arrow stream", "DATA_LOW", False),
         Topic("alert", grid.TILE_ZOOM, False, "gripmap.v1.Alert", "REAL_TIME", True),
         Topic("ahead", None, True, "gripmap.v1.Ahead", "DATA_HIGH", False),
+        Topic("vss", None, True, "JSON of VSS signals", "DATA_HIGH", False),
         Topic("weather", grid.REGION_ZOOM, False, "gripmap.v1.Weather", "DATA", True),
         Topic("alive", None, True, None, "DATA", True),
         Topic("shard", None, True, None, "DATA", True),
@@ -90,6 +91,16 @@ def alert_key(tile: int) -> str:
 def ahead_key(vehicle: str) -> str:
     """Where a vehicle tells what lies ahead of it."""
     return f"{ROOT}/ahead/{vehicle}"
+
+
+def vss_key(vehicle: str) -> str:
+    """Where a vehicle tells the friction where it is, in words of the Vehicle Signal Specification."""
+    return f"{ROOT}/vss/{vehicle}"
+
+
+def private_keys(vehicle: str) -> list[str]:
+    """What a vehicle tells itself and its owner, and nobody else."""
+    return [ahead_key(vehicle), vss_key(vehicle)]
 
 
 def weather_key(region: int) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
+import zenoh
 
 from edge_agent.adaptation.memberships import Memberships
 from edge_agent.ahead.lookout import Lookout
@@ -19,6 +20,7 @@ from edge_agent.cli.common import leave, publisher_of, status, stop_on_signal
 from edge_agent.inputs.block import Block
 from edge_agent.observe.pipeline import Pipeline
 from edge_agent.publish.publisher import Publisher
+from edge_agent.publish.vss import RoadFrictionOutput
 from schemas.config import AgentConfig
 from schemas.runtime.metrics import serving
 from schemas.runtime.process import Line, line_logger, log_as, print_line
@@ -46,12 +48,14 @@ def drive_live(
     admitted: Callable[[], bool] = lambda: True,
     troubled: Callable[[], list[str]] = list,
     lookout: Lookout | None = None,
+    vss: RoadFrictionOutput | None = None,
     memberships: Memberships | None = None,
 ) -> int:
     """Drive in real time, do what is due `at_end`, take leave; prints a line of counts and returns 0.
 
     What is learned while not `admitted` is not published; `troubled` tells what is wrong with the sources. A `lookout`
-    hears the map over the vehicles' sessions. `memberships` stand in for the estimator's own.
+    hears the map over the vehicles' sessions. `vss` tells the friction where they are, of signals that are admitted.
+    `memberships` stand in for the estimator's own.
     """
     chosen = estimator or config.estimator
     log_as(config.log, sys.stderr)
@@ -68,15 +72,27 @@ def drive_live(
     ):
         if address:
             print_line(f"metrics: {address}/metrics", sys.stderr)
+
+        def opened(name: str, session: zenoh.Session) -> None:
+            for one in (lookout, vss):
+                if one is not None:
+                    one.attach(name, session)
+
+        def after() -> None:
+            if lookout is not None:
+                _show(lookout, pipeline)
+            if vss is not None and admitted():
+                vss.tell(pipeline.grip)
+
         pipeline = Pipeline(bank_of(chosen, vehicles, memberships), len(vehicles), config)
-        publisher = publisher_of(names, config, chosen, lookout.attach if lookout else lambda *_: None)
+        publisher = publisher_of(names, config, chosen, opened)
         running.append(publisher)
         report = partial(status, publisher=publisher, log_line=line_logger(config.log, sys.stderr))
         if lookout is not None:
             lookout.start()
         drive(
             blocks, pipeline, publisher, stop, report, duration_s=duration_s, progress=progress, admitted=admitted,
-            after=partial(_show, lookout, pipeline) if lookout is not None else lambda: None,
+            after=after,
         )  # fmt: skip
         heard: dict[str, float] = {}
         if lookout is not None:

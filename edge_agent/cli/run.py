@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,6 +15,7 @@ from edge_agent.cli.options import add_estimator, memberships_of
 if TYPE_CHECKING:
     from edge_agent.ahead.lookout import Lookout
     from edge_agent.inputs.block import Block
+    from edge_agent.publish.vss import RoadFrictionOutput
     from schemas.config import AgentConfig
     from schemas.vehicle import Vehicle
 
@@ -33,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--trust", action="store_true", help="publish what the signal doctor did not pass")
     parser.add_argument("--ahead", action="store_true", help="hear the map, and warn of slippery road ahead")
     parser.add_argument("--route", type=Path, help="where it drives to, for --ahead (GPX or GeoJSON)")
+    parser.add_argument("--vss", action="store_true", help="tell the friction here as VSS signals, a line of JSON each")
     parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON); needed but with simulated")
     add_estimator(parser)
     parser.add_argument("--name", help="name to publish under (default: the vehicle's)")
@@ -61,17 +64,18 @@ def run(args: argparse.Namespace) -> int:
         return _live(args, sources, config)
     if len(sources) == 1 and (kind := sources[0].partition(":")[0]) in plugins.found(plugins.SOURCES):
         vehicle = load_vehicle(_vehicle_file(args))
+        name = args.name or vehicle.name
         blocks = plugins.loaded(plugins.SOURCES, kind)(sources[0].partition(":")[2])
         return drive_live(
-            [vehicle], [checked_name(args.name or vehicle.name)], blocks, config, args.estimator, args.duration,
-            lookout=_lookout(args, args.name or vehicle.name, config), memberships=memberships_of(args),
+            [vehicle], [checked_name(name)], blocks, config, args.estimator, args.duration,
+            lookout=_lookout(args, name, config), vss=_vss(args, name, config), memberships=memberships_of(args),
         )  # fmt: skip
     if len(sources) > 1:
         raise InputError("source", f"{', '.join(sources)} do not go together", "name live ones, or one log")
     vehicle, name, blocks = _simulated(args) if sources[0] == SIMULATED else _logged(args, Path(sources[0]))
     return drive_live(
         [vehicle], [checked_name(name)], blocks, config, args.estimator, args.duration,
-        lookout=_lookout(args, name, config), memberships=memberships_of(args),
+        lookout=_lookout(args, name, config), vss=_vss(args, name, config), memberships=memberships_of(args),
     )  # fmt: skip
 
 
@@ -84,6 +88,15 @@ def _lookout(args: argparse.Namespace, name: str, config: AgentConfig) -> Lookou
 
     route = read_route(args.route) if args.route is not None else None
     return Lookout([name], warning_lines(config), lambda _: route)
+
+
+def _vss(args: argparse.Namespace, name: str, config: AgentConfig) -> RoadFrictionOutput | None:
+    if not args.vss:
+        return None
+    from edge_agent.publish.vss import RoadFrictionOutput
+    from schemas.runtime.process import print_line
+
+    return RoadFrictionOutput([name], lambda line: print_line(line, sys.stdout), config.state_rate_hz)
 
 
 def _live(args: argparse.Namespace, sources: list[str], config: AgentConfig) -> int:
@@ -104,7 +117,7 @@ def _live(args: argparse.Namespace, sources: list[str], config: AgentConfig) -> 
         return drive_live(
             [trip.vehicle], [name], blocks, config, args.estimator, args.duration, trip.end,
             admitted=trip.admitted, troubled=lambda: [*rows.troubles(), *trip.troubles()],
-            lookout=_lookout(args, name, config), memberships=memberships_of(args),
+            lookout=_lookout(args, name, config), vss=_vss(args, name, config), memberships=memberships_of(args),
         )  # fmt: skip
     finally:
         blocks.close()

@@ -34,6 +34,16 @@ class Seen(NamedTuple):
     time: IntArray
 
 
+class Grip(NamedTuple):
+    """What the vehicles believed at a block's end, each (N,): quantiles of mu, grip used, [ns]; NaN: unknown."""
+
+    mu: FloatArray
+    mu_lower: FloatArray
+    mu_upper: FloatArray
+    mu_utilised: FloatArray
+    time: IntArray
+
+
 class Pipeline:
     """A bank of N vehicles with its open visits. Use `step` for each block in order, then `finish` once."""
 
@@ -43,6 +53,7 @@ class Pipeline:
         self._ends = TripEnds(vehicles, config.trip_end_m, config.trip_end_s)
         self._last: Block | None = None
         self.seen: Seen | None = None
+        self.grip: Grip | None = None
         self.places: IntArray = np.full(vehicles, NOWHERE)  # cell * 4 + sector at the block's end
 
     def step(self, block: Block) -> tuple[Estimates, RecordBlock, RecordBlock]:
@@ -54,6 +65,9 @@ class Pipeline:
         )
         self._last = block
         self.seen = Seen(located.latitude[-1], located.longitude[-1], located.yaw[-1], estimates.vx[-1], block.time[-1])
+        self.grip = Grip(
+            estimates.mu[-1], estimates.mu_lower[-1], estimates.mu_upper[-1], estimates.mu_utilised[-1], block.time[-1]
+        )
         cell, sector = located.cell[-1], located.sector[-1]
         self.places = np.where(cell == NOWHERE, NOWHERE, cell * SECTORS + sector)
         self._ends.drive(block.time, estimates.vx)

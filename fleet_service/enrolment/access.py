@@ -2,13 +2,14 @@
 
 | role    | puts                                     | hears and asks                      |
 |---------|------------------------------------------|-------------------------------------|
-| vehicle | obs/*/*/*/NAME, state/*/*/*/NAME, ahead/NAME, token alive/NAME | map and alert; ack/NAME, ahead/NAME |
-| owner   | nothing                                  | map and alert; ahead/NAME of its own |
+| vehicle | obs/*/*/*/NAME, state/*/*/*/NAME, PRIVATE, token alive/NAME | map and alert; ack/NAME, PRIVATE |
+| owner   | nothing                                  | map and alert; PRIVATE of its own   |
 | reader  | nothing                                  | map and alert                       |
 | weather | weather/**                               | nothing                             |
-| service | everything under gripmap/ but ahead/    | likewise                            |
+| service | everything under gripmap/ but PRIVATE    | likewise                            |
 | router  | what others were let put, between routers | likewise                           |
 
+PRIVATE is ahead/NAME and vss/NAME: what lies ahead of a vehicle, and under it.
 Zenoh decides by the common name of the certificate and reads the list once, at its start. Denials are silent for the
 sender. A put on a wildcard counts as a put on every key of it, so that it must lie within a rule as a whole.
 """
@@ -77,7 +78,7 @@ def access_control(fleet: Enrolment) -> Section:
     """The access list of all routers."""
     rules = [
         _rule("everything", ("ingress", "egress"), MESSAGES, [EVERYTHING]),
-        _rule("private", ("ingress", "egress"), MESSAGES, [keys.ahead_key("*")]) | {"permission": "deny"},
+        _rule("private", ("ingress", "egress"), MESSAGES, keys.private_keys("*")) | {"permission": "deny"},
         _rule("ask", ("ingress",), ("declare_subscriber", "query"), PUBLIC),
         _rule("told", ("egress",), ("put", "reply"), PUBLIC),
         # Declared publishers and queriers send nothing, silently, until they are told that somebody listens.
@@ -107,7 +108,7 @@ def access_control(fleet: Enrolment) -> Section:
         policies.append({"rules": [rule["id"] for rule in own], "subjects": [name]})
     for name, owned in fleet.owners.items():
         if owned:
-            sees = _sees(name, [keys.ahead_key(vehicle) for vehicle in owned])
+            sees = _sees(name, [key for vehicle in owned for key in keys.private_keys(vehicle)])
             rules += sees
             policies.append({"rules": [rule["id"] for rule in sees], "subjects": [name]})
     return {
@@ -125,11 +126,11 @@ def _own(name: str) -> list[Section]:
             f"put/{name}",
             ("ingress",),
             ("put",),
-            [*(f"{keys.ROOT}/{kind}/*/*/*/{name}" for kind in wire.Kind), keys.ahead_key(name)],
+            [*(f"{keys.ROOT}/{kind}/*/*/*/{name}" for kind in wire.Kind), *keys.private_keys(name)],
         ),
         # a declared publisher sends nothing until it is told that its owner listens
-        _rule(f"seen/{name}", ("egress",), ("declare_subscriber",), [keys.ahead_key(name)]),
-        *_sees(name, [keys.ahead_key(name)]),
+        _rule(f"seen/{name}", ("egress",), ("declare_subscriber",), keys.private_keys(name)),
+        *_sees(name, keys.private_keys(name)),
         _rule(f"alive/{name}", ("ingress",), ("liveliness_token",), [keys.alive_key(name)]),
         _rule(f"hear/{name}", ("ingress",), ("declare_subscriber",), [keys.ack_key(name)]),
         _rule(f"ack/{name}", ("egress",), ("put",), [keys.ack_key(name)]),
@@ -139,7 +140,7 @@ def _own(name: str) -> list[Section]:
 def _sees(name: str, expressions: list[str]) -> list[Section]:
     return [
         _rule(f"look/{name}", ("ingress",), ("declare_subscriber",), expressions),
-        _rule(f"ahead/{name}", ("egress",), ("put",), expressions),
+        _rule(f"private/{name}", ("egress",), ("put",), expressions),
     ]
 
 

@@ -61,7 +61,7 @@ class Enrolment(Settings):
     weather: list[VehicleName] = Field(default=[], description="who puts road weather, and does nothing else")
     vehicles: list[VehicleName] = Field(default=[], description="their own keys; map and alerts to read")
     owners: dict[VehicleName, list[VehicleName]] = Field(
-        default={}, description="who may see what lies ahead of which vehicles, and read as a reader does"
+        default={}, description="who may see what lies ahead of and under which vehicles, and read as a reader does"
     )
 
     @property

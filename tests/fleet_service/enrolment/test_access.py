@@ -67,16 +67,14 @@ def test_a_vehicle_may_exactly_what_the_design_says() -> None:
     public = (f"{keys.ROOT}/map/**", f"{keys.ROOT}/alert/**")
     assert allowed("ingress") == {
         *(("put", f"{keys.ROOT}/{kind}/*/*/*/{HONEST}") for kind in ("obs", "state")),
-        ("put", keys.ahead_key(HONEST)),
-        ("declare_subscriber", keys.ahead_key(HONEST)),
+        *((message, place) for message in ("put", "declare_subscriber") for place in keys.private_keys(HONEST)),
         ("liveliness_token", keys.alive_key(HONEST)),
         ("declare_subscriber", keys.ack_key(HONEST)),
         *((message, place) for message in ("declare_subscriber", "query") for place in public),
     }
     assert allowed("egress") == {
         ("put", keys.ack_key(HONEST)),
-        ("put", keys.ahead_key(HONEST)),
-        ("declare_subscriber", keys.ahead_key(HONEST)),
+        *((message, place) for message in ("put", "declare_subscriber") for place in keys.private_keys(HONEST)),
         *((m, place) for m in ("put", "reply") for place in public),
         *(("declare_subscriber", f"{keys.ROOT}/{kind}/**") for kind in ("obs", "state")),
         ("declare_queryable", f"{keys.ROOT}/map/**"),
@@ -165,7 +163,10 @@ def test_a_declared_publisher_of_a_vehicle_is_told_that_somebody_listens(running
         until(lambda: received)
 
 
-def test_what_lies_ahead_of_a_vehicle_is_seen_by_it_and_its_owner_alone(tmp_path: Path) -> None:
+@pytest.mark.parametrize("own", [keys.ahead_key, keys.vss_key])
+def test_what_is_ahead_of_a_vehicle_and_under_it_is_seen_by_it_and_its_owner_alone(
+    tmp_path: Path, own: Callable[[str], str]
+) -> None:
     other = next(name for name in VEHICLES if name != HONEST)
     fleet = enrolment(owners={"owner-0": [HONEST], "owner-1": [other]})
     listeners = (HONEST, other, SERVICE, READER, "owner-0", "owner-1")
@@ -173,14 +174,14 @@ def test_what_lies_ahead_of_a_vehicle_is_seen_by_it_and_its_owner_alone(tmp_path
     with network(tmp_path, fleet=fleet) as found, ExitStack() as stack:
         sessions = {name: stack.enter_context(found.session(name)) for name in listeners}
         for name, session in sessions.items():
-            for expression in (keys.ahead_key(HONEST), f"{keys.ROOT}/ahead/*", "gripmap/**"):
+            for expression in (own(HONEST), own("*"), "gripmap/**"):
                 stack.enter_context(session.declare_subscriber(expression, _noting(heard_by[name])))
-        publisher = sessions[HONEST].declare_publisher(keys.ahead_key(HONEST))
+        publisher = sessions[HONEST].declare_publisher(own(HONEST))
         matched(publisher)
 
         def arrived() -> bool:
             publisher.put(b"ice")
-            sessions[other].put(keys.ahead_key(HONEST), b"a lie")
+            sessions[other].put(own(HONEST), b"a lie")
             return bool(heard_by[HONEST] and heard_by["owner-0"])
 
         until(arrived)

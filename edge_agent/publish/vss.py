@@ -1,0 +1,80 @@
+"""The friction where the car is, in the words of the Vehicle Signal Specification (COVESA VSS 4 and later).
+
+`Vehicle.ADAS.ESC.RoadFriction.{MostProbable,LowerBound,UpperBound}` are percent of a peak adhesion of 1: 50 %, 5 % and
+95 % quantiles, clipped at 100 as the standard wants. What is unknown is absent and never a default: a signal without a
+number is left out, and MostProbable also where less than EXCITED_SHARE of the grip was used within UTILISED_WINDOW_S,
+since then mu is mostly what was believed before.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from typing import Any, Final
+
+import zenoh
+
+from edge_agent.observe.pipeline import Grip
+from schemas import keys
+from schemas.thresholds import EXCITED_SHARE, NS
+
+BRANCH: Final = "Vehicle.ADAS.ESC.RoadFriction"
+ENCODING: Final = "application/json"
+FULL: Final = 100.0  # [%]
+DIGITS: Final = 1
+_TOPIC: Final = keys.TOPICS["vss"]
+
+
+def road_friction(mu: float, mu_lower: float, mu_upper: float, mu_utilised: float) -> dict[str, float]:
+    """The signals [%] that are known; {} where nothing is.
+
+    Args:
+        mu, mu_lower, mu_upper: 50 %, 5 % and 95 % quantiles; NaN where unknown.
+        mu_utilised: largest grip used in the last second, any wheel.
+    """
+    told = {"MostProbable": mu if mu_utilised >= EXCITED_SHARE * mu else math.nan, "LowerBound": mu_lower,
+            "UpperBound": mu_upper}  # fmt: skip
+    return {
+        f"{BRANCH}.{name}": round(min(FULL * value, FULL), DIGITS)
+        for name, value in told.items()
+        if math.isfinite(value)
+    }
+
+
+class RoadFrictionOutput:
+    """Tells the friction of vehicles by name: a line of JSON each, and the same on its own Zenoh key.
+
+    Args:
+        names: row k of what is told is vehicle k.
+        say: takes a line.
+        rate_hz: how often.
+    """
+
+    def __init__(self, names: Sequence[str], say: Callable[[str], None], rate_hz: float) -> None:
+        self._names, self._say, self._step_ns = names, say, round(NS / rate_hz)
+        self.publishers: dict[str, Any] = {}
+        self._due = 0
+
+    def attach(self, name: str, session: zenoh.Session) -> None:
+        """A vehicle's session is open."""
+        self.publishers[name] = session.declare_publisher(
+            keys.vss_key(name), encoding=ENCODING, priority=getattr(zenoh.Priority, _TOPIC.priority),
+            congestion_control=zenoh.CongestionControl.DROP,
+        )  # fmt: skip
+
+    def tell(self, grip: Grip | None) -> None:
+        """What is believed now. Does not wait: a put that finds no room is dropped."""
+        if grip is None or int(grip.time.max()) < self._due:
+            return
+        now = int(grip.time.max())
+        self._due = now + self._step_ns
+        for k, name in enumerate(self._names):
+            known = road_friction(*(float(column[k]) for column in grip[:4]))
+            at = datetime.fromtimestamp(int(grip.time[k]) / NS, UTC).isoformat(timespec="milliseconds")
+            line = json.dumps({"event": "vss", "vehicle": name, "time": at.replace("+00:00", "Z"), **known})
+            self._say(line)
+            publisher = self.publishers.get(name)
+            if publisher is not None and publisher.matching_status.matching:
+                publisher.put(line.encode())

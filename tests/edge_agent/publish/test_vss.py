@@ -1,0 +1,95 @@
+"""The friction here as VSS signals: percent, clipped, absent where unknown; over a real session and by the command."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+
+from edge_agent.cli import main
+from edge_agent.observe.pipeline import Grip
+from edge_agent.publish.vss import BRANCH, RoadFrictionOutput, road_friction
+from schemas import keys
+from schemas.runtime.zenoh_session import configuration
+from schemas.thresholds import NS
+from tests.edge_agent.service import Router
+from tests.waiting import matched, until
+
+START = 1_800_000_000 * NS
+WORDS = ["run", "--scenario", "test", "--estimator", "ckf", "--name", "car-one", "--duration", "6", "--vss"]
+
+
+def grip(mu: float, lower: float, upper: float, used: float, seconds: float = 0.0) -> Grip:
+    told = (np.array([value]) for value in (mu, lower, upper, used))
+    return Grip._make((*told, np.array([START + round(seconds * NS)])))
+
+
+def names(known: dict[str, float]) -> dict[str, float]:
+    return {name.removeprefix(f"{BRANCH}."): value for name, value in known.items() if name.startswith(BRANCH)}
+
+
+def test_quantiles_are_percent_and_clipped() -> None:
+    assert names(road_friction(0.312, 0.25, 0.4, 0.3)) == {"MostProbable": 31.2, "LowerBound": 25.0, "UpperBound": 40.0}
+    assert names(road_friction(1.05, 0.9, 1.18, 1.0)) == {
+        "MostProbable": 100.0,
+        "LowerBound": 90.0,
+        "UpperBound": 100.0,
+    }
+
+
+@pytest.mark.parametrize("used", [0.0, 0.35, math.nan])
+def test_what_was_hardly_used_has_no_most_probable_value(used: float) -> None:
+    assert names(road_friction(0.6, 0.11, 1.14, used)) == {"LowerBound": 11.0, "UpperBound": 100.0}
+
+
+def test_what_is_unknown_is_absent() -> None:
+    assert road_friction(math.nan, math.nan, math.nan, 0.5) == {}
+
+
+def test_it_is_told_at_its_rate() -> None:
+    lines: list[str] = []
+    output = RoadFrictionOutput(["car-one"], lines.append, 2.0)
+    output.tell(None)
+    for k in range(21):
+        output.tell(grip(0.3, 0.2, 0.4, 0.3, 0.1 * k))
+    assert len(lines) == 5
+    assert json.loads(lines[1])["time"] == "2027-01-15T08:00:00.500Z"
+
+
+def test_it_is_put_where_somebody_listens_as_it_is_printed(router: Router) -> None:
+    lines: list[str] = []
+    output = RoadFrictionOutput(["car-one"], lines.append, 10.0)
+    heard: list[str] = []
+    with (
+        zenoh.open(configuration(router.settings, "car-one")) as car,
+        zenoh.open(configuration(router.settings, "dashboard")) as dashboard,
+    ):
+        output.attach("car-one", car)
+        output.tell(grip(0.3, 0.2, 0.4, 0.3))
+        dashboard.declare_subscriber(keys.vss_key("car-one"), lambda sample: heard.append(sample.payload.to_string()))
+        matched(output.publishers["car-one"])
+        output.tell(grip(0.3, 0.2, 0.4, 0.3, 1.0))
+        until(lambda: heard)
+    assert heard == lines[1:]
+    assert names(json.loads(heard[0]))["MostProbable"] == 30.0
+
+
+def test_the_command_prints_lines_of_the_drive(
+    router: Router, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "agent.json"
+    config.write_text(json.dumps({"zenoh": router.settings.model_dump(), "spool": str(tmp_path / "spool.sqlite")}))
+    assert main([*WORDS, "--config", str(config)]) == 0
+    *lines, _ = capsys.readouterr().out.splitlines()
+    told = [json.loads(line) for line in lines]
+    assert len(told) > 1
+    assert {one["event"] for one in told} == {"vss"}
+    assert {one["vehicle"] for one in told} == {"car-one"}
+    for one in told:
+        known = names(one)
+        assert 0.0 < known["LowerBound"] < known["UpperBound"] <= 100.0
+        assert known["LowerBound"] <= known.get("MostProbable", 100.0)
