@@ -1,18 +1,24 @@
-"""Answering queries: what is light at once in Zenoh's thread, what is heavy one after the other in a thread of its own.
+"""Answering queries: what is light at once in Zenoh's thread, what is heavy in a thread of its own, a tile at a time.
 
-Who asks for much waits behind who asks for much, and nobody who asks for little waits for either: the heavy answers go
-a tile at a time and rest after each as long as it took. What is more than an answer may hold is an error that says how
-to ask. One past is rebuilt at a time, in a process of its own; who asks meanwhile is told to ask again.
+Zenoh does not tell a queryable who asks, and what an asker says of itself anybody can say. So nobody has a budget of
+his own: all share by what a question costs. The next tile is always of the question that would have ended first, had
+each come to an idle service (`_Heavy.rank`); so a small one goes before a large one that came earlier, and no stream of
+small ones keeps a large one waiting for ever. Where too many wait, the most costly is told to come again. Light answers
+take no more than LIGHT_PER_S together, beyond which they are treated as heavy ones, the smallest first. After each tile
+of a heavy answer the thread rests as long as it took. What is more than an answer may hold is an error that says how to
+ask. One past is rebuilt at a time, in a process of its own; who asks meanwhile is told to ask again.
 """
 
 from __future__ import annotations
 
+import heapq
 import logging
-import queue
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Final, NamedTuple
 
@@ -28,7 +34,9 @@ TEXT: Final = "text/plain"
 COST: Final = {Format.ARROW: 1, Format.JSON: 20, Format.GEOJSON: 20}
 LIGHT: Final = 30_000  # 20 ms of an Arrow answer
 MOST: Final = 10_000_000  # ten million cells of Arrow, 700 MB; half a million as text, 250 MB
-WAITING: Final = 8  # heavy questions; more are told to come again
+PER_S: Final = 1_500_000  # cost that is answered in a second
+LIGHT_PER_S: Final = PER_S / 2  # ... by Zenoh's thread, which answers one light question after the other
+WAITING: Final = 64  # questions; more are told to come again
 REST: Final = 1.0  # after a tile of a heavy answer, by the time it took: light ones find the interpreter free
 LONGEST_REST_S: Final = 0.05
 
@@ -46,20 +54,62 @@ class Answering(NamedTuple):
     answer: Callable[[MapQuery, Callable[[int], bool], int | None], Iterable[tuple[int, bytes]]]
 
 
+@dataclass(order=True)
+class _Heavy:
+    """A question that waits, or is half answered.
+
+    Attributes:
+        rank: when it would be answered, had it come to a service that has nothing else to do [s].
+        number: of the questions before it.
+    """
+
+    rank: float
+    number: int
+    request: zenoh.Query = field(compare=False)
+    wanted: MapQuery = field(compare=False)
+    tiles: Iterator[tuple[int, bytes]] | None = field(default=None, compare=False)
+
+
+@dataclass
+class _Answered:
+    """Whether nothing of an answer is still to come."""
+
+    whole: bool = True
+
+
+class _Light:
+    """How much light answering there may be."""
+
+    def __init__(self) -> None:
+        self._left, self._since, self._guard = LIGHT_PER_S, time.monotonic(), threading.Lock()
+
+    def take(self, cost: float) -> bool:
+        """Whether there may be so much now; it is taken."""
+        with self._guard:
+            now = time.monotonic()
+            self._left = min(LIGHT_PER_S, self._left + (now - self._since) * LIGHT_PER_S)
+            self._since = now
+            if self._left < cost:
+                return False
+            self._left -= cost
+            return True
+
+
 class MapQueryable:
     """The callback of the queryables.
 
     Args:
         answering: counts and makes answers.
-        counts: takes `queries`, `heavy_queries`, `bad_queries.FIELD` and `answer_failures`.
+        counts: takes `queries`, `heavy_queries`, `refused_queries`, `bad_queries.FIELD` and `answer_failures`.
     """
 
     def __init__(self, answering: Answering, counts: Counter[str]) -> None:
         self._answering, self._counts = answering, counts
         self._past = threading.Lock()
-        self._heavy: queue.Queue[tuple[zenoh.Query, MapQuery]] = queue.Queue(WAITING)
+        self._heavy: list[_Heavy] = []  # a heap
+        self._light = _Light()
         self._worker: threading.Thread | None = None
-        self._starting = threading.Lock()
+        self._some = threading.Condition()
 
     def __call__(self, request: zenoh.Query) -> None:
         """Answer one query, now or a little later."""
@@ -77,10 +127,10 @@ class MapQueryable:
             return
         if wanted.at is not None:
             self._ask_past(request, wanted)
-        elif cost <= LIGHT:
+        elif cost <= LIGHT and self._light.take(cost):
             self._reply(request, wanted)
         else:
-            self._queue(request, wanted)
+            self._queue(request, wanted, cost)
 
     def _ask_past(self, request: zenoh.Query, wanted: MapQuery) -> None:
         if self._past.acquire(blocking=False):
@@ -88,20 +138,47 @@ class MapQueryable:
         else:
             self._refuse(request, InputError("at", "another past is being rebuilt", "ask again later"))
 
-    def _queue(self, request: zenoh.Query, wanted: MapQuery) -> None:
+    def _queue(self, request: zenoh.Query, wanted: MapQuery, cost: float) -> None:
         self._counts["heavy_queries"] += 1
-        try:
-            self._heavy.put_nowait((request, wanted))
-        except queue.Full:
-            self._refuse(request, InputError("query", "too many ask for as much", "ask again later, or for less"))
-        with self._starting:
+        with self._some:
+            rank = time.monotonic() + cost / PER_S
+            heapq.heappush(self._heavy, _Heavy(rank, self._counts["heavy_queries"], request, wanted))
+            dropped = max(self._heavy) if len(self._heavy) > WAITING else None
+            if dropped is not None:
+                self._heavy.remove(dropped)
+                heapq.heapify(self._heavy)
+            self._some.notify()
             if self._worker is None or not self._worker.is_alive():
                 self._worker = threading.Thread(target=self._work, name="heavy answers", daemon=True)
                 self._worker.start()
+        if dropped is not None:
+            self._counts["refused_queries"] += 1
+            self._refuse(
+                dropped.request, InputError("query", "too many ask for as much", "ask again later, or for less")
+            )
 
     def _work(self) -> None:
         while True:
-            self._reply(*self._heavy.get(), rest=REST)
+            with self._some:
+                self._some.wait_for(lambda: self._heavy)
+                first = heapq.heappop(self._heavy)
+            began = time.perf_counter()
+            if self._goes_on(first):
+                with self._some:
+                    heapq.heappush(self._heavy, first)
+            time.sleep(min(REST * (time.perf_counter() - began), LONGEST_REST_S))
+
+    def _goes_on(self, heavy: _Heavy) -> bool:
+        """Answer with one tile more; whether there may be others."""
+        request = heavy.request
+        with self._answered(request) as answered:
+            if heavy.tiles is None:
+                heavy.tiles = iter(self._answering.answer(heavy.wanted, *_wanted(request)))
+            for tile, payload in heavy.tiles:
+                request.reply(keys.map_key(tile), payload, encoding=heavy.wanted.format.encoding)
+                answered.whole = False
+                break
+        return not answered.whole
 
     def _answer_past(self, request: zenoh.Query, wanted: MapQuery) -> None:
         try:
@@ -109,28 +186,32 @@ class MapQueryable:
         finally:
             self._past.release()
 
-    def _reply(self, request: zenoh.Query, wanted: MapQuery, rest: float = 0.0) -> None:
-        with request:
-            try:
-                self._send(request, wanted, rest)
-            except InputError as error:
-                self._refuse(request, error)
-            except zenoh.ZError:  # the session closed meanwhile: nobody is there to hear it
-                pass
-            except Exception as error:  # whatever it is: a query that ends without a reply says that there is no data
-                self._counts["answer_failures"] += 1
-                log.exception("a query could not be answered")
+    def _reply(self, request: zenoh.Query, wanted: MapQuery) -> None:
+        with self._answered(request):
+            for tile, payload in self._answering.answer(wanted, *_wanted(request)):
+                request.reply(keys.map_key(tile), payload, encoding=wanted.format.encoding)
+
+    @contextmanager
+    def _answered(self, request: zenoh.Query) -> Iterator[_Answered]:
+        """Reply to a request, and let it go unless there is more to come; what fails is an error reply."""
+        answered = _Answered()
+        try:
+            yield answered
+        except InputError as error:
+            answered.whole = True
+            self._refuse(request, error)
+        except zenoh.ZError:  # the session closed meanwhile: nobody is there to hear it
+            answered.whole = True
+        except Exception as error:  # whatever it is: a query that ends without a reply says that there is no data
+            answered.whole = True
+            self._counts["answer_failures"] += 1
+            log.exception("a query could not be answered")
+            with suppress(zenoh.ZError):
                 request.reply_err(
                     f"query: could not be answered ({type(error).__name__}); ask again later", encoding=TEXT
                 )
-
-    def _send(self, request: zenoh.Query, wanted: MapQuery, rest: float) -> None:
-        began = time.perf_counter()
-        for tile, payload in self._answering.answer(wanted, *_wanted(request)):
-            request.reply(keys.map_key(tile), payload, encoding=wanted.format.encoding)
-            if rest:
-                time.sleep(min(rest * (time.perf_counter() - began), LONGEST_REST_S))
-                began = time.perf_counter()
+        if answered.whole:
+            request.drop()
 
     def _refuse(self, request: zenoh.Query, error: InputError) -> None:
         field = error.field if error.field in MapQuery.model_fields else "query"  # else the asker's own word

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pytest
 import zenoh
 
-from fleet_service.serve.queryable import COST, LIGHT, MOST, Answering, MapQueryable
+from fleet_service.serve.queryable import COST, LIGHT, LIGHT_PER_S, MOST, WAITING, Answering, MapQueryable
 from schemas import keys
 from schemas.query import Format, MapQuery
 from tests.fleet_service.examples import TILE
@@ -94,3 +94,71 @@ def test_who_asks_for_little_does_not_wait_for_who_asks_for_much(session: zenoh.
     assert [reply.ok.payload.to_string() for reply in heavy if reply.ok] == ["a tile"]
     querier.undeclare()
     queryable.undeclare()
+
+
+COSTS = {2: MOST, 3: 2 * LIGHT, 4: LIGHT}  # by what is asked for; a question of each kind
+
+
+class Half:
+    """Answers of two tiles; those that cost most wait for `go` after the first."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.counts, self.go, self.session = Counter[str](), threading.Event(), session
+        self.begun = threading.Semaphore(0)
+        self.queryable = MapQueryable(Answering(self.cells, self.answer), self.counts)
+        self.key = keys.map_key(TILE)
+
+    def cells(self, query: MapQuery, wanted: Callable[[int], bool], only: int | None) -> int:
+        return COSTS[query.min_vehicles]
+
+    def answer(self, query: MapQuery, wanted: Callable[[int], bool], only: int | None) -> Iterator[tuple[int, bytes]]:
+        yield TILE, b"first"
+        while query.min_vehicles == 2 and not self.go.is_set():
+            self.begun.release()
+            yield TILE, b"more"
+        yield TILE, b"last"
+
+    def ask(self, kind: int) -> list[str]:
+        """All replies: Zenoh hands over the last of a key, if it came."""
+        return texts(self.session, f"{self.key}?min_vehicles={kind}")
+
+
+@pytest.fixture
+def half(session: zenoh.Session) -> Iterator[Half]:
+    """Such a queryable, heard."""
+    made = Half(session)
+    declared = session.declare_queryable(made.key, made.queryable, complete=True)
+    querier = session.declare_querier(made.key)
+    matched(querier)
+    yield made
+    made.go.set()
+    querier.undeclare()
+    declared.undeclare()
+
+
+def test_a_smaller_question_is_answered_amid_a_larger_one_that_came_before(half: Half) -> None:
+    large = half.session.get(f"{half.key}?min_vehicles=2", timeout=60.0)
+    assert half.begun.acquire(timeout=30.0)
+    assert half.ask(3) == ["last"]
+    assert not half.go.is_set()
+    half.go.set()
+    assert [reply.ok.payload.to_string() for reply in large if reply.ok] == ["last"]
+
+
+def test_light_questions_beyond_their_share_are_still_answered(half: Half) -> None:
+    """Whoever asks for many small things waits with the heavy ones; nothing of it is refused."""
+    for _ in range(2 * int(LIGHT_PER_S / LIGHT)):
+        assert half.ask(4) == ["last"]
+    assert half.counts["queries"] > half.counts["heavy_queries"] > 0
+    assert not half.counts["refused_queries"]
+
+
+def test_where_too_many_ask_the_most_costly_is_told_to_come_again(half: Half) -> None:
+    large = [half.session.get(f"{half.key}?min_vehicles=2", timeout=60.0) for _ in range(WAITING + 2)]
+    until(lambda: half.counts["refused_queries"] >= 1)
+    assert half.ask(3) == ["last"]
+    half.go.set()
+    answers = [sorted(part.payload.to_string() for r in one if (part := r.ok or r.err)) for one in large]
+    refused = [answer for answer in answers if "last" not in answer]
+    assert len(refused) == half.counts["refused_queries"] < len(large)
+    assert all("query: too many ask for as much; ask again later, or for less" in answer for answer in refused)
