@@ -95,7 +95,7 @@ class ServiceConfig(MonitoringSettings):
         default=None, description="Parquet file of road weather to begin with; reports over Zenoh come on top"
     )
     public_vehicles: int = Field(
-        default=1, ge=1, description="answers and tiles show only cells of so many distinct vehicles (privacy)"
+        default=1, ge=1, description="cells are shown of so many vehicles; from 2 on, of the last 12 to 24 h (privacy)"
     )
     clock_ahead_s: Positive = Field(default=30.0, description="records further in the future are refused")
     oldest_s: Positive = Field(default=30 * 86400.0, description="records older than this are refused")

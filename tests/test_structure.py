@@ -68,7 +68,7 @@ PURE = (
     "fleet_service/fusion",
     "fleet_service/ingest/dedup.py",
     "fleet_service/ingest/grouping.py",
-    *(f"fleet_service/serve/{name}.py" for name in ("alerts", "map_state", "neighbour_fill", "view")),
+    *(f"fleet_service/serve/{name}.py" for name in ("alerts", "map_state", "neighbour_fill", "view", "visitors")),
 )
 # Beside it, what turns one thing in memory into another: tables and messages too, but no input or output either.
 SANS_IO = (

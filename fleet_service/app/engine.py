@@ -21,7 +21,7 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_service.app.clock import TimeNow
-from fleet_service.app.memory import SLOTS, Memory, remember
+from fleet_service.app.memory import SLOTS, Memory, remember, visited
 from fleet_service.app.past import PastQuery, ask
 from fleet_service.app.precompile import warm_up
 from fleet_service.archive.files import lock
@@ -98,7 +98,7 @@ class Engine:
         self._log: SegmentLog[BatchId] = SegmentLog(root, config.name)
         self._wanted: queue.SimpleQueue[tuple[Future[Any], Callable[[], object]]] = queue.SimpleQueue()
         self._ended: list[Alert] = []  # alerts that nobody was told the end of yet
-        memory = remember(root, config.lateness_s, set_aside)
+        memory = remember(root, config, set_aside)
         self.counts["checkpoints_refused"] += memory.refused
         self.weather = WeatherInbox(root, config.name, memory.fusion, self.counts)
         self._know(memory)
@@ -111,7 +111,8 @@ class Engine:
     def _know(self, memory: Memory) -> None:
         """Go on with what is known of the archive."""
         self.fusion, self.map, self._alerts, self._streams = memory.fusion, memory.map, memory.alerts, memory.streams
-        self._tiles = TileCache(self.map, self._guard, self._config.public_vehicles)
+        self._visitors = memory.visitors
+        self._tiles = TileCache(self.map, self._guard, self._config.public_vehicles, self._visitors)
         self._intake = BatchIntake(self._streams, Pseudonyms(self._root / "keys"), self.counts, self._acks)
         self.weather.fusion = self.fusion
 
@@ -123,7 +124,7 @@ class Engine:
         """
         stood = self._alerts.standing
         before()
-        memory = remember(self._root, self._config.lateness_s, set_aside)
+        memory = remember(self._root, self._config, set_aside)
         with self._guard:
             self._tracks, self._places = Tracks(), Bucket(NEW_CELLS_AT_ONCE, NEW_CELLS_PER_HOUR)
             self._know(memory)
@@ -159,7 +160,7 @@ class Engine:
 
     def _image(self) -> Taken:
         with self._guard:
-            tables = image_of(self.fusion, self._alerts.standing, self._streams)
+            tables = image_of(self.fusion, self._alerts.standing, self._streams) | visited(self._visitors)
         return Taken(tables, self.written_to, tuple(path.name for path in weather_files(self._root)))
 
     @property
@@ -248,7 +249,10 @@ class Engine:
         self.report_lag_s = float((rows["received_at"] - rows["leave_time"]).min()) * 1e-9
         with self._guard:
             heard = np.flatnonzero(~self._beyond(rows))
-            updated = self.fusion.update(observations_of(rows, rows["witness"]).take(heard))
+            taken = observations_of(rows, rows["witness"]).take(heard)
+            updated = self.fusion.update(taken)
+            if self._visitors is not None:
+                self._visitors.heard(taken)
             self.map.changed(updated.slots)
             raised = self._alerts.updated(updated.slots)
             if raised:
@@ -343,8 +347,8 @@ class Engine:
         for start in range(0, self.fusion.size, SLOTS):
             with self._guard:
                 slots = np.arange(start, min(start + SLOTS, self.fusion.size))
-                public = slots[self.fusion.live.vehicles[slots] >= self._config.public_vehicles]
-                tables.append(pa.Table.from_batches([batch_of(self._tiles.seen(public, now), now)]))
+                seen = self._tiles.seen(self._tiles.public(slots, now), now)
+                tables.append(pa.Table.from_batches([batch_of(seen, now)]))
         return pa.concat_tables([*tables, MAP_SCHEMA.empty_table()])
 
     def fade_alerts(self, now: int) -> list[Alert]:
@@ -368,7 +372,9 @@ class Engine:
         at = nanoseconds(query.at)
         if at > now:
             raise InputError("at", "lies in the future", "give a time that has been")
-        return ask(self._root, PastQuery(query, at, self._config.lateness_s, only), wanted)
+        return ask(
+            self._root, PastQuery(query, at, self._config.lateness_s, only, self._config.public_vehicles), wanted
+        )
 
     def cells(self, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None) -> int:
         """Cells that an answer may have at the most.

@@ -65,7 +65,7 @@ def _erase(
     cut = engine.between(lambda: engine.written_to, stop)
     if cut is None:
         return None
-    told = json.dumps({**asdict(wanted), "lateness_s": config.lateness_s, "cut": cut})
+    told = json.dumps({**asdict(wanted), "config": config.model_dump(mode="json"), "cut": cut})
     output = beside.run("erasure", "fleet_service.app.erasing_process", [str(root)], stop, told)
     if output is None:
         return None
@@ -92,5 +92,5 @@ def apart(root: Path, told: dict[str, Any]) -> dict[str, Any]:
     known = weather.files(root)  # one that comes meanwhile is read again, which changes nothing
     with erased(root, told["vehicle"], told["month"]) as done:
         cut = Cut(*told["cut"])
-        checkpoints.save(root, remember(root, told["lateness_s"], until=cut).image(cut, known))
+        checkpoints.save(root, remember(root, ServiceConfig(**told["config"]), until=cut).image(cut, known))
     return {"rows": done.rows, "files": [str(path.relative_to(root)) for path in done.files]}

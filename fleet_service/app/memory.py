@@ -19,11 +19,14 @@ from fleet_service.fusion.weather import Reports
 from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.weather import archived
 from fleet_service.replay.checkpoints import Taken
-from fleet_service.replay.rebuild import Begin, Since, first_day, replay, restore_streams
+from fleet_service.replay.rebuild import Begin, Since, first_day, nobody, replay, restore_streams
 from fleet_service.replay.restart import image_of, restart
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.map_state import MapState
+from fleet_service.serve.visitors import Visitors
+from schemas.config import ServiceConfig
 
+VISITORS: Final = "visitors"  # a table of a checkpoint
 SLOTS: Final = 20_000  # at once: a lock is held for 40 ms, and little memory is needed
 
 
@@ -35,6 +38,7 @@ class Memory(NamedTuple):
         streams: batches that were admitted.
         weather: all reports that were used.
         refused: checkpoints that could not be begun from.
+        visitors: who was where lately; None, where every cell is public.
     """
 
     fusion: Fusion
@@ -43,30 +47,45 @@ class Memory(NamedTuple):
     streams: SequenceTrackers
     weather: Reports
     refused: int
+    visitors: Visitors | None
 
     def image(self, cut: Cut, weather: Iterable[Path]) -> Taken:
         """What a checkpoint keeps of it; everything up to the segment `cut`, and these files of weather, are in it."""
-        tables = image_of(self.fusion, self.alerts.standing, self.streams)
+        tables = image_of(self.fusion, self.alerts.standing, self.streams) | visited(self.visitors)
         return Taken(tables, cut, tuple(path.name for path in weather))
 
 
+def visited(visitors: Visitors | None) -> dict[str, pa.Table]:
+    """Visitors as tables of a checkpoint: bits and the part of the window in columns of one length."""
+    if visitors is None:
+        return {}
+    columns = visitors.columns()
+    part = np.full(len(columns["bits"]), columns["part"][0])
+    return {VISITORS: pa.table({"bits": pa.array(columns["bits"]), "part": pa.array(part)})}
+
+
 def remember(
-    root: Path, lateness_s: float, damaged: Callable[[Path, str], None] = pass_over, until: Cut | None = None
+    root: Path, config: ServiceConfig, damaged: Callable[[Path, str], None] = pass_over, until: Cut | None = None
 ) -> Memory:
     """Read the archive; of segments that are not compacted, those written up to `until`.
 
     Raises:
         OSError: it cannot be read.
     """
-    begin = restart(root, lateness_s)
+    begin = restart(root, config.lateness_s, (VISITORS,))
     fusion, streams = begin.fusion, begin.streams
+    visitors = None
+    if config.public_vehicles > 1:  # after a checkpoint that does not have them nothing is shown until so many came
+        told = begin.beside.get(VISITORS)
+        visitors = Visitors.of(fusion, told) if told and len(told["bits"]) else Visitors(fusion)
     shown, alerts = MapState(fusion), Alerts(fusion)
     alerts.resume(begin.standing)
     used = archived(root, damaged=damaged)  # before the observations, which it acts on
     fusion.update_weather(archived(root, known=begin.weather, damaged=damaged) if begin.cut else used)
     restored = np.array_split(np.arange(fusion.size), fusion.size // SLOTS + 1)
     matters = Begin(first_day(root), begin.cut, until)
-    rest = replay(root, fusion, Since(matters, streams if begin.cut else None), damaged)
+    heard = nobody if visitors is None else visitors.heard
+    rest = replay(root, fusion, Since(matters, streams if begin.cut else None), damaged, heard)
     with ThreadPoolExecutor(1, "streams") as beside:
         noted = partial(restore_streams, root, streams, matters, damaged)
         noting = None if begin.cut else beside.submit(noted)  # what a checkpoint knows, the replay asks
@@ -78,4 +97,4 @@ def remember(
         else:
             noting.result()
     pa.default_memory_pool().release_unused()  # the archive went through it
-    return Memory(fusion, shown, alerts, streams, used, begin.refused)
+    return Memory(fusion, shown, alerts, streams, used, begin.refused, visitors)

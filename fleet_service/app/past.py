@@ -17,10 +17,12 @@ from typing import BinaryIO, Final, NamedTuple
 
 import pyarrow as pa
 
+from fleet_service.fusion import Fusion, Observations
 from fleet_service.replay.rebuild import Box, past, rows_near, too_much
 from fleet_service.serve.map_state import MapState
 from fleet_service.serve.query import answer
 from fleet_service.serve.tile_cache import TileCache
+from fleet_service.serve.visitors import Visitors
 from schemas import grid
 from schemas.errors import InputError
 from schemas.query import MapQuery
@@ -32,12 +34,14 @@ _ERROR: Final = -1
 
 
 class PastQuery(NamedTuple):
-    """A query about a moment [ns], with the lateness that the service had [s]; `only`: the one tile that is wanted."""
+    """A query about a moment [ns], with the lateness that the service had [s]; `only`: the one tile that is wanted;
+    `public`: vehicles that a cell must have had lately to be shown."""
 
     query: MapQuery
     at: int
     lateness_s: float
     only: int | None
+    public: int = 1
 
 
 def ask(root: Path, question: PastQuery, wanted: Callable[[int], bool]) -> Iterator[tuple[int, bytes]]:
@@ -89,11 +93,18 @@ def replies(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
     Raises:
         InputError: too many rows are in the box, or the archive cannot be read.
     """
+    heard: list[Visitors] = []
+
+    def listener(fusion: Fusion) -> Callable[[Observations], None]:
+        heard.append(Visitors(fusion))
+        return heard[0].heard
+
+    listening = listener if question.public > 1 else None
     try:
-        then = past(root, question.lateness_s, question.at, box_of(question), MOST_ROWS)
+        then = past(root, question.lateness_s, question.at, box_of(question), MOST_ROWS, listening)
     except OSError as error:
         raise InputError("at", f"the archive cannot be read ({error.strerror})", "ask again later") from error
-    cache = TileCache(MapState(then), nullcontext(), question.query.min_vehicles)
+    cache = TileCache(MapState(then), nullcontext(), question.public, heard[0] if heard else None)
     yield from answer(cache, question.query, lambda _: True, question.at, question.only)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 from itertools import pairwise
@@ -110,13 +110,24 @@ class Since(NamedTuple):
         return found or None
 
 
+Heard = Callable[[Observations], None]
+
+
+def nobody(_: Observations) -> None:
+    """Listens to no observation."""
+
+
 def too_much() -> InputError:
     """A question about the past that asks for too many rows."""
     return InputError("at", "would have to read too much of the archive", "narrow bbox")
 
 
-def past(root: Path, lateness_s: float, until: int, box: Box | None = None, most: int | None = None) -> Fusion:
-    """The fusion of a service that had received everything until a moment [ns], near a box [deg].
+def past(
+    root: Path, lateness_s: float, until: int, box: Box | None = None, most: int | None = None,
+    listener: Callable[[Fusion], Heard] | None = None,
+) -> Fusion:  # fmt: skip
+    """The fusion of a service that had received everything until a moment [ns], near a box [deg]; what it fuses is told
+    to what `listener` makes for it.
 
     Raises:
         InputError: there are more rows than `most`.
@@ -125,7 +136,8 @@ def past(root: Path, lateness_s: float, until: int, box: Box | None = None, most
     fusion = Fusion(lateness_s)
     begin = Begin(until // layout.DAY_NS - MAP_DAYS)
     fusion.update_weather(archived(root, received_until=until))
-    for _ in replay(root, fusion, Since(begin, until=until, box=box, most=most)):
+    wanted, heard = Since(begin, until=until, box=box, most=most), nobody if listener is None else listener(fusion)
+    for _ in replay(root, fusion, wanted, heard=heard):
         pass  # the alerts of then are history
     return fusion
 
@@ -144,6 +156,7 @@ def replay(
     fusion: Fusion,
     since: Since = Since(),  # noqa: B008 immutable
     damaged: Damaged = pass_over,
+    heard: Heard = nobody,
 ) -> Iterator[Updated]:
     """Replay the archive into `fusion` in order of time, with the weights that were used; yields once per epoch.
 
@@ -154,6 +167,7 @@ def replay(
         fusion: a new one, or one that holds everything before `since`.
         since: the rows wanted.
         damaged: is told of a damaged file.
+        heard: is told of what was fused.
     """
     last = None if since.until is None else since.until // layout.DAY_NS + 1
     where = since.where()
@@ -173,9 +187,9 @@ def replay(
         o, before = _joined([*waiting, (o, before)])
         epoch = (o.time + before.late_by) // EPOCH_NS
         waiting = [_taken(o, before, epoch > end)]
-        yield from _fused(fusion, *_taken(o, before, epoch <= end))
+        yield from _fused(fusion, *_taken(o, before, epoch <= end), heard)
     if waiting:
-        yield from _fused(fusion, *waiting[0])
+        yield from _fused(fusion, *waiting[0], heard)
 
 
 def _before(rows: segments.Rows) -> Before:
@@ -202,13 +216,16 @@ def _taken(o: Observations, before: Before, rows: BoolArray | IntArray) -> tuple
     return o.take(rows), Before(before.late[rows], before.late_by[rows], before.weight[rows], before.error[rows])
 
 
-def _fused(fusion: Fusion, o: Observations, before: Before) -> Iterator[Updated]:
+def _fused(fusion: Fusion, o: Observations, before: Before, heard: Heard) -> Iterator[Updated]:
     """Fuse rows epoch by epoch of when they were fused."""
     time = o.time + before.late_by
     order = np.argsort(time, kind="stable")
     for part in np.split(order, np.flatnonzero(np.diff(time[order] // EPOCH_NS)) + 1):
         if len(part):
-            yield fusion.update(*_taken(o, before, part))
+            taken, used = _taken(o, before, part)
+            updated = fusion.update(taken, used)
+            heard(taken)
+            yield updated
 
 
 def in_order(listing: reading.Listing, most: int | None = None) -> Iterator[pa.Table]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -14,6 +15,7 @@ from fleet_service.fusion import Fusion
 from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.replay import checkpoints
 from fleet_service.replay.checkpoint_tables import fusion_from, tables_of
+from schemas.numeric import IntArray
 from schemas.wire import Alert
 
 log = logging.getLogger(__name__)
@@ -33,6 +35,7 @@ class Restart(NamedTuple):
         cut: everything up to this segment is in it; None: nothing is.
         weather: names of the files of weather that are in it.
         refused: checkpoints that could not be read: damaged, or of another version.
+        beside: other tables of the checkpoint that were asked for, as columns.
     """
 
     fusion: Fusion
@@ -41,10 +44,11 @@ class Restart(NamedTuple):
     cut: Cut | None
     weather: frozenset[str]
     refused: int
+    beside: dict[str, dict[str, IntArray]]
 
 
-def restart(root: Path, lateness_s: float) -> Restart:
-    """Begin from the archive in a folder."""
+def restart(root: Path, lateness_s: float, beside: Sequence[str] = ()) -> Restart:
+    """Begin from the archive in a folder; `beside`: tables that the service put to those of `image_of`."""
     refused = 0
     for path in checkpoints.newest(root):
         try:
@@ -54,14 +58,16 @@ def restart(root: Path, lateness_s: float) -> Restart:
             above = tables.pop(ABOVE)["seq"].to_numpy()
             columns = tables.pop(STREAMS)
             streams = SequenceTrackers.of({name: columns[name].to_numpy() for name in columns.column_names}, above)
+            told = {name: tables.pop(name) for name in beside if name in tables}
+            others = {n: {column: t[column].to_numpy() for column in t.column_names} for n, t in told.items()}
             fusion = fusion_from(tables, lateness_s)
         except Exception as error:  # noqa: BLE001 whatever is wrong with it, the log has it all
             log.warning("checkpoint %s is not begun from: %s", path.name, error)
             refused += 1
             continue
         checkpoints.begin(path)
-        return Restart(fusion, streams, standing, taken.cut, frozenset(taken.weather), refused)
-    return Restart(Fusion(lateness_s), SequenceTrackers(), [], None, frozenset(), refused)
+        return Restart(fusion, streams, standing, taken.cut, frozenset(taken.weather), refused, others)
+    return Restart(Fusion(lateness_s), SequenceTrackers(), [], None, frozenset(), refused, {})
 
 
 def image_of(fusion: Fusion, standing: list[Alert], streams: SequenceTrackers) -> dict[str, pa.Table]:

@@ -80,7 +80,7 @@ def _viewed(cache: TileCache, tile: int, query: MapQuery, route: IntArray | None
             ahead = route[grid.tile_of(route // grid.SECTORS) == tile]
             found = fusion.slots_of(ahead // grid.SECTORS, ahead % grid.SECTORS)
             passed = found[found >= 0]
-        cells = cache.seen(passed, now)
+        cells = cache.seen(cache.public(passed, now), now)
         if query.basis == "borrowed":
             cells = joined(cells, impute(fusion, tile, slots, route, now))
     return used_once(cells, now)

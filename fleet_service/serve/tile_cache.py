@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from fleet_service.serve.encode import arrow_stream, batch_of
 from fleet_service.serve.map_state import MapState
 from fleet_service.serve.view import CellView, coarse, view
+from fleet_service.serve.visitors import Visitors
 from schemas import grid
 from schemas.numeric import IntArray
 from schemas.thresholds import NS
@@ -59,10 +60,13 @@ class TileCache:
         state: the map.
         guard: held while the map is read; not while Arrow is written.
         least: vehicles of a cell that is public.
+        visitors: who must have been that many lately; None: whenever it was.
     """
 
-    def __init__(self, state: MapState, guard: AbstractContextManager[Any], least: int) -> None:
-        self.state, self.guard, self._least = state, guard, least
+    def __init__(
+        self, state: MapState, guard: AbstractContextManager[Any], least: int, visitors: Visitors | None = None
+    ) -> None:
+        self.state, self.guard, self._least, self._visitors = state, guard, least, visitors
         self._kept: dict[int, ShownTile] = {}
         self._held = 0  # bytes
         self._acknowledged = 0  # change up to which all must be seen
@@ -83,7 +87,7 @@ class TileCache:
         """A tile as it is believed at `now` [ns]."""
         with self.guard:
             change = self.state.change
-            cells = self.seen(self._public(self.state.slots(tile)), now)
+            cells = self.seen(self._from_south(self.public(self.state.slots(tile), now)), now)
         payload = arrow_stream(batch_of(cells, now))
         batch = pa.ipc.open_stream(payload).read_next_batch()
         columns = selected_by(batch)
@@ -96,12 +100,14 @@ class TileCache:
         cells = view(self.state.fusion, slots, now)
         return coarse(cells) if self._least > 1 else cells
 
-    def _public(self, slots: IntArray) -> IntArray:
-        """The public ones, from south to north."""
-        live = self.state.fusion.live
-        public = slots[live.vehicles[slots] >= self._least]
-        _, row = grid.deinterleave(live.key[public] // grid.SECTORS)
-        return public[np.argsort(-row, kind="stable")]
+    def public(self, slots: IntArray, now: int) -> IntArray:
+        """The public ones at `now` [ns]."""
+        slots = slots[self.state.fusion.live.vehicles[slots] >= self._least]
+        return slots if self._visitors is None else slots[self._visitors.count(slots, now) >= self._least]
+
+    def _from_south(self, slots: IntArray) -> IntArray:
+        _, row = grid.deinterleave(self.state.fusion.live.key[slots] // grid.SECTORS)
+        return slots[np.argsort(-row, kind="stable")]
 
     def _keep(self, tile: int, made: ShownTile) -> None:
         with self.guard:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator
-from datetime import datetime
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +14,16 @@ import pyarrow as pa
 import pytest
 
 from fleet_service.app.engine import Engine
+from fleet_service.archive.retention import drop_checkpoints
+from fleet_service.fusion import Fusion
 from fleet_service.ingest.inbox import Message
+from fleet_service.replay import checkpoints
 from fleet_service.serve.view import CellView, coarse
+from fleet_service.serve.visitors import PART_NS, Visitors
 from schemas import query, wire
 from schemas.config import ServiceConfig
 from schemas.wire import Kind
-from tests.fleet_service.examples import LATITUDE, LONGITUDE, SECOND, batch, key
+from tests.fleet_service.examples import LATITUDE, LONGITUDE, SECOND, START, batch, key, observations, value
 
 Start = Callable[[int], Engine]
 
@@ -36,17 +42,17 @@ def start(tmp_path: Path) -> Iterator[Start]:
         engine.close()
 
 
-def hear(engine: Engine, *names: str) -> None:
+def hear(engine: Engine, *names: str, now: int | None = None) -> None:
     """One visit of each."""
-    now = time.time_ns()
+    now = time.time_ns() if now is None else now
     sent = [Message(Kind.OBSERVATION, key(n), wire.encode(batch(n, 1, now - SECOND, [0.8])), "") for n in names]
     engine.ingest(sent, now)
     engine.flush()
 
 
-def rows(engine: Engine, **parameters: str) -> list[dict[str, object]]:
+def rows(engine: Engine, now: int | None = None, **parameters: str) -> list[dict[str, object]]:
     """Cells of an answer."""
-    tiles = engine.answer(query.parse(parameters), lambda _: True, time.time_ns())
+    tiles = engine.answer(query.parse(parameters), lambda _: True, time.time_ns() if now is None else now)
     return [row for _, payload in tiles for row in pa.ipc.open_stream(payload).read_all().to_pylist()]
 
 
@@ -54,7 +60,7 @@ def test_a_cell_is_public_from_k_vehicles_on_in_answers_and_tiles(start: Start) 
     engine = start(3)
     hear(engine, "sim-001", "sim-002")
     for parameters in ({}, {"min_vehicles": "1"}, {"basis": "borrowed"}):
-        assert not rows(engine, **parameters)
+        assert not rows(engine, None, **parameters)
     assert not engine.tiles(time.time_ns())
     hear(engine, "sim-003")
     assert [row["vehicles"] for row in rows(engine)] == [3]
@@ -102,3 +108,69 @@ def test_coarse_counts_are_never_more_than_there_were() -> None:
     assert (seen.vehicles <= counts).all()
     assert (seen.vehicles >= 0.39 * counts).all()
     assert (coarse(seen).vehicles == seen.vehicles).all()
+
+
+def test_who_passes_alone_at_night_is_not_seen_where_many_were_by_day(start: Start) -> None:
+    """The vehicles that make a cell public are those of the last hours, in answers, routes, snapshots and tiles."""
+    engine, day = start(3), (time.time_ns() // (2 * PART_NS) - 2) * 2 * PART_NS + 8 * 3600 * SECOND
+    names = [f"sim-{k:03}" for k in range(6)]
+    route = f"{LONGITUDE - 0.001},{LATITUDE}|{LONGITUDE + 0.001},{LATITUDE}"
+    hear(engine, *names, now=day)
+    assert len(rows(engine, day)) == len(rows(engine, day, route=route)) == engine.whole_map(day).num_rows == 1
+    night = day + 18 * 3600 * SECOND
+    hear(engine, "sim-007", now=night)
+    engine.tiles(day)
+    assert not rows(engine, night)
+    assert not rows(engine, night, route=route)
+    assert not engine.whole_map(night).num_rows
+    assert not engine.tiles(night)
+    hear(engine, "sim-008", "sim-009", now=night + SECOND)
+    assert [row["vehicles"] for row in rows(engine, night + 2 * SECOND)] == [5]
+    hour = datetime.fromtimestamp(day / 1e9, UTC)
+    assert rows(engine, night, at=f"{hour + timedelta(minutes=1):%Y-%m-%dT%H:%M:%SZ}")
+    assert not rows(engine, night, at=f"{hour + timedelta(hours=17):%Y-%m-%dT%H:%M:%SZ}")
+
+
+def test_a_restart_knows_who_was_there_with_and_without_a_checkpoint(start: Start, tmp_path: Path) -> None:
+    engine = start(3)
+    hear(engine, "sim-001", "sim-002", "sim-003")
+    engine.flush()
+    taken = taken_from(engine)
+    checkpoints.save(tmp_path, taken)
+    for _ in ("checkpoint", "log"):
+        engine.close()
+        engine = start(3)
+        assert [row["vehicles"] for row in rows(engine)] == [3]
+        drop_checkpoints(tmp_path)
+
+
+def taken_from(engine: Engine) -> checkpoints.Taken:
+    """A checkpoint, with a worker that flushes."""
+    found: list[checkpoints.Taken | None] = []
+    thread = threading.Thread(target=lambda: found.append(engine.checkpoint(threading.Event())))
+    thread.start()
+    while thread.is_alive():
+        engine.flush()
+        thread.join(0.01)
+    assert found[0] is not None
+    return found[0]
+
+
+def test_visitors_are_never_counted_as_more_than_they_were() -> None:
+    fusion, now = Fusion(60.0), START
+    visitors = Visitors(fusion)
+    rng = np.random.default_rng(3)
+    for turn in range(4):
+        who = rng.integers(1, 2**62, 40)
+        o = observations(np.arange(40) * 0.1, who, value(np.full(40, 0.8)))
+        o = replace(o, time=o.time + turn * PART_NS)
+        fusion.update(o)
+        visitors.heard(o)
+        now = int(o.time[-1])
+    slots = np.arange(fusion.size)
+    assert 40 < visitors.count(slots, now)[0] <= 64
+    assert 20 < visitors.count(slots, now + PART_NS)[0] <= 40
+    assert visitors.count(slots, now + 2 * PART_NS)[0] == 0
+    again = Visitors.of(fusion, visitors.columns())
+    assert again.count(slots, now).tolist() == visitors.count(slots, now).tolist()
+    assert Visitors.of(Fusion(60.0), visitors.columns()).count(np.zeros(0, np.int64), now).tolist() == []

@@ -1,0 +1,82 @@
+"""How many distinct vehicles were in a cell lately: rather too few than too many, in sixteen bytes a cell. Pure.
+
+What k vehicles learned hides each of them only while they are k. Once a cell is public for ever, the one car that
+passes at night shows in it.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_service.fusion import Fusion, Observations
+from schemas.numeric import IntArray
+from schemas.thresholds import NS
+
+PART_NS: Final = 12 * 3600 * NS  # the window is the part of a day that runs, and the one before: 12 to 24 hours
+PARTS: Final = 2
+_FIBONACCI: Final = np.uint64(0x9E3779B97F4A7C15)  # 2⁶⁴ over the golden ratio: its multiples lie far apart
+_SHIFT: Final = np.uint64(58)
+
+
+class Visitors:
+    """The vehicles of each slot of a fusion, each as one bit of 64 in each part of the window.
+
+    Args:
+        fusion: whose slots they are; it takes observations before they are `heard`.
+    """
+
+    def __init__(self, fusion: Fusion) -> None:
+        self._fusion = fusion
+        self._bits: NDArray[np.uint64] = np.zeros((0, PARTS), np.uint64)
+        self._part = 0  # the newest that was heard of
+
+    def heard(self, o: Observations) -> None:
+        """Note who was where."""
+        self._grow()
+        part = o.time // PART_NS
+        self._move_on(int(part.max(initial=self._part)))
+        bit = np.uint64(1) << ((o.vehicle.astype(np.uint64) * _FIBONACCI) >> _SHIFT)
+        for sector in (o.sector, o.second):
+            slot = self._fusion.slots_of(o.cell, np.maximum(sector, 0))
+            for back in range(PARTS):
+                mine = (part == self._part - back) & (slot >= 0) & (sector >= 0)
+                np.bitwise_or.at(self._bits[:, back], slot[mine], bit[mine])
+
+    def count(self, slots: IntArray, now: int) -> IntArray:
+        """Distinct vehicles (k,) of slots within the window that ends at `now` [ns]."""
+        self._grow()
+        ago = max(now // PART_NS - self._part, 0)
+        within = self._bits[slots, : max(PARTS - ago, 0)]
+        return np.asarray(np.bitwise_count(np.bitwise_or.reduce(within, axis=1)), np.int64)
+
+    def columns(self) -> dict[str, IntArray]:
+        """What `of` makes the same of."""
+        self._grow()
+        return {"bits": self._bits[: self._fusion.size].reshape(-1).view(np.int64), "part": np.array([self._part])}
+
+    @staticmethod
+    def of(fusion: Fusion, columns: dict[str, IntArray]) -> Visitors:
+        """The visitors that `columns` told; nobody, where they do not fit."""
+        made, bits = Visitors(fusion), columns["bits"]
+        if len(bits) == PARTS * fusion.size:
+            made._bits = bits.view(np.uint64).reshape(-1, PARTS).copy()
+            made._part = int(columns["part"][0])
+        return made
+
+    def _grow(self) -> None:
+        """Room for the slots that there are; twice as much, so that it is seldom done."""
+        if len(self._bits) < self._fusion.size:
+            longer = np.zeros((2 * self._fusion.size, PARTS), np.uint64)
+            longer[: len(self._bits)] = self._bits
+            self._bits = longer
+
+    def _move_on(self, part: int) -> None:
+        """Begin a part of the window; what is older than it goes."""
+        ago = part - self._part
+        if ago > 0:
+            self._bits[:, ago:] = self._bits[:, : max(PARTS - ago, 0)]
+            self._bits[:, :ago] = 0
+            self._part = part
