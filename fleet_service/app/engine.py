@@ -110,6 +110,7 @@ class Engine:
 
     def _know(self, memory: Memory) -> None:
         """Go on with what is known of the archive."""
+        self._memory = memory
         self.fusion, self.map, self._alerts, self._streams = memory.fusion, memory.map, memory.alerts, memory.streams
         self._visitors = memory.visitors
         self._tiles = TileCache(self.map, self._guard, self._config.public_vehicles, self._visitors)
@@ -131,6 +132,11 @@ class Engine:
             still = {(alert.cell, alert.sector) for alert in self._alerts.standing}
             gone = [alert for alert in stood if (alert.cell, alert.sector) not in still]
             self._ended += [replace(alert, raised=False, reason=ERASED) for alert in gone]
+
+    def drop_old(self) -> int:
+        """Drop cells that are back at the prior and old; returns how many. In `between`."""
+        with self._guard:
+            return self._memory.drop_old()
 
     def checkpoint(self, stop: threading.Event) -> Taken | None:
         """What the service knows, and the segment up to which everything is in it; None if stopped meanwhile.

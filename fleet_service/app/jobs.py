@@ -79,6 +79,10 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
         weather.retire(root, at.now // layout.DAY_NS - config.raw_days - 1)
         return f"retired: {done.days} days" if done.days else None
 
+    def old_cells(stop: threading.Event) -> str | None:
+        dropped = engine.between(engine.drop_old, stop)
+        return f"dropped: {dropped} cells that nobody visited for a week" if dropped else None
+
     def inventory(_: threading.Event) -> str | None:
         engine.counts["files_set_aside"] = count_set_aside(root)
         return None
@@ -102,6 +106,7 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
         Job("snapshot", config.snapshot_s, snapshot),
         Job("retention", DAY_S if config.raw_days else 0.0, with_room(retention)),
         Job("inventory", INVENTORY_S, inventory),
+        Job("old_cells", DAY_S, old_cells),
         Job("erasure", ASKED_S, lambda stop: erasing.asked(engine, config, root, stop)),
     ]
 

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.archive.layout import Cut
+from fleet_service.archive.layout import DAY_NS, Cut
 from fleet_service.archive.load import pass_over
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.weather import Reports
@@ -26,6 +26,9 @@ from fleet_service.serve.map_state import MapState
 from fleet_service.serve.visitors import Visitors
 from schemas.config import ServiceConfig
 
+# After fifty-six times the mean time between changes (fusion.constants.CHANGE_S) nothing of a belief is left.
+KEPT_NS: Final = 7 * DAY_NS
+LEAST_DROPPED: Final = 0.01  # of all cells: fewer are not worth copying the others
 VISITORS: Final = "visitors"  # a table of a checkpoint
 SLOTS: Final = 20_000  # at once: a lock is held for 40 ms, and little memory is needed
 
@@ -48,6 +51,21 @@ class Memory(NamedTuple):
     weather: Reports
     refused: int
     visitors: Visitors | None
+
+    def drop_old(self) -> int:
+        """Drop cells that nobody visited for KEPT_NS: what is believed of them is the prior again; returns how many."""
+        newest = self.fusion.checkpoint or 0
+        gone = self.fusion.untouched(newest - KEPT_NS)
+        gone[sorted(self.alerts.raised)] = False
+        dropped = int(gone.sum())
+        if dropped > self.fusion.size * LEAST_DROPPED:
+            place = self.fusion.drop(gone)
+            self.map.renumbered()
+            self.alerts.renumbered(place)
+            if self.visitors is not None:
+                self.visitors.renumbered(place)
+            return dropped
+        return 0
 
     def image(self, cut: Cut, weather: Iterable[Path]) -> Taken:
         """What a checkpoint keeps of it; everything up to the segment `cut`, and these files of weather, are in it."""
@@ -97,4 +115,6 @@ def remember(
         else:
             noting.result()
     pa.default_memory_pool().release_unused()  # the archive went through it
-    return Memory(fusion, shown, alerts, streams, used, begin.refused, visitors)
+    memory = Memory(fusion, shown, alerts, streams, used, begin.refused, visitors)
+    memory.drop_old()
+    return memory

@@ -163,6 +163,15 @@ class Fusion:
         used[left], error[left], late_by = 0.0, np.array(UNKNOWN, np.float32), np.where(left, 0, late_by)
         return Updated(late, late_by, used, error, distinct(np.concatenate(touched)))
 
+    def untouched(self, before: int) -> BoolArray:
+        """Slots (size,) of which nobody told anything since `before` [ns]; see `drop`."""
+        return self.store.untouched(before)
+
+    def drop(self, gone: BoolArray) -> IntArray:
+        """Drop slots (size,) that are `untouched`, as if nobody had ever been there; returns where each slot went, -1
+        for those that are gone."""
+        return self.store.drop(gone)
+
     def update_weather(self, reports: Reports) -> None:
         """Take in weather; each report must act from `next_epoch` on at the earliest, or the map depends on when it
         came."""

@@ -53,6 +53,10 @@ class Alerts:
         )
         self._standing |= {slot: alert for slot, alert in zip(slots.tolist(), standing, strict=True) if slot >= 0}
 
+    def renumbered(self, place: IntArray) -> None:
+        """Slots of the fusion, of which none with an alert is gone, have other numbers now: `place` of each."""
+        self._standing = {int(place[slot]): alert for slot, alert in self._standing.items()}
+
     def updated(self, slots: IntArray) -> list[Alert]:
         """Alerts that the cells just updated raise or clear."""
         time, slippery = self._fusion.live.time[slots], self._slippery(slots)

@@ -67,6 +67,11 @@ class MapState:
         """How many slots a tile has."""
         return sum(map(len, self._slots.get(tile, ())))
 
+    def renumbered(self) -> None:
+        """Slots of the fusion have other numbers now."""
+        self._slots.clear()
+        self._indexed = 0
+
     def _index(self) -> None:
         if self._indexed == self.fusion.size:
             return

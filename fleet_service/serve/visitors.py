@@ -52,6 +52,13 @@ class Visitors:
         within = self._bits[slots, : max(PARTS - ago, 0)]
         return np.asarray(np.bitwise_count(np.bitwise_or.reduce(within, axis=1)), np.int64)
 
+    def renumbered(self, place: IntArray) -> None:
+        """Slots of the fusion have other numbers now: `place` of each, -1 for those that are gone."""
+        stay = np.flatnonzero(place >= 0)
+        longer = np.zeros((len(place), PARTS), np.uint64)
+        longer[: min(len(place), len(self._bits))] = self._bits[: len(place)]
+        self._bits = longer[stay]
+
     def columns(self) -> dict[str, IntArray]:
         """What `of` makes the same of."""
         self._grow()

@@ -40,7 +40,7 @@ from fleet_service.fusion.store.table import (
     slots_for,
     table_of,
 )  # fmt: skip
-from schemas.numeric import IntArray
+from schemas.numeric import BoolArray, IntArray
 from schemas.runtime.jit import compiled
 from schemas.runtime.records import RecordArray
 
@@ -180,6 +180,30 @@ class Store:
             self.hour = hour
             self._rebuild_pairs(hour - int(c.FORGOTTEN_S), 0)
             self._rebuild_reporters(hour - _HOUR - _AHEAD)
+
+    def untouched(self, before: int) -> BoolArray:
+        """Slots (size,) whose last visit was before a time [ns], and which nothing else points at."""
+        cells, pairs = self.state.live.cells[: self.size], self.state.pairs
+        found = (cells["time"] < before) & (cells["window"] == NONE) & (cells["reporters"] == NONE)
+        found[pairs["slot"][pairs["slot"] != NONE]] = False
+        return np.asarray(found)
+
+    def drop(self, gone: BoolArray) -> IntArray:
+        """Drop slots (size,) that are `untouched`; returns where each slot went, NONE for those that are gone."""
+        stay = np.flatnonzero(~gone)
+        place = np.full(self.size, NONE, np.int64)
+        place[stay] = np.arange(len(stay))
+        live = self.state.live
+        belief, cells = no_beliefs(len(stay)), rows_of_lines(len(stay), CELL)
+        belief[:], cells[:] = live.belief[stay], live.cells[stay]
+        self.state = self.state._replace(live=live._replace(belief=belief, cells=cells))
+        for pointing in (self.state.windows["slot"], self.state.pairs["slot"]):
+            used = pointing != NONE
+            pointing[used] = place[pointing[used]]
+        self.size = len(stay)
+        self._slots = table_of(cells, self.size, self.size)
+        self._rebuild_pairs(0, 0)
+        return place
 
     def _rebuild_pairs(self, least: int, most: int) -> None:
         """Drop pairs that last reported before `least` [s], and make room for `most`."""

@@ -8,7 +8,8 @@ import pytest
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.store.records import GRIP, ICE, NONE, PAIRS, REPORTERS_USED, VEHICLE
 from fleet_service.fusion.store.table import PAIRS_MOST, fill, rows_of
-from tests.fleet_service.examples import CELL, START, at_least, belief, observations, value
+from schemas import mugrid
+from tests.fleet_service.examples import CELL, SECOND, START, at_least, belief, observations, value
 
 LATENESS_S = 120.0
 HOUR = 3600.0
@@ -54,3 +55,34 @@ def test_reporters_and_sources_of_hours_ago_are_dropped_and_new_ones_take_their_
     assert fusion.sources(slots[7:8], GRIP, START - 1)[0].tolist() == [2]
     assert fusion.sources(slots[8:9], GRIP, START - 1)[0].tolist() == [0]
     assert not np.allclose(belief(fusion, CELL + 7), before)
+
+
+def test_cells_that_are_back_at_the_prior_and_old_are_dropped_and_the_others_go_on_as_they_were() -> None:
+    """A fusion that dropped them takes what comes next as one that has them all."""
+    fusion, whole = Fusion(LATENESS_S), Fusion(LATENESS_S)
+    cells, week = CELL + np.arange(40), 7 * 24 * HOUR
+    visits = [
+        observations(np.arange(40.0), np.arange(40), value([0.2] * 40), cells),
+        observations(week + np.arange(10.0), np.arange(10), value([0.7] * 10), cells[:10]),
+        observations(week + HOUR * np.arange(1.0, 6.0), [1] * 5, value([0.7] * 5), cells[5:10]),
+    ]
+    for one in visits:
+        fusion.update(one)
+        whole.update(one)
+    now = START + int(week * 1e9)
+    gone = fusion.untouched(now - SECOND)
+    np.testing.assert_array_equal(np.flatnonzero(gone), np.arange(10, 40))
+    prior = fusion.beliefs(np.flatnonzero(gone), now)
+    np.testing.assert_allclose(prior, np.tile(mugrid.PRIOR, (30, 1)), atol=1e-4)
+    place = fusion.drop(gone)
+    np.testing.assert_array_equal(place, [*range(10), *[NONE] * 30])
+    assert fusion.size == 10
+    assert (fusion.slots_of(cells[10:], np.zeros(30, np.int64)) == NONE).all()
+    after = observations(week + 6 * HOUR + np.arange(20.0), np.arange(20), value([0.3] * 20), cells[:20])
+    for other in (fusion, whole):
+        other.update(after)
+    for cell in cells[:10].tolist():
+        np.testing.assert_allclose(belief(fusion, cell), belief(whole, cell), atol=1e-12)
+    for cell in cells[10:20].tolist():
+        np.testing.assert_allclose(belief(fusion, cell), belief(whole, cell), atol=1e-3)  # 16 bits a bin at rest
+    assert fusion.live.vehicles[: fusion.size].max() < 40

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -20,10 +21,10 @@ from fleet_service.ingest.inbox import Message
 from fleet_service.replay import checkpoints
 from fleet_service.serve.view import CellView, coarse
 from fleet_service.serve.visitors import PART_NS, Visitors
-from schemas import query, wire
+from schemas import grid, query, wire
 from schemas.config import ServiceConfig
 from schemas.wire import Kind
-from tests.fleet_service.examples import LATITUDE, LONGITUDE, SECOND, START, batch, key, observations, value
+from tests.fleet_service.examples import CELL, LATITUDE, LONGITUDE, SECOND, START, batch, key, observations, value
 
 Start = Callable[[int], Engine]
 
@@ -174,3 +175,39 @@ def test_visitors_are_never_counted_as_more_than_they_were() -> None:
     again = Visitors.of(fusion, visitors.columns())
     assert again.count(slots, now).tolist() == visitors.count(slots, now).tolist()
     assert Visitors.of(Fusion(60.0), visitors.columns()).count(np.zeros(0, np.int64), now).tolist() == []
+
+
+def test_cells_that_nobody_visits_for_a_week_are_dropped_by_the_service_and_by_a_restart(start: Start) -> None:
+    engine, now = start(1), time.time_ns()
+    names, alone = [f"sim-{k:03}" for k in range(4)], LATITUDE - 0.002
+    old = now - 8 * 86_400 * SECOND
+    where: dict[str, Any] = {"latitude": [alone], "cell": [grid.cell_of(alone, LONGITUDE)]}
+    sent = [Message(Kind.OBSERVATION, key(n), wire.encode(batch(n, 9, old, [0.8], **where)), "") for n in names]
+    engine.ingest(sent, old)
+    hear(engine, *names, now=now)
+    hear(engine, *(f"sim-1{k:02}" for k in range(4)), now=now + 300 * SECOND)
+    assert engine.fusion.size == 2
+    ice = hear_ice(engine, now + 600 * SECOND)
+    assert ice
+    assert engine.drop_old() == 1
+    assert engine.drop_old() == 0
+    at = now + 601 * SECOND
+    (row,) = [one for one in rows(engine, at) if one["cell"] == CELL]
+    assert row["vehicles"] == 8
+    assert [alert.cell for alert in engine.repeated(9)] == [ice[0].cell]
+    hear(engine, "sim-020", now=at + SECOND)
+    shown = {one["cell"]: one["vehicles"] for one in rows(engine, at + 2 * SECOND)}
+    engine.close()
+    again = start(1)
+    assert {one["cell"]: one["vehicles"] for one in rows(again, at + 2 * SECOND)} == shown
+    assert where["cell"][0] not in shown
+
+
+def hear_ice(engine: Engine, now: int) -> list[wire.Alert]:
+    """Four vehicles find ice in a cell of their own, which raises an alert."""
+    where: dict[str, Any] = {
+        "latitude": [LATITUDE + 0.002] * 3,
+        "cell": [grid.cell_of(LATITUDE + 0.002, LONGITUDE)] * 3,
+    }
+    sent = [batch(f"sim-2{k:02}", 1, now, [0.12] * 3, **where) for k in range(4)]
+    return engine.ingest([Message(Kind.OBSERVATION, key(one.vehicle), wire.encode(one), "") for one in sent], now)
