@@ -17,6 +17,7 @@ import heapq
 import random
 import secrets
 import sqlite3
+from collections import deque
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -33,6 +34,7 @@ LONGEST_RESEND_S = 6.0  # for an answer of a service that does answer; see `paci
 # A batch that no service can read is answered by none. Once so many later ones of its stream were settled, a service is
 # about to take no more (it remembers 65 536 above one that is missing), so that this one must go.
 PASSED_OVER = 50_000
+LEAST_OLDEST = 1000  # keys that may be gone before they are looked through
 JITTER = 0.25  # share of the delay, either way: agents that lost one router do not return in step
 DEFAULT_CAPACITY_BYTES = 256 * 2**20  # some days of one vehicle at a batch per second and kind
 EVICTION_ORDER = (Kind.STATE, Kind.OBSERVATION)  # an old state is worth least, an observation most
@@ -85,8 +87,9 @@ class _Entry:
 
 @dataclass
 class _Sequence:
-    """Seqs of one stream: the next to give and those still held."""
+    """Seqs of one stream: the next to give and those still held. All its entries share the stream's name."""
 
+    stream: Stream
     next: int = 1
     first: int = 1
     held: dict[int, int] = field(default_factory=dict)
@@ -115,7 +118,7 @@ class Outbox:
         self.counts = OutboxCounts()
         self._random = random.Random(self.boot)
         self._entries: dict[int, _Entry] = {}
-        self._oldest: dict[Kind, dict[int, None]] = {kind: {} for kind in Kind}  # keys in their order
+        self._oldest: dict[Kind, deque[int]] = {kind: deque() for kind in Kind}  # keys in their order, gone ones too
         self._streams: dict[Stream, _Sequence] = {}
         self._pacers: dict[tuple[str, int], Pacer] = {}
         self._later: list[tuple[float, int]] = []  # heap of when what flies is given up
@@ -148,7 +151,7 @@ class Outbox:
         own = {stream: sequence for stream, sequence in self._streams.items() if stream.boot == self.boot}
         for sequence in own.values():
             sequence.held.clear()
-        self._entries, self._oldest, self._streams = {}, {kind: {} for kind in Kind}, own
+        self._entries, self._oldest, self._streams = {}, {kind: deque() for kind in Kind}, own
         self._pacers, self._later, self._deletable, self._bytes = {}, [], [], 0
         self._restore()
         self.counts.damaged += max(before - sum(entry.records for entry in self._entries.values()), 0)
@@ -158,15 +161,20 @@ class Outbox:
 
     def _hold(self, key: int, entry: _Entry) -> None:
         self._entries[key] = entry
-        self._oldest[entry.stream.kind][key] = None
-        sequence = self._streams.setdefault(entry.stream, _Sequence())
+        oldest = self._oldest[entry.stream.kind]
+        oldest.append(key)
+        if len(oldest) > 2 * len(self._entries) + LEAST_OLDEST:
+            self._oldest[entry.stream.kind] = deque(one for one in oldest if one in self._entries)
+        sequence = self._streams.get(entry.stream)
+        if sequence is None:
+            sequence = self._streams[entry.stream] = _Sequence(entry.stream)
+        entry.stream = sequence.stream
         sequence.held[entry.seq] = key
         sequence.next = max(sequence.next, entry.seq + 1)
         self._bytes += entry.size
 
     def _forget(self, key: int) -> _Entry:
         entry = self._entries.pop(key)
-        del self._oldest[entry.stream.kind][key]
         sequence = self._streams[entry.stream]
         del sequence.held[entry.seq]
         if not sequence.held and entry.stream.boot != self.boot:
@@ -225,7 +233,7 @@ class Outbox:
 
     def _insert(self, draft: Draft, ahead: dict[Stream, int]) -> StoredBatch:
         stream = Stream(draft.vehicle, self.boot, draft.kind, draft.region)
-        known = self._streams.get(stream, _Sequence())
+        known = self._streams.get(stream) or _Sequence(stream)
         seq = ahead.get(stream, known.next)
         payload = draft.encode(seq, known.first_held())
         name = (stream.vehicle, stream.boot, str(stream.kind), stream.region, seq, draft.records)
@@ -266,8 +274,9 @@ class Outbox:
         """Keep within the capacity: oldest state first, then oldest observation."""
         for kind in EVICTION_ORDER:
             while self._bytes > self.capacity_bytes and self._oldest[kind]:
-                entry = self._forget(next(iter(self._oldest[kind])))
-                self.counts.evicted[kind] += entry.records
+                key = self._oldest[kind].popleft()
+                if key in self._entries:
+                    self.counts.evicted[kind] += self._forget(key).records
 
     def _delete(self) -> None:
         self._database.executemany("DELETE FROM batch WHERE id = ?", [(key,) for key in self._deletable])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -321,3 +322,29 @@ def test_a_batch_that_nobody_answers_is_given_up_once_it_would_stop_its_stream(
     assert outbox.counts.unanswered == 2
     assert outbox.store([draft()], now)[0].payload == b"61/61", "older than that never comes"
     outbox.close()
+
+
+def test_a_batch_that_waits_takes_little_memory_and_a_long_life_leaves_none_behind(path: Path) -> None:
+    """A day of a vehicle is 170 000 batches."""
+    count = 20_000
+    outbox = Outbox(path, boot=BOOT)
+    outbox.store([draft(kind=(Kind.STATE, Kind.OBSERVATION)[k % 2], size=200) for k in range(count)], now=0.0)
+    outbox.close()
+    tracemalloc.start()
+    try:
+        again = Outbox(path, boot=BOOT + 1)
+        assert again.batches == count
+        assert tracemalloc.get_traced_memory()[0] < 320 * count
+        for kind in Kind:
+            again.settle(stream(kind=kind), [(1, count)])
+        again.delete_settled()
+        held = []
+        for turn in range(40):
+            again.store([draft(size=200) for _ in range(500)], now=10.0 * turn)
+            again.settle(stream(boot=BOOT + 1), [(1, 500 * (turn + 1))])
+            assert again.due(10.0 * turn, 100) == []
+            held.append(tracemalloc.get_traced_memory()[0])
+        assert max(held[30:]) < 1.5 * max(held[10:20]), "what is gone takes nothing"
+    finally:
+        tracemalloc.stop()
+    again.close()
