@@ -3,13 +3,10 @@
 | if | then | kind |
 |---|---|---|
 | the mismatch of the wheels, or of the axles, is one of five sets | ln R of that group moves by its step | Sugeno |
-| the axles' mismatch is FAR | no friction explains the block | Mamdani |
-| or what is believed of vehicle and sensors is STRETCHED | no friction explains the block | Mamdani |
-| that was so LATELY | the axles are distrusted, what was learned is forgotten, the prior returns | Sugeno |
 | the wheels' mismatch is FAR | offsets, slope and bank return to their prior faster | Sugeno |
 | steering is WIDE | R of the axle that is steered is larger | Sugeno |
 
-Mamdani: OR is the larger membership. Sugeno: what a rule asks for, times its membership. The first line is `fuzzy.py`.
+Sugeno: what a rule asks for, times its membership. The first line is `fuzzy.py`.
 Sets are ramps from a foot (membership 0) to a peak (1); feet, peaks and what is asked for are `Memberships`. Inputs are
 of the block that has just ended, so that a rule never sees what it steers.
 """
@@ -32,8 +29,6 @@ class RuleBase(NamedTuple):
     """Feet and peaks of the sets, and what the last two rules ask for."""
 
     far: Annotated[FloatArray, 2]
-    stretched: Annotated[FloatArray, 2]
-    lately: Annotated[FloatArray, 2]
     wide: Annotated[FloatArray, 2]
     ln_noise: float  # of an axle whose steering is WIDE [nat]
     pace: float  # of offsets, slope and bank where the wheels are FAR [1/s]
@@ -42,26 +37,13 @@ class RuleBase(NamedTuple):
 def rule_base(memberships: Memberships) -> RuleBase:
     """The rules with the vertices of `memberships`."""
     m = memberships
-    far, stretched, lately, wide = (np.array(pair) for pair in (m.far, m.stretched, m.lately, WIDE))
-    return RuleBase(far, stretched, lately, wide, *m.consequents)
+    return RuleBase(np.array(m.far), np.array(WIDE), *m.consequents)
 
 
 @compiled
 def is_high(value: float, ramp: FloatArray) -> float:
     """Membership of `value` in the set that rises from ramp[0] to ramp[1]."""
     return float(min(max((value - ramp[0]) / (ramp[1] - ramp[0]), 0.0), 1.0))
-
-
-@compiled
-def contradiction(rules: RuleBase, axles: float, belief: float) -> float:
-    """How far no friction explains a block, by the mismatch of the axles and the cost of what is believed [nat]."""
-    return max(is_high(axles, rules.far), is_high(belief, rules.stretched))
-
-
-@compiled
-def distrust(rules: RuleBase, share: float) -> float:
-    """How far the axles are distrusted, by the share of the last time in contradiction."""
-    return is_high(share, rules.lately)
 
 
 @compiled

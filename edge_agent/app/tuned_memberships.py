@@ -9,7 +9,7 @@ from typing import Annotated, Final
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from edge_agent.adaptation.memberships import Memberships
+from edge_agent.adaptation.memberships import RETIRED, Memberships
 from schemas.config import explain
 from schemas.errors import InputError
 
@@ -98,7 +98,7 @@ def parse(text: str | bytes, where: str) -> Tuned:
         if way not in document.scores:
             raise InputError(f"scores.{way}", "is missing", f"write the {where} with edge-agent tune")
     known = set(Memberships().to_json())
-    if unknown := sorted(set(document.memberships) - known):
+    if unknown := sorted(set(document.memberships) - known - set(RETIRED)):
         raise InputError(f"memberships.{unknown[0]}", "is unknown", f"use {', '.join(sorted(known))}")
     return Tuned(Memberships.from_json(document.memberships), document)
 

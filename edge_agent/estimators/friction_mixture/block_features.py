@@ -21,6 +21,7 @@ from edge_agent.estimators.friction_mixture.constants import Constants, NodeStat
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.drive_split import front_share
 from edge_agent.estimators.friction_mixture.memory import BlockSums, MixtureMemory
+from edge_agent.estimators.friction_mixture.trust import strained_noise
 from edge_agent.estimators.friction_mixture.workspace import BlockFeatures
 from schemas.runtime.jit import compiled
 from schemas.signals import S
@@ -166,7 +167,8 @@ def _noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures
         variance = 0.5 * slip_variance + constants.floor_x**2 + features.noise_std[wheel] ** 2 + shape**2
         features.noise_std[wheel] = math.sqrt(variance * scale)
         features.slip_noise[wheel] = slip_variance * scale
-    scale = design.scales[1] * memory.factor[1]
+    scale = design.scales[1] * memory.factor[1] * (strained_noise(memory.trust, constants) if design.adaptive else 1.0)
+    features.axle_scale = scale
     for axle in range(2):
         side = features.side[axle]
         turning = constants.gyro_std * (row[Parameter.TO_FRONT] if axle == 0 else row[Parameter.TO_REAR]) / speed

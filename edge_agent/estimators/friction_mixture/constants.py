@@ -54,8 +54,8 @@ class Constants(NamedTuple):
     hazard: float = 1 / 190
     # [1/m] slow change to a neighbouring node
     diffusion: float = 0.003
-    # [m] in which ice may begin unnoticed: patches are 20 to 100 m long
-    patch_length: float = 18.0
+    # [m] in which ice may begin unnoticed: two lengths of a car (18: .05 less of the ice in town is covered)
+    patch_length: float = 8.0
     # [1] share of roads whose two sides differ
     split_prior: float = 0.05
     # [1/m] end of such a road
@@ -81,8 +81,8 @@ class Constants(NamedTuple):
     sliding_slope: float = 0.3
     # [1] weight of the density that sliding spreads over slip: not every braking car slides on all wheels
     sliding_penalty: float = 0.3
-    # [1] weight of ln det S of the axles: none favours the flexible node, all of it the saturated one (.45: false ice)
-    axle_penalty: float = 0.28
+    # [1] weight of ln det S of the axles: none favours the flexible node, all of it the saturated one (.28: false ice)
+    axle_penalty: float = 0.24
 
     # [1] prior standard deviations within which stiffness, leaks and offsets are kept; more is a contradiction
     farthest: float = 4.0
@@ -99,14 +99,14 @@ class Constants(NamedTuple):
     curve_e: float = -0.1
     # [1] tyres between round and sharp: most of them
     shape_std: float = 1.0
-    # [s] return of the shape to its prior: it changes with the road as well
-    shape_time: float = 100.0
+    # [s] return of the shape to its prior: a curve's error differs from slip to slip, and load to load
+    shape_time: float = 60.0
     # [1] log of the factor along: files of real cars are a third off (BMW M8, AV-21), and no drive got worse by it
     stiffness_x_std: float = 0.18
     # [1] log of the factor across (vehicle)
     stiffness_y_std: float = 0.12
-    # [s] return of the stiffness factors to their prior
-    stiffness_time: float = 300.0
+    # [s] return of the stiffness factors: what they stand for is another one from bend to bend (300: twice too sure)
+    stiffness_time: float = 60.0
     # [1] power of the stiffness factor that divides a wheel's residual: slip is noisy, force is quiet
     stiffness_power_x: float = 1.0
     # [1] the same for an axle, where both are
@@ -125,20 +125,20 @@ class Constants(NamedTuple):
     # [1] gravity leak of a pitching body, in measured a_x: pitch is stiffer than roll
     leak_x: float = 0.02
     # [s] return of the leaks to their prior
-    leak_time: float = 600.0
+    leak_time: float = 60.0
 
     # [m/s^2] offset of a_x: tilted mount and sensor, .22 to .96 on logs of real cars
     bias_x_std: float = 0.25
     # [m/s^2] offset of a_y, .07 to .54 there; a crossfall that the wheels do not steer against reads the same
     bias_y_std: float = 0.2
-    # [s] return of the offsets, of radii and of lags to their prior: they outlast a drive
-    bias_time: float = 600.0
+    # [s] return of the offsets, of radii and of lags to their prior: what they stand for changes with slope and bend
+    bias_time: float = 60.0
     # [m/s^2] slope of the road: 3 %
     slope_std: float = 0.3
     # [m] over which it is another one: waves of 100 to 400 m
     slope_length: float = 100.0
-    # [m/s^2] bank of the road: crossfall 1 %, what changes of it
-    bank_std: float = 0.1
+    # [m/s^2] bank of the road: crossfall 1 to 3 %, and banked bends
+    bank_std: float = 0.3
     # [m] over which it is another one
     bank_length: float = 150.0
     # [s] return of slope and bank to level at any speed
@@ -165,8 +165,8 @@ class Constants(NamedTuple):
 
     # [rad/s] white noise of a wheel speed sample (vehicle)
     omega_noise: float = 0.03
-    # [rad/s] steps of a wheel speed, where they cannot be seen: .07 wide
-    step_noise: float = 0.02
+    # [rad/s] what wheel speeds have wrong beside their noise: steps that cannot be seen, teeth, tyres that wobble
+    step_noise: float = 0.06
     # [rad] white noise of steering in a block (vehicle)
     angle_std: float = 0.0003
     # [1] steering ratio, compliance and how the wheels of an axle point, of the angle: gains are 3 % off
@@ -220,13 +220,24 @@ class Constants(NamedTuple):
     # [1] one standard deviation of that
     guard_std: float = 0.03
 
-    # [s] of contradiction before it is believed
-    odd_rise: float = 8.0
-    # [s] without it before it is forgotten: sensors stay as they are
-    odd_fall: float = 60.0
-    # [1] R of the axles at full distrust, over R
+    # [1] degrees of freedom with which a car begins as strained as the model: few rows say nothing of it yet
+    strain_prior: float = 2.0
+    # [1] strain at which the axles are as sure as stated: level drives have .2 to .5, rough ones .5 to 2
+    strain_usual: float = 0.7
+    # [1] power of strain over the usual in R of the axles: what one error says of the next
+    strain_power: float = 2.0
+    # [1] least of that factor: a level car's axles had .24 of the stated R as the best of a search
+    strain_least: float = 0.25
+    # [1] most of it
+    strain_most: float = 3.0
+
+    # [nat] likelihood ratio at which contradiction is believed: errors that are three times what is stated, for 1 s
+    odd_least: float = 3.0
+    # [s] before the model is tried again, the first time: a bend or two of a race track would pass, a lap does not
+    patience: float = 120.0
+    # [1] R of the axles while distrusted, over R
     distrust_noise: float = 1000.0
-    # [m/s/s^.5] walk of v_y at full distrust
+    # [m/s/s^.5] walk of v_y while distrusted
     distrust_drift: float = 3.0
-    # [s] in which at full distrust what was learned of vehicle, sensors and road goes back to the prior
+    # [s] in which while distrusted what was learned of vehicle, sensors and road goes back to the prior
     distrust_forget: float = 5.0

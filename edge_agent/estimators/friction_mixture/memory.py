@@ -94,8 +94,11 @@ class RollingMotion:
 class Trust:
     """Whether any friction explains what is measured."""
 
-    odd: float  # share of the last time in which none did
-    distrust: float  # from 0 to 1
+    odd: float  # how much more likely it is of late that none does [nat]
+    distrust: float  # 1 where none does, else 0
+    left: float  # of that, before it is tried again [s]
+    patience: float  # how long it lasted last [s]
+    strain: float  # of what is believed of vehicle and sensors: chi-square over degrees of freedom
     hurry: float  # at which offsets, slope and bank return to their prior, beside the usual pace [1/s]
 
 
@@ -126,6 +129,7 @@ class MixtureMemory:
     overall_covariance: Annotated[FloatArray, STATES, STATES]
     actual: Annotated[FloatArray, 2]  # windowed innovation variances: wheels, axles
     theoretical: Annotated[FloatArray, 2]
+    stated: float  # as theoretical of the axles, with R as the constants state it
     factor: Annotated[FloatArray, 2]  # adapted over nominal R
     last_side: Annotated[FloatArray, 2]  # side force over load of the axles in the block before [1]
     usual_force: Annotated[FloatArray, 6]  # force over load of wheels and axles, smoothed [1]

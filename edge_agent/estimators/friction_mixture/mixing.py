@@ -22,6 +22,7 @@ from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.friction_grid import SMALLEST, change_road
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory
 from edge_agent.estimators.friction_mixture.restart import put_split_to_sleep
+from edge_agent.estimators.friction_mixture.trust import credence
 from edge_agent.estimators.friction_mixture.workspace import Scratch
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
@@ -29,7 +30,8 @@ from schemas.runtime.jit import compiled
 LEAST_MIXING = 1e-3  # a smaller share of foreign mass changes no digit that is read
 LEAST_WEIGHT = 1e-9  # nor does a node of less
 SLEEPING_SHARE = 0.5  # of the split nodes' prior: below, they sleep again; above, they would wake at the next sign
-FORGOTTEN_S = 0.5  # in which friction goes back to its prior at full distrust
+FORGOTTEN_S = 0.5  # in which friction goes back to its prior once nothing is believed
+BRINK = 4  # power of doubt in that: a contradiction that merely grows forgets nothing yet
 LARGEST_DRIFT = 0.5  # of a node's mass in a block: more would overshoot the balance between neighbours
 
 
@@ -68,7 +70,8 @@ def drive_on(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, met
     count, constants = awake(memory), design.constants
     prior = design.sides.prior[:count] if memory.split else design.prior[:count]
     hazard = 1.0 - math.exp(-metres * constants.hazard)
-    forgotten = 1.0 - math.exp(-memory.trust.distrust * scratch.features.duration / FORGOTTEN_S)
+    doubt = 1.0 - credence(memory.trust, constants)
+    forgotten = 1.0 - math.exp(-(doubt**BRINK) * scratch.features.duration / FORGOTTEN_S)
     hazard = max(hazard, forgotten)
     leaving = 1.0 - math.exp(-metres * constants.split_hazard)
     drift = min(metres * constants.diffusion * NODES, LARGEST_DRIFT)

@@ -27,7 +27,7 @@ from edge_agent.estimators.friction_mixture.constants import (
     NodeState,
 )
 from edge_agent.estimators.friction_mixture.design import MixtureDesign, Nominal
-from edge_agent.estimators.friction_mixture.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Trust
 from edge_agent.estimators.friction_mixture.residuals import (
     correct_forces,
     find_residuals,
@@ -42,6 +42,8 @@ from edge_agent.filters.cholesky import multiply
 from edge_agent.filters.sequential import potter, project
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
+
+DOUBTED = 0.05  # of distrust_noise, at the brink of it
 
 
 class NodeUpdate(NamedTuple):
@@ -69,7 +71,7 @@ def update_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, 
     node.gained.x, node.gained.y = gained_velocity(features.gain, mean)
     price = linearize(memory.row, design, side_mu, mean, features, node)
     spread(memory.row, design, side_mu, mean, root, features, node)
-    across = inflation * (1.0 + constants.distrust_noise * memory.trust.distrust) / features.novelty
+    across = inflation * doubted_noise(memory.trust, constants) / features.novelty
     plain = square = 0.0
     for r in range(ROWS):
         innovation[r] = -node.residual[r]
@@ -244,6 +246,14 @@ def spread(
             by_state = node.derivative[state, r]
             for column in range(state + 1):
                 node.deviation[r, column] += by_state * root[state, column]
+
+
+@compiled
+def doubted_noise(trust: Trust, constants: Constants) -> float:
+    """Factor on R of the axles: what contradicts shall not move the motion while it is found out."""
+    if trust.distrust > 0.0:
+        return 1.0 + constants.distrust_noise
+    return 1.0 + DOUBTED * constants.distrust_noise * (trust.odd / constants.odd_least) ** 2
 
 
 @compiled

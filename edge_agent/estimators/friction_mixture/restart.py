@@ -72,6 +72,7 @@ def start(memory: MixtureMemory, design: MixtureDesign, time: float, sample: Flo
     rolling.disagreed_time, rolling.ahead, rolling.left = time, math.nan, math.nan
     rolling.resting_ax = now[S.AX]
     begin_excitation(memory.excitation)
+    memory.trust.strain = 1.0
     memory.started = True
     return flags.OK
 
@@ -182,6 +183,7 @@ def _begin_anew(memory: MixtureMemory, design: MixtureDesign, speed: float) -> i
     for group in range(2):
         memory.actual[group] = memory.theoretical[group]
         memory.factor[group] = 1.0
+    memory.stated = memory.actual[1]
     put_split_to_sleep(memory)
     clear(memory.patch)
     for j in range(NODES):

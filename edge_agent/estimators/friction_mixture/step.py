@@ -26,7 +26,7 @@ from edge_agent.estimators.friction_mixture.residuals import gained_velocity
 from edge_agent.estimators.friction_mixture.restart import find_quantiles, recover, start
 from edge_agent.estimators.friction_mixture.rolling_motion import watch_wheels
 from edge_agent.estimators.friction_mixture.split_sides import BOTH, LEFT, RIGHT, project
-from edge_agent.estimators.friction_mixture.trust import REPORTED, judge
+from edge_agent.estimators.friction_mixture.trust import judge
 from edge_agent.estimators.friction_mixture.weighing import measure
 from edge_agent.estimators.friction_mixture.workspace import Scratch
 from schemas.numeric import FloatArray
@@ -59,10 +59,10 @@ def finish_block(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch)
     drive_on(memory, design, scratch, features.speed * features.duration)
     drive_onto(memory, design, features.speed * features.duration)
     measure(memory, design, scratch)
-    judge(memory, design, features.duration)
     predict(memory, design, scratch)
     memory.health = health | recover(memory, design, features)
-    if memory.trust.distrust > REPORTED:
+    judge(memory, design, features.duration, memory.health)
+    if memory.trust.distrust > 0.0:
         memory.health |= flags.CONTRADICTION
     conclude(memory, design, scratch)
     begin_block(memory)

@@ -15,6 +15,7 @@ from edge_agent.estimators.friction_mixture.mixing import awake, reset_diverged
 from edge_agent.estimators.friction_mixture.node_filter import update_node
 from edge_agent.estimators.friction_mixture.restart import SLOWEST_M_S
 from edge_agent.estimators.friction_mixture.rolling_motion import take_rolling
+from edge_agent.estimators.friction_mixture.trust import credence, strained_evidence
 from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, Scratch
 from edge_agent.filters.cholesky import factorize
 from schemas.numeric import FloatArray
@@ -45,6 +46,7 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
     count = awake(memory)
     for group in range(2):
         scratch.actual_sum[group] = scratch.theoretical_sum[group] = 0.0
+    scratch.stated_sum, surplus = 0.0, 1.0 - 1.0 / scratch.features.axle_scale
     top, nis, rows = -math.inf, 0.0, 0
     scratch.features.novelty = novelty(memory.usual_force, scratch.features, design.constants)
     for j in range(count):
@@ -60,6 +62,9 @@ def update_all(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -
                 group = 0 if r < 4 else 1
                 scratch.actual_sum[group] += memory.weight[j] * scratch.innovation[j, r] ** 2
                 scratch.theoretical_sum[group] += memory.weight[j] * scratch.theoretical[j, r]
+                if group == 1:
+                    without = scratch.theoretical[j, r] - surplus * scratch.node.noise[r]
+                    scratch.stated_sum += memory.weight[j] * without
     total = 0.0
     for j in range(count):
         total += math.exp(scratch.joint[j] - top)
@@ -81,8 +86,8 @@ def temper(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> No
         best = max(best, scratch.log_likelihood[j])
     need = (constants.demand_half / max(features.demand, LEAST_DEMAND)) ** constants.demand_power
     blind = memory.block.counts[S.AX] == 0 or math.isnan(features.side[0] + features.side[1])
-    share = features.novelty / (1.0 + need)
-    moving = slip_meaning(features, memory.overall_mean[NodeState.VX]) * (1.0 - memory.trust.distrust)
+    share = features.novelty / (1.0 + need) * (strained_evidence(memory.trust) if design.adaptive else 1.0)
+    moving = slip_meaning(features, memory.overall_mean[NodeState.VX]) * credence(memory.trust, constants)
     for j in range(count):
         loss = scratch.log_likelihood[j] - best
         beyond = min(loss + constants.plausible_loss, 0.0)
@@ -137,6 +142,8 @@ def adapt(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch) -> Non
         if scratch.theoretical_sum[group] > 0.0:
             memory.actual[group] = keep * memory.actual[group] + (1.0 - keep) * scratch.actual_sum[group]
             memory.theoretical[group] = keep * memory.theoretical[group] + (1.0 - keep) * scratch.theoretical_sum[group]
+            if group == 1:
+                memory.stated = keep * memory.stated + (1.0 - keep) * scratch.stated_sum
             if design.adaptive:
                 memory.factor[group] = adapted(
                     memory.factor[group], memory.actual[group], memory.theoretical[group],

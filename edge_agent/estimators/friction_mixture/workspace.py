@@ -42,6 +42,7 @@ class BlockFeatures:
     noise_std: Annotated[FloatArray, ROWS]  # nominal, of a residual where the curve rises [1]
     slip_noise: Annotated[FloatArray, ROWS]  # variance of slip, as linear force over load; half of it is in noise_std
     informs_x: Annotated[FloatArray, 2]  # how much the force of an axle's wheels informs of stiffness, 0 to 1
+    axle_scale: float  # R of the axles over R as the constants state it
     informs_y: Annotated[FloatArray, 2]
 
 
@@ -88,6 +89,7 @@ class Scratch:
     moved: Annotated[FloatArray, ALL_NODES]  # change of what the belief about the vehicle costs [nat]
     predicted: Annotated[FloatArray, ALL_NODES]
     actual_sum: Annotated[FloatArray, 2]
+    stated_sum: float  # the axles' with R as the constants state it
     theoretical_sum: Annotated[FloatArray, 2]
     root: Annotated[FloatArray, ALL_NODES, STATES, STATES]
     velocity_row: Annotated[FloatArray, STATES]  # deviation of a velocity in the axes of a root's columns

@@ -43,8 +43,8 @@ LESS = 1.0 / 3.0
 MOVES = {
     # fewer and more independent measurements
     "block_time": Move("updates", "acceleration", 0.4),
-    "correlation_time": Move("vy_std", "j-turn", 1.2),
-    "window": Move("adaptation", "acceleration", 0.8),  # R follows the spin later
+    "correlation_time": Move("vy_std", "constant-radius", 1.4),
+    "window": Move("adaptation", "acceleration", 2.0, LESS),  # R follows the spin sooner
     # the road
     "hazard": Move("least probabilities", "j-turn", 1.5),
     "patch_length": Move("lower", "slalom", 1.015),  # ice comes later
@@ -55,7 +55,7 @@ MOVES = {
     # how much a block counts
     "demand_half": Move("width", "constant-radius", 1.5),  # the same force tells less
     "demand_power": Move("penalty", "acceleration", 0.5),  # above the threshold all is evidence, nothing is charged
-    "plausible_loss": Move("least probabilities", "constant-radius", 1.2),
+    "plausible_loss": Move("least probabilities", "constant-radius", 1.1),
     "largest_loss": Move("least probabilities", "j-turn", 0.3),
     "steady_time": Move("width", "constant-radius", 0.9),  # the force is new for longer
     "steady_half": Move("width", "constant-radius", 1.12),
@@ -79,7 +79,7 @@ MOVES = {
     "stiffness_power_x": Move("nis", "acceleration", 0.6),  # the residual of a stiff tyre is divided by more
     "stiffness_power_y": Move("nis", "turn and straight", 0.94),
     "informing_x": Move("std LN_KX", "j-turn", 1.08),
-    "informing_y": Move("std LN_KY", "pulses", 1.2),
+    "informing_y": Move("std LN_KY", "pulses", 1.15),
     "gain_std": Move("width", "acceleration", 1.1),
     # sensors
     "leak_y_mean": Move("mean LEAK_Y", "acceleration", 2.0),
@@ -92,8 +92,8 @@ MOVES = {
     "slope_std": Move("std SLOPE", "braking", 1.6),
     "slope_length": Move("std SLOPE", "pulses", 1.08, LESS),  # it is another one sooner
     "bank_std": Move("std BANK", "j-turn", 0.5, LESS),
-    "bank_length": Move("std BANK", "constant-radius", 0.87, LESS),
-    "slope_time": Move("std BANK", "standing", 0.96, LESS),
+    "bank_length": Move("std BANK", "braking", 1.2, LESS),  # it is another one sooner
+    "slope_time": Move("std BANK", "acceleration", 1.05, LESS),
     "steer_std": Move("std STEER", "constant-radius", 1.5),
     "wheel_std": Move("std RADIUS", "standing", 2.5),
     "radius_std": Move("vx_std", "turn and straight", 2.5),
@@ -102,20 +102,20 @@ MOVES = {
     "drift_x": Move("std VX", "slalom", 1.2),
     "drift_y": Move("vy_std", "gaining-slalom", 1.6),
     "leak_wander": Move("std VX", "split-braking", 1.2),
-    "gyro_wander": Move("vy_std", "rough acceleration", 1.07),
+    "gyro_wander": Move("vy_std", "rough acceleration", 1.02),
     # noise: what is expected to be larger is found to be smaller than expected
-    "omega_noise": Move("nis", "gaining-slalom", 0.6),
+    "omega_noise": Move("nis", "constant-radius", 0.94),
     "step_noise": Move("nis", "gaining-slalom", 0.6),
     "angle_std": Move("nis", "side force without turning", 0.97),
     "angle_share": Move("std STEER", "slalom", 1.25),
     "gyro_std": Move("vy_std", "gaining-slalom", 1.15),
-    "floor_x": Move("nis", "split-braking", 0.85),
+    "floor_x": Move("nis", "standing", 0.8),
     "floor_y": Move("nis", "j-turn", 0.86),
-    "force_share": Move("nis", "acceleration", 0.7),
+    "force_share": Move("nis", "split-braking", 0.75),
     "axle_share": Move("nis", "j-turn", 0.91),
-    "shape_share": Move("nis", "split-braking", 0.88),
+    "shape_share": Move("nis", "split-braking", 0.92),
     "lag": Move("nis", "turn and straight", 0.94),
-    "no_torque_share": Move("nis", "braking without torque", 0.6),
+    "no_torque_share": Move("nis", "braking without torque", 0.7),
     "no_torque_floor": Move("nis", "pulses", 0.89),
     # wheels that tell the motion without a tyre
     "standing_time": Move("stands", "stopping", 0.5),
@@ -134,8 +134,13 @@ MOVES = {
     "guard_margin": Move("least probabilities", "braking", 1.4),
     "guard_std": Move("least probabilities", "acceleration", 1.25),
     # contradiction
-    "odd_rise": Move("oddity", "turn and straight", 0.6),
-    "odd_fall": Move("distrust", "side force without turning", 0.75, LESS),
+    "strain_prior": Move("strain", "turn and straight", 1.1),  # it takes more to tell how a car is
+    "strain_usual": Move("vy_std", "turn and straight", 0.97),  # the axles are surer
+    "strain_power": Move("vy_std", "braking", 1.1, LESS),  # a level car's axles are less sure
+    "strain_least": Move("vy_std", "gaining-slalom", 1.15),
+    "strain_most": Move("vy_std", "rough acceleration", 0.9, LESS),
+    "odd_least": Move("distrust", "side force without turning", 0.98),  # it is believed later
+    "patience": Move("distrust", "side force in one bend", 0.8, 0.02),  # it is tried again sooner
     "distrust_noise": Move("nis", "side force without turning", 0.97, LESS),  # it no longer follows what it distrusts
     "distrust_drift": Move("vy_std", "side force without turning", 1.5),
     "distrust_forget": Move("BIAS_Y", "side force without turning", 1.2),  # what was learned is kept for longer
@@ -182,8 +187,9 @@ def made_up(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
         signals[:, S.AX] = 0.5
         signals[:, OMEGA] = np.clip(20.0 - 10.0 * t, 0.0, None)[:, None]
     else:
+        lasts = 10.0 if name == "side force without turning" else 4.0
         signals[:, OMEGA] = 60.0
-        signals[:, S.AY] = np.where(t < 10.0, 3.0 * np.sin(2.0 * t), 0.0)
+        signals[:, S.AY] = np.where(t < lasts, 3.0 * np.sin(2.0 * t), 0.0)
     return t, signals, drive("j-turn", SHORT["j-turn"])[2]
 
 
@@ -244,7 +250,7 @@ def inside(filters: np.ndarray) -> dict[str, float]:
         "v_y told by an axle": float(np.isfinite(rolling["left"]).mean()),
         "std of wheels' v_x": known(rolling["ahead_std"], rolling["ahead"]),
         "std of the axle's v_y": known(rolling["left_std"], rolling["left"]),
-        "oddity": float(trust["odd"].mean()),
+        "strain": float(trust["strain"].mean()),
         "distrust": float(trust["distrust"].mean()),
     }
 

@@ -1,0 +1,110 @@
+"""Strain tells a car that is as its file says from one that is not; contradiction is of the axles, and not of ice."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+import pytest
+
+from edge_agent.adaptation.memberships import Memberships
+from edge_agent.dynamics.parameters import parameter_table
+from edge_agent.estimators.friction_mixture.bank import mixture_bank
+from edge_agent.estimators.friction_mixture.constants import Constants
+from edge_agent.estimators.friction_mixture.design import design_of
+from edge_agent.estimators.friction_mixture.memory import Trust
+from edge_agent.estimators.friction_mixture.trust import (
+    FACTOR,
+    axles_ratio,
+    credence,
+    strain,
+    strained_evidence,
+    strained_noise,
+)
+from schemas.numeric import BoolArray, FloatArray
+from schemas.runtime.records import records
+from schemas.signals import Health, S
+from tests.edge_agent.estimators.drives import drive
+
+CONSTANTS = Constants()
+
+
+def believing(*, strained: float = 1.0, odd: float = 0.0) -> Trust:
+    trust = records(Trust, 1)
+    trust["strain"], trust["odd"] = strained, odd
+    return cast(Trust, trust[0])  # as a kernel sees it
+
+
+def after(signals: FloatArray, t: FloatArray, vehicle: object, *, adaptive: bool = True) -> tuple[np.void, BoolArray]:
+    bank = mixture_bank(
+        parameter_table([vehicle]),  # type: ignore[list-item]
+        design_of(Memberships(), adaptive=adaptive),
+    )
+    health = bank.advance(t[:, None], signals[:, None]).health[:, 0]
+    return bank._filters["trust"][0], (health.astype(np.int64) & Health.CONTRADICTION) > 0
+
+
+def test_strain_is_one_where_nothing_was_learned_and_chi_square_over_freedom_of_much() -> None:
+    assert strain(0.0, 0.0, 2.0) == 1.0
+    assert strain(5000.0, 5000.0, 2.0) == pytest.approx(2.0, rel=1e-3)
+    assert strain(0.0, 10.0, 2.0) < 0.2
+
+
+def test_axles_are_surer_in_a_car_that_is_as_its_file_says_and_within_limits() -> None:
+    usual = CONSTANTS.strain_usual
+    assert strained_noise(believing(strained=usual), CONSTANTS) == pytest.approx(1.0)
+    noise = [strained_noise(believing(strained=share * usual), CONSTANTS) for share in (0.01, 0.8, 1.2, 100.0)]
+    assert noise == sorted(noise)
+    assert (noise[0], noise[-1]) == (CONSTANTS.strain_least, CONSTANTS.strain_most)
+
+
+def test_evidence_of_a_strained_car_counts_less_and_of_a_level_one_no_more() -> None:
+    assert strained_evidence(believing(strained=2.0)) == 0.5
+    assert strained_evidence(believing(strained=0.1)) == 1.0
+
+
+def test_innovations_as_stated_speak_for_the_model_and_thrice_as_large_ones_against_it() -> None:
+    assert axles_ratio(1.0, 1.0) < 0.0 < axles_ratio(FACTOR, 1.0)
+
+
+def test_evidence_is_believed_less_and_less_until_the_brink_and_then_not_at_all() -> None:
+    shares = [credence(believing(odd=share * CONSTANTS.odd_least), CONSTANTS) for share in (0.0, 0.3, 0.8, 1.0, 2.0)]
+    assert shares[0] == 1.0
+    assert shares[-2:] == [0.0, 0.0]
+    assert shares == sorted(shares, reverse=True)
+
+
+def test_tilted_and_turned_sensors_strain_and_as_the_file_says_they_do_not() -> None:
+    t, signals, vehicle = drive("slalom", 0.6, seconds=12.0)
+    wrong = signals.copy()
+    wrong[:, S.AX] += 0.5
+    wrong[:, S.DELTA : S.DELTA + 2] += 0.01
+    level, strained = (float(after(s, t, vehicle)[0]["strain"]) for s in (signals, wrong))
+    assert level < CONSTANTS.strain_usual < 1.0 < strained
+
+
+@pytest.mark.parametrize("manoeuvre", ["braking", "acceleration", "slalom", "pulses"])
+def test_ice_that_explains_the_data_is_no_contradiction(manoeuvre: str) -> None:
+    t, signals, vehicle = drive(manoeuvre, 0.15)
+    trust, said = after(signals, t, vehicle)
+    assert not said.any()
+    assert trust["odd"] < CONSTANTS.odd_least
+
+
+def test_side_force_that_nothing_turns_contradicts_for_as_long_as_patience_and_a_straight_undoes_nothing() -> None:
+    vehicle = drive("straight", 0.85)[2]
+    t = np.arange(0.0, 5.0 + CONSTANTS.patience, 0.01)
+    signals = np.zeros((len(t), 18))
+    signals[:, S.OMEGA : S.OMEGA + 4] = 60.0
+    signals[:, S.AY] = np.where(t < 4.0, 3.0 * np.sin(2.0 * t), 0.0)
+    said = after(signals, t, vehicle)[1]
+    began, ended = t[said.argmax()], t[len(t) - 1 - said[::-1].argmax()]
+    assert 0.5 < began < 4.0
+    assert ended - began == pytest.approx(CONSTANTS.patience, abs=0.2)
+
+
+def test_without_adaptation_nothing_is_strained_or_distrusted() -> None:
+    t, signals, vehicle = drive("slalom", 0.6, seconds=6.0)
+    wrong = signals.copy()
+    wrong[:, S.AX] += 0.5
+    assert after(wrong, t, vehicle, adaptive=False)[0]["strain"] == 1.0
