@@ -10,10 +10,15 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from schemas.config import moment
 from schemas.errors import InputError
+
+if TYPE_CHECKING:
+    from fleet_service.client.datex import Supplier
+
+STATUSES: Final = ("real", "test", "technicalExercise", "securityExercise")
 
 
 def stop_on_signals() -> threading.Event:
@@ -28,6 +33,27 @@ def add_connection(parser: argparse.ArgumentParser) -> None:
     """Declare how to reach the map."""
     parser.add_argument("--connect", metavar="ENDPOINT", help="router, e.g. tcp/127.0.0.1:7447")
     parser.add_argument("--config", metavar="FILE", help="JSON with a `zenoh` section, as for run")
+
+
+def add_supplier(parser: argparse.ArgumentParser) -> None:
+    """Declare who answers for a DATEX II publication."""
+    parser.add_argument("--country", metavar="CC", help="datex: the supplier's, e.g. se")
+    parser.add_argument("--supplier", metavar="NAME", help="datex: the supplier's name at its National Access Point")
+    parser.add_argument("--status", choices=STATUSES, default="test", help="datex: of the information; default test")
+
+
+def supplier_of(arguments: argparse.Namespace) -> Supplier:
+    """Who answers for a DATEX II publication.
+
+    Raises:
+        InputError: it is not said, or no country.
+    """
+    from fleet_service.client.datex import Supplier
+
+    for name in ("country", "supplier"):
+        if getattr(arguments, name) is None:
+            raise InputError(name, "is missing for a DATEX II publication", f"give --{name}")
+    return Supplier(arguments.country, arguments.supplier, arguments.status)
 
 
 def add_part(parser: argparse.ArgumentParser) -> None:

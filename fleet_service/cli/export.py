@@ -10,7 +10,16 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from fleet_service.cli.common import ArchiveReport, add_archive, add_connection, add_part, on_archive, span
+from fleet_service.cli.common import (
+    ArchiveReport,
+    add_archive,
+    add_connection,
+    add_part,
+    add_supplier,
+    on_archive,
+    span,
+    supplier_of,
+)
 from schemas.errors import InputError
 from schemas.runtime import commandline, talk
 from schemas.thresholds import NS
@@ -18,7 +27,6 @@ from schemas.thresholds import NS
 ENDINGS: Final = (".parquet", ".geojson", ".csv")
 WHAT: Final = ("map", "observations", "rollup")
 DATEX: Final = "datex"
-STATUSES: Final = ("real", "test", "technicalExercise", "securityExercise")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,9 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--snapshot", action="store_true", help="map: the service's last hourly one, at once")
     add_connection(parser)
-    parser.add_argument("--country", metavar="CC", help="datex: the supplier's, e.g. se")
-    parser.add_argument("--supplier", metavar="NAME", help="datex: the supplier's name at its National Access Point")
-    parser.add_argument("--status", choices=STATUSES, default="test", help="datex: of the information; default test")
+    add_supplier(parser)
     parser.add_argument("--follow", action="store_true", help="datex: keep the file up until a signal")
 
 
@@ -60,13 +66,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _datex(arguments: argparse.Namespace) -> int:
     from fleet_service.cli.common import stop_on_signals
-    from fleet_service.client.datex import Supplier
-    from fleet_service.client.datex_feed import DatexFeed, publish
+    from fleet_service.client.datex_feed import DatexFeed, DatexFile, publish
     from fleet_service.client.map_client import settings
 
     commandline.ending("out", commandline.out_folder("out", arguments.out), (".xml",))
-    supplier = Supplier(arguments.country, arguments.supplier, arguments.status)
-    feed = DatexFeed(supplier, arguments.out, lambda line: print(line, flush=True))
+    feed = DatexFeed(DatexFile(supplier_of(arguments), arguments.out, lambda line: print(line, flush=True)))
     publish(settings(arguments.connect, arguments.config), feed, stop_on_signals() if arguments.follow else None)
     return 0
 

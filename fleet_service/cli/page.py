@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from fleet_service.cli.common import add_connection, stop_on_signals
+from fleet_service.cli.common import add_connection, add_supplier, stop_on_signals, supplier_of
 from schemas.errors import InputError
+from schemas.runtime import commandline
+
+if TYPE_CHECKING:
+    from fleet_service.client.datex_feed import DatexFile
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -20,6 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--overlay", metavar="FILE", type=Path, help="Parquet of cell, sector, mu to lay over the map")
     parser.add_argument("--base-map", metavar="URL", help="raster tiles below the cells, with {z}, {x} and {y}")
+    parser.add_argument("--datex", metavar="FILE", type=Path, help="keep a DATEX II publication up in it, and serve it")
+    add_supplier(parser)
     add_connection(parser)
 
 
@@ -40,10 +47,22 @@ def run(arguments: argparse.Namespace) -> int:
     settings = server.PageSettings(
         connection=map_client.settings(arguments.connect, arguments.config), host=arguments.host, port=arguments.port,
         names=arguments.name, archive=arguments.archive, metrics=arguments.metrics, overlay=arguments.overlay,
-        base_map=arguments.base_map,
+        base_map=arguments.base_map, datex=_publication(arguments),
     )  # fmt: skip
     server.run(settings, stop_on_signals(), lambda line: print(line, flush=True))
     return 0
+
+
+def _publication(arguments: argparse.Namespace) -> DatexFile | None:
+    if arguments.datex is None:
+        for name in ("country", "supplier"):
+            if getattr(arguments, name) is not None:
+                raise InputError(name, "is of no use without --datex", "give both, or neither")
+        return None
+    from fleet_service.client.datex_feed import DatexFile
+
+    commandline.ending("datex", commandline.out_folder("datex", arguments.datex), (".xml",))
+    return DatexFile(supplier_of(arguments), arguments.datex, lambda line: print(line, flush=True))
 
 
 def _insist_on_base_map(address: str | None) -> None:

@@ -12,7 +12,7 @@ import zenoh
 
 from fleet_service.client.datex import Supplier, publication, same_but_for_time
 from fleet_service.client.map_client import is_place_served, is_served, joined
-from fleet_service.client.stretches import Stretches
+from fleet_service.client.stretches import StretchAlert, Stretches
 from fleet_service.client.watching import GATHER_S, standing_alerts
 from schemas import grid, keys, query, wire
 from schemas.config import ZenohSettings
@@ -23,8 +23,8 @@ from schemas.runtime.durable import written
 REFRESH_S: Final = 60.0  # between two looks at all that stands, and at the most between two times of publication
 
 
-class DatexFeed:
-    """One publication, from the alerts that are heard.
+class DatexFile:
+    """One publication, kept in a file and gone on with.
 
     Args:
         supplier: who answers for it.
@@ -37,13 +37,50 @@ class DatexFeed:
 
     def __init__(self, supplier: Supplier, path: Path, say: Callable[[str], None]) -> None:
         self._supplier, self._path, self._say = supplier, path, say
-        self._stretches, self._lock = Stretches(), threading.Lock()
-        self._before = path.read_bytes() if path.exists() else None
-        self._has_news, self._written = True, 0.0
+        self.document = path.read_bytes() if path.exists() else None
+        self._written = 0.0
+        if self.document is not None:
+            publication(supplier, [], 0, self.document)
+
+    @property
+    def is_due(self) -> bool:
+        """Whether its time of publication is to be renewed."""
+        return time.monotonic() >= self._written + REFRESH_S
+
+    def keep_up(self, standing: list[StretchAlert], is_heard: Callable[[float, float], bool]) -> None:
+        """Write the publication where it says something new, or has not been written for long.
+
+        Args:
+            standing: every stretch that is under an alert.
+            is_heard: whether a service speaks for a place (latitude, longitude).
+
+        Raises:
+            InputError: the file cannot be written; `document` is the new one all the same.
+        """
+        before = self.document
+        new = publication(self._supplier, standing, time.time_ns(), before, is_heard)
+        changed = before is None or not same_but_for_time(new, before)
+        if not changed and not self.is_due:
+            return
+        self.document, self._written = new, time.monotonic()
+        with commandline.writing(self._path), written(self._path) as file:
+            file.write(new)
+        if changed:
+            self._say(f"{len(standing)} slippery stretches in {self._path}")
+
+
+class DatexFeed:
+    """What keeps a publication up, from the alerts that are heard.
+
+    Args:
+        file: the publication.
+    """
+
+    def __init__(self, file: DatexFile) -> None:
+        self._file, self._stretches, self._lock = file, Stretches(), threading.Lock()
+        self._has_news = True
         self._heard: dict[int, bool] = {}
         self._is_heard: Callable[[float, float], bool] = lambda *_: False
-        if self._before is not None:
-            publication(supplier, [], 0, self._before)
 
     def take(self, alert: wire.Alert) -> None:
         """An alert was raised or cleared, or still stands."""
@@ -67,26 +104,18 @@ class DatexFeed:
             self._has_news = True
 
     def write(self) -> None:
-        """Write the publication where it says something new, or has not been written for long.
+        """Keep the publication up, where there is news or its time is due.
 
         Raises:
             InputError: the file cannot be written.
         """
         with self._lock:
-            if not self._has_news and time.monotonic() < self._written + REFRESH_S:
+            if not self._has_news and not self._file.is_due:
                 return
             self._has_news = False
             self._stretches.changes()
             standing = self._stretches.standing
-        new = publication(self._supplier, standing, time.time_ns(), self._before, self._is_heard)
-        changed = self._before is None or not same_but_for_time(new, self._before)
-        if not changed and time.monotonic() < self._written + REFRESH_S:
-            return
-        with commandline.writing(self._path), written(self._path) as file:
-            file.write(new)
-        self._before, self._written = new, time.monotonic()
-        if changed:
-            self._say(f"{len(standing)} slippery stretches in {self._path}")
+        self._file.keep_up(standing, self._is_heard)
 
 
 def publish(connection: ZenohSettings, feed: DatexFeed, stop: threading.Event | None) -> None:

@@ -85,21 +85,22 @@ def served_table(answer: Answer) -> pa.Table:
 def is_served(session: zenoh.Session, asked: query.MapQuery) -> bool:
     """Whether any service answers for the map: an empty answer of one is not the silence of none.
 
-    A service has a token, which not every reader may see; and it answers for the tiles of its regions.
+    A service has a token, which not every reader may see; and it answers for the tiles of its regions. A router matches
+    only who answers for all of a key expression: where no place is asked for, a service of the whole world is found by
+    any tile, and one of a region by its answer.
     """
     point = asked.route[0] if asked.route else asked.bbox[:2] if asked.bbox else None
-    if _is_matched(session, EVERYWHERE) if point is None else is_place_served(session, point[1], point[0]):
+    if is_place_served(session, *(reversed(point) if point else (0.0, 0.0))):
+        return True
+    if point is None and any(True for _ in replies(session, EVERYWHERE, {})):
         return True
     return any(reply.ok is not None for reply in session.liveliness().get(f"{keys.ROOT}/shard/*", timeout=SERVED_S))
 
 
 def is_place_served(session: zenoh.Session, latitude: float, longitude: float) -> bool:
     """Whether a service answers for the tile of a place [deg]; no takes SERVED_S."""
-    return _is_matched(session, keys.map_key(int(grid.tile_of(int(grid.cell_of(latitude, longitude))))))
-
-
-def _is_matched(session: zenoh.Session, expression: str) -> bool:
-    querier: Any = session.declare_querier(expression)
+    tile = grid.tile_of(int(grid.cell_of(latitude, longitude)))
+    querier: Any = session.declare_querier(keys.map_key(int(tile)))
     deadline = time.monotonic() + SERVED_S
     while not querier.matching_status.matching:
         if time.monotonic() > deadline:

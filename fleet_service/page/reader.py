@@ -26,6 +26,7 @@ from schemas.wire.tile import decode_tile
 
 log = logging.getLogger(__name__)
 ROUND_S: Final = 0.5
+AGAIN_S: Final = 5.0  # between two questions to a service of which nothing is known
 REFRESH_S: Final = 60.0  # a tile is put when it changes; that its intervals widen with time must be asked for
 REFRESHED: Final = 20  # tiles in a round: 40 a second, 2 400 in the minute; more are renewed more rarely
 REGIONS: Final = 256  # that are watched for a service
@@ -46,7 +47,7 @@ class Reader:
         self._away_since: dict[int, float] = {}
         self._names: dict[str, set[str]] = {"alive": set(), "shard": set()}
         self._anything: Any = None
-        self._served = False
+        self._served, self._stood, self._tried = False, 0.0, -AGAIN_S
 
     def run(self, stop: threading.Event) -> None:
         """Listen until `stop` is set."""
@@ -63,6 +64,8 @@ class Reader:
                 served = bool(self._sees_services())
                 if served and not self._served:  # at the start, and when a service came back: what was missed
                     self._ask_all(session)
+                elif served and time.monotonic() >= self._stood + REFRESH_S:
+                    self._ask_standing(session)
                 self._served = served
                 self._refresh(session)
                 stop.wait(ROUND_S)
@@ -78,6 +81,10 @@ class Reader:
     def served(self) -> bool:
         """Whether any service answers."""
         return self._served and self.connected
+
+    def is_heard(self, latitude: float, longitude: float) -> bool:
+        """Whether a service answers for a place [deg]."""
+        return self._answers(int(grid.region_of(int(grid.cell_of(latitude, longitude)))))
 
     def regions(self) -> list[dict[str, Any]]:
         """Regions with cells: their box, whether a service answers for them, since when none does."""
@@ -128,6 +135,10 @@ class Reader:
                 self._world.take_tile(tile, table, time.time())
         except (InputError, WireError) as error:
             log.warning("the map was not told: %s", error)
+        self._ask_standing(session)
+
+    def _ask_standing(self, session: zenoh.Session) -> None:
+        self._stood = time.monotonic()
         standing = standing_alerts(session)
         self._world.take_standing(standing, lambda cell: self._answers(int(grid.region_of(cell))), time.time())
 
@@ -162,15 +173,26 @@ class Reader:
         return querier is not None and bool(querier.matching_status.matching)
 
     def _sees_services(self) -> bool:
-        """Whether a service answers for any place: by its token, or, where none may be heard, by what it serves."""
-        if self._names["shard"]:
+        """Whether a service answers for any place: by its token, or, where none may be heard, by what it serves.
+
+        A router matches only who answers for all of a key expression: a service of the whole world is found by any
+        tile, one of a region by the regions that are known, and before any is known by its answer.
+        """
+        if self._names["shard"] or any(self._answers(region) for region in self._queriers):
             return True
         session = self._session
-        if session is None:
+        if session is None or not self.connected:
             return False
         if self._anything is None:
-            self._anything = session.declare_querier(map_client.EVERYWHERE)
-        return bool(self._anything.matching_status.matching)
+            self._anything = session.declare_querier(f"{keys.ROOT}/map/*/*/*/*")
+        if self._anything.matching_status.matching:
+            return True
+        if self._world.tiles() or time.monotonic() < self._tried + AGAIN_S:
+            return False
+        self._tried = time.monotonic()
+        with contextlib.suppress(InputError):
+            return any(True for _ in map_client.replies(session, map_client.EVERYWHERE, {}))
+        return False
 
 
 @contextlib.contextmanager

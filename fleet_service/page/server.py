@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import socket
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -15,6 +16,8 @@ import uvicorn
 from starlette.applications import Starlette
 from starlette.types import ASGIApp
 
+from fleet_service.client.datex_feed import DatexFile
+from fleet_service.client.watching import GATHER_S
 from fleet_service.page import web
 from fleet_service.page.health import ServiceHealth
 from fleet_service.page.moments import Moments
@@ -24,6 +27,7 @@ from fleet_service.page.world import HeldWorld
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
 
+log = logging.getLogger(__name__)
 LOOPBACK: Final = ("127.0.0.1", "localhost", "::1")
 LEAVE_S: Final = 2
 LOOK_S: Final = 0.1
@@ -41,6 +45,7 @@ class PageSettings:
         metrics: addresses of services' metrics, for the health view.
         overlay: Parquet of cell, sector, mu to lay over the map.
         base_map: address of raster tiles with {z}, {x}, {y}.
+        datex: a DATEX II publication to keep up and to serve; None: there is none.
         most: watchers at once.
     """
 
@@ -52,6 +57,7 @@ class PageSettings:
     metrics: list[str] = field(default_factory=list)
     overlay: Path | None = None
     base_map: str | None = None
+    datex: DatexFile | None = None
     most: int = MOST
 
 
@@ -72,7 +78,7 @@ def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None
     watchers = Watchers(world, state, settings.most)
     sources = web.Sources(
         world, reader, Moments(settings.archive), ServiceHealth(settings.metrics), watchers, settings.overlay,
-        settings.base_map,
+        settings.base_map, settings.datex,
     )  # fmt: skip
     hosts = [*settings.names, *(LOOPBACK if settings.host in LOOPBACK or settings.names else ())]
 
@@ -84,11 +90,26 @@ def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None
     app = web.application(sources, hosts, lifespan)
     listener = threading.Thread(target=reader.run, args=(stop,), name="reader", daemon=True)
     listener.start()
+    if settings.datex is not None:
+        threading.Thread(target=keep_up, args=(settings.datex, world, reader, stop), name="datex", daemon=True).start()
     try:
         asyncio.run(_serve(app, listening, stop, watchers, say))
     finally:
         stop.set()
         listener.join(LEAVE_S)
+
+
+def keep_up(file: DatexFile, world: HeldWorld, reader: Reader, stop: threading.Event) -> None:
+    """Keep a publication up with the alerts that the page hears, until `stop` is set."""
+    seen = -1
+    while not stop.wait(GATHER_S):
+        if not reader.served or (world.alerts_heard == seen and not file.is_due):
+            continue  # where no service speaks nothing ends, and the publication's time says how old it is
+        seen = world.alerts_heard
+        try:
+            file.keep_up(world.stretches(), reader.is_heard)
+        except InputError as error:  # it is served all the same
+            log.warning("%s", error)
 
 
 async def _serve(

@@ -19,6 +19,7 @@ from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from fleet_service.client.datex_feed import DatexFile
 from fleet_service.page import asked, colours, ogc, overlay, records, route
 from fleet_service.page.health import ServiceHealth
 from fleet_service.page.moments import Moments
@@ -44,6 +45,7 @@ class Sources(NamedTuple):
     watchers: Watchers
     overlay: Path | None = None
     base_map: str | None = None
+    datex: DatexFile | None = None
 
 
 def application(sources: Sources, hosts: Iterable[str], lifespan: Callable[[Starlette], Any]) -> ASGIApp:
@@ -59,7 +61,8 @@ def application(sources: Sources, hosts: Iterable[str], lifespan: Callable[[Star
         "/": routes.index, "/static/{name}": routes.file, "/settings": routes.settings, "/tiles": routes.tiles,
         "/blocks": routes.blocks, "/events": routes.events, "/cell/{cell}/{sector}": routes.cell,
         "/history/{cell}/{sector}": routes.history, "/moments": routes.times, "/route": routes.route,
-        "/health": routes.health, "/overlay": routes.overlay, **routes.features.paths(),
+        "/health": routes.health, "/overlay": routes.overlay, "/datex2/situation.xml": routes.situations,
+        **routes.features.paths(),
     }  # fmt: skip
     app = Starlette(
         routes=[Route(path, told(answer)) for path, answer in paths.items()],
@@ -175,6 +178,15 @@ class Routes:
             "regions": reader.regions(), "router": reader.connected,
             "watchers": len(watchers), "reloads": watchers.reloads,
         })  # fmt: skip
+
+    async def situations(self, _: Request) -> Response:
+        """The slippery stretches as a DATEX II publication: a snapshot to pull."""
+        if self._of.datex is None:
+            return PlainTextResponse("this page publishes no situations; see --datex\n", 404)
+        if self._of.datex.document is None:
+            told = "no service has answered yet; that is no dry road\n"
+            return PlainTextResponse(told, 503, headers={"Retry-After": "10"})
+        return Response(self._of.datex.document, media_type="application/xml", headers={"Cache-Control": "no-store"})
 
     async def overlay(self, _: Request) -> Response:
         """The other map, or null."""

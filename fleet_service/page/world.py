@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.client.stretches import Stretches
+from fleet_service.client.stretches import StretchAlert, Stretches
 from fleet_service.page import records
 from fleet_service.page.records import Records, TileBlock
 from schemas import grid
@@ -42,6 +42,8 @@ class HeldWorld:
         self._tiles: dict[int, HeldTile] = {}
         self._before: dict[int, _Before] = {}  # of the tiles that changed since `changes` was asked
         self._stretches = Stretches()
+        self._alerts_changed = False
+        self.alerts_heard = 0  # counts what was said of alerts
         self.heard = 0.0  # when any service said anything [s since 1970]
 
     def take_tile(self, tile: int, table: pa.Table, now: float) -> None:
@@ -60,12 +62,14 @@ class HeldWorld:
         """An alert of a cell was raised, repeated or cleared."""
         with self._lock:
             self.heard = now
+            self.alerts_heard += 1
             self._stretches.take(alert)
 
     def take_standing(self, standing: Iterable[Alert], served: Callable[[int], bool], now: float) -> None:
         """These alerts stand; of the cells that are served no others do."""
         with self._lock:
             self.heard = now
+            self.alerts_heard += 1
             self._stretches.take_all(standing, lambda alert: served(alert.cell))
 
     def changes(self) -> list[TileBlock]:
@@ -83,7 +87,14 @@ class HeldWorld:
     def alerts_changed(self) -> bool:
         """Whether stretches changed since this was asked last."""
         with self._lock:
-            return bool(self._stretches.changes())
+            found, self._alerts_changed = bool(self._stretches.changes()) or self._alerts_changed, False
+            return found
+
+    def stretches(self) -> list[StretchAlert]:
+        """The stretches that stand, with all that was said until now."""
+        with self._lock:
+            self._alerts_changed |= bool(self._stretches.changes())
+            return self._stretches.standing
 
     def standing(self) -> list[dict[str, Any]]:
         """The stretches that stand, newest first."""

@@ -255,6 +255,14 @@ def test_every_option_of_the_command_does_what_it_says(router: ZenohSettings, tm
         str(overlay),
         "--base-map",
         "https://t.example/{z}/{x}/{y}.png",
+        "--datex",
+        str(tmp_path / "situations.xml"),
+        "--country",
+        "se",
+        "--supplier",
+        "GripMap test",
+        "--status",
+        "technicalExercise",
     ]
     page = Part("page", [sys.executable, "-m", "fleet_service.cli", "page", *words, *to], tmp_path)
     page.start()
@@ -269,6 +277,7 @@ def test_every_option_of_the_command_does_what_it_says(router: ZenohSettings, tm
         ]
         status, headers, _ = ask(address, "/", Host="map.example")
         assert (status, ask(address, "/", Host="other.example")[0]) == (200, 421)
+        until(lambda: ask(address, "/datex2/situation.xml")[0] == 503)  # no service is there
         assert "img-src 'self' data: https://t.example;" in headers["content-security-policy"]
         page.send(signal.SIGTERM)
         page.wait(30.0)

@@ -1,0 +1,122 @@
+"""The publication that others pull from the page: as the alerts are, gone on with, valid."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import zenoh
+
+from fleet_service.client.datex import Supplier
+from fleet_service.client.datex_feed import DatexFile
+from fleet_service.fusion import Fusion
+from fleet_service.page.server import PageSettings
+from fleet_service.serve.encode import arrow_stream, batch_of
+from fleet_service.serve.view import view
+from schemas import grid, keys, wire
+from schemas.config import ZenohSettings
+from schemas.thresholds import NS
+from schemas.wire import Alert
+from tests.fleet_service.client.test_datex import records, schema, text
+from tests.fleet_service.examples import START, TILE, observations, value
+from tests.fleet_service.page.conftest import page_of
+from tests.fleet_service.page.test_server import ask
+from tests.waiting import until
+
+ROUTE = "/datex2/situation.xml"
+OURS = Supplier("se", "GripMap test")
+NOTHING = b"<nothing/>"
+CELLS = [(TILE << 14) + k for k in range(3)]
+
+
+@contextmanager
+def made_up_service(session: zenoh.Session) -> Iterator[None]:
+    """Answers for one cell of the region, so that it has a service."""
+    fusion = Fusion(120.0)
+    fusion.update(observations([0.0], [1], value([0.3])))
+    payload = arrow_stream(batch_of(view(fusion, np.arange(1), START), START))
+
+    def answer(asked: zenoh.Query) -> None:
+        with asked:
+            asked.reply(keys.map_key(TILE), payload)
+
+    queryable = session.declare_queryable(keys.map_key(TILE).rpartition("/")[0] + "/*", answer, complete=True)
+    try:
+        yield
+    finally:
+        queryable.undeclare()
+
+
+def put(session: zenoh.Session, cells: list[int], *, raised: bool, at: int = START) -> None:
+    for cell in cells:
+        latitude, longitude = (float(v) for v in grid.centre(cell))
+        told = Alert(cell, 0, raised, at, 0.2, 0.1, 0.3, 0.95, 3, latitude, longitude, "P(mu < 0.4) = 0.95 > 0.9")
+        session.put(keys.alert_key(TILE), wire.encode_alert(told))
+
+
+def test_what_is_pulled_follows_the_alerts_and_is_gone_on_with(
+    router: ZenohSettings, session: zenoh.Session, tmp_path: Path
+) -> None:
+    out = tmp_path / "situations.xml"
+    with made_up_service(session):
+        with page_of(router, datex=DatexFile(OURS, out, print)) as address:
+            pulled = pull(address)
+            until(lambda: pulled() != NOTHING)
+            assert not records(pulled())
+            put(session, CELLS, raised=True)
+            until(lambda: records(pulled()))
+            begun = pulled()
+            (record,) = records(begun)
+            assert record.get("version") == "1"
+            until(lambda: out.read_bytes() == begun)
+        with page_of(router, datex=DatexFile(OURS, out, print)) as address:
+            pulled = pull(address)
+            until(lambda: text(records(pulled())[0], ".//com:overallEndTime"))  # nothing stands any more
+            put(session, CELLS, raised=True, at=START + NS)
+            until(lambda: len(records(pulled())) == 2)
+            put(session, CELLS, raised=False, at=START + 2 * NS)
+            until(lambda: all(text(one, ".//com:overallEndTime") for one in records(pulled())))
+            over = pulled()
+    assert {record.get("id")} < {one.get("id") for one in records(over)}
+    for document in (begun, over):
+        schema().validate(document.decode())
+
+
+def pull(address: str) -> Callable[[], bytes]:
+    """What the page answers; NOTHING while it has nothing to say yet."""
+
+    def pulled() -> bytes:
+        status, headers, body = ask(address, ROUTE)
+        assert status in (200, 503)
+        assert status == 503 or headers["content-type"].startswith("application/xml")
+        return body if status == 200 else NOTHING
+
+    return pulled
+
+
+def test_silence_of_a_service_that_went_ends_nothing(
+    router: ZenohSettings, session: zenoh.Session, tmp_path: Path
+) -> None:
+    file = DatexFile(OURS, tmp_path / "situations.xml", print)
+    with page_of(router, datex=file) as address:
+        pulled = pull(address)
+        with made_up_service(session):
+            put(session, CELLS, raised=True)
+            until(lambda: records(pulled()))
+        until(lambda: not json.loads(ask(address, "/health")[2])["regions"][0]["served"])
+        put(session, CELLS, raised=False)
+        assert not text(records(pulled())[0], ".//com:overallEndTime")
+
+
+def test_a_page_without_a_publication_says_how_to_have_one(bare: str) -> None:
+    status, _, body = ask(bare, ROUTE)
+    assert (status, b"--datex" in body) == (404, True)
+
+
+def test_before_any_service_spoke_there_is_no_publication(router: ZenohSettings, tmp_path: Path) -> None:
+    with page_of(router, datex=DatexFile(OURS, tmp_path / "situations.xml", print)) as address:
+        assert ask(address, ROUTE)[0] == 503
+    assert PageSettings(router).datex is None
