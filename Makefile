@@ -34,7 +34,8 @@ test-all: $(PAPERS)  ## these, and the campaigns in their quick form
 test-shuffled: $(PAPERS)  ## all ten times in an order drawn anew: none may lean on another
 	for round in 1 2 3 4 5 6 7 8 9 10; do $(TESTS) --random-order || exit 1; done
 
-browser-test: setup  ## pages in the system's Chromium; pictures in .page
+browser-test: setup  ## pages in the system's Chromium, and axe-core's scan of them; pictures in .page
+	$(BIN)/python -m tests.npm axe-core
 	$(BIN)/python -m pytest -q -rs tests/fleet_service/page tests/fleet_service/analytics/test_page.py
 
 docs: setup  ## the documentation site, .docs/index.html; a warning is an error

@@ -1,0 +1,33 @@
+"""Accessibility of the page by axe-core: what it calls serious or critical, in every panel."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from tests.browser import Opened
+from tests.npm import file_of
+
+TABS: Final = ("legend", "cell", "alerts", "route", "health", "share")
+SERIOUS: Final = ("serious", "critical")
+_RUN: Final = "async () => (await axe.run(document)).violations"
+MISSING: Final = "no axe-core in .page/tools: make browser-test fetches it with npm"
+
+
+def findings(seen: Opened, tabs: tuple[str, ...] = TABS) -> list[str] | None:
+    """Serious findings, one a line; None where axe-core is not there."""
+    source = file_of("axe-core", "axe.min.js")
+    if source is None:
+        return None
+    seen.page.emulate_media(reduced_motion="reduce")  # a colour that is just fading in is not the one that is read
+    seen.page.evaluate(f"() => {{ {source.read_text()} }}")
+    found: list[str] = []
+    for tab in tabs:
+        seen.page.evaluate("async tab => { gripmap.open(tab); await gripmap.panel() }", tab)
+        violations: list[dict[str, Any]] = seen.page.evaluate(_RUN)
+        found += [
+            f"{tab}: {one['id']} ({one['impact']}): {one['help']}: {node['html'][:200]}"
+            for one in violations
+            if one["impact"] in SERIOUS
+            for node in one["nodes"]
+        ]
+    return found

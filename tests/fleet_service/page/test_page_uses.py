@@ -1,0 +1,152 @@
+"""The page as it is used beside the desk: a night played, a sound, on paper, on a wall, a dropped route, read aloud."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import pytest
+
+from schemas import grid
+from tests.browser import Opened
+from tests.fleet_service.page import scan, street
+from tests.fleet_service.page.conftest import Drive, RunningPage
+from tests.fleet_service.page.test_page import ICE, cell_of, kept, kinds, look, near, shown, waits
+from tests.waiting import until
+
+WALL: Final = {"width": 3840, "height": 2160}
+_HEARD: Final = """() => {
+  globalThis.beeps = 0;
+  const Real = AudioContext;
+  globalThis.AudioContext = class extends Real {
+    createOscillator() { globalThis.beeps++; return super.createOscillator(); }
+  };
+}"""
+_DROP: Final = """text => {
+  const carried = new DataTransfer();
+  carried.items.add(new File([text], "way.gpx", { type: "application/gpx+xml" }));
+  const drop = new DragEvent("drop", { dataTransfer: carried, bubbles: true, cancelable: true });
+  document.getElementById("map").dispatchEvent(drop);
+  return drop.defaultPrevented;
+}"""
+
+
+def test_a_night_is_played_moment_by_moment_and_ends_now(page: RunningPage, drive: Drive) -> None:
+    drive("snow")
+    until(lambda: kept(page.archive))
+    first = kept(page.archive)[0]
+    drive("ice")
+    until(lambda: kept(page.archive)[-1] > first + 2)
+    with shown(page) as seen:
+        near(seen, cell_of("ice"))
+        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
+        seen.page.evaluate(
+            "() => { globalThis.played = []; new MutationObserver(() => played.push([document.body.dataset.at, "
+            "document.body.dataset.kinds])).observe(document.body, { attributeFilter: ['data-at'] }) }"
+        )
+        assert page.service is not None
+        page.service.end()  # no further moment comes while it is played
+        seen.page.evaluate("gripmap.timeline.load()")
+        seen.page.locator("#play").click()
+        assert seen.page.locator("#play").inner_text() != "play"
+        until(lambda: seen.page.evaluate("document.body.dataset.at === 'now'"), 120.0)  # a moment each .7 s
+        played: list[list[str]] = seen.page.evaluate("played")
+        moments = [int(at) for at, _ in played[:-1]]
+        assert moments == sorted(moments)
+        assert len(set(moments)) >= 2
+        assert moments[0] == first
+        ice = [int(drawn.split(",")[ICE]) for _, drawn in played]
+        assert (ice[0], ice[-1]) == (0, street.known("ice"))
+        waits(seen, "gripmap.timeline.timer === null")
+
+
+def test_a_sound_is_heard_of_a_new_alert_only_where_it_was_asked_for(page: RunningPage, drive: Drive) -> None:
+    with shown(page) as seen:
+        silent = seen.page.context.new_page()
+        silent.goto(page.address)
+        silent.wait_for_selector("body[data-ready]", state="attached")
+        for one in (seen.page, silent):
+            one.evaluate(_HEARD)
+            until(lambda: one.evaluate("gripmap.heardAlerts"))  # noqa: B023 it is used up within the loop
+        seen.page.locator("#tab-alerts").click()
+        assert not seen.page.locator("#sound").is_checked()
+        seen.page.locator("#sound").check()
+        assert seen.page.evaluate("beeps") == 1, "who asks for it hears how it will be"
+        drive("ice")
+        waits(seen, "document.body.dataset.alerts === '1'")
+        assert seen.page.evaluate("beeps") == 2
+        until(lambda: silent.evaluate("document.body.dataset.alerts === '1'"))
+        assert silent.evaluate("beeps") == 0
+
+
+def test_on_paper_are_the_map_and_the_words_and_nothing_to_press(page: RunningPage, drive: Drive) -> None:
+    drive("ice", "dry")
+    with shown(page) as seen:
+        near(seen, cell_of("ice"), 17)
+        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
+        seen.page.emulate_media(media="print")
+        for selector in ("#tabs", "#controls", "#play", "#slider"):
+            assert not seen.page.locator(selector).is_visible(), selector
+        for selector in ("#map", "#panel", "#scale", "#moment"):
+            assert seen.page.locator(selector).is_visible(), selector
+        panel = seen.page.evaluate("(p => [p.scrollHeight, p.clientHeight])(document.getElementById('panel'))")
+        assert panel[0] <= panel[1] + 1, "no word is cut off"
+        assert seen.page.pdf()[:5] == b"%PDF-"
+        look(seen, "print")
+
+
+def test_a_dropped_gpx_is_a_route(page: RunningPage, drive: Drive) -> None:
+    drive("ice", "wet")
+    west, east = (grid.centre(street.cells(street.PARTS[name])[k]) for name, k in (("ice", 0), ("passed", 3)))
+    points = "".join(f'<rtept lat="{float(lat):.7f}" lon="{float(lon):.7f}"/>' for lat, lon in (west, east))
+    with shown(page) as seen:
+        gpx = f'<gpx xmlns="http://www.topografix.com/GPX/1/1"><rte>{points}</rte></gpx>'
+        assert seen.page.evaluate(_DROP, gpx), "the browser does not open it instead"
+        waits(seen, "document.getElementById('route-share')")
+        assert seen.page.evaluate("gripmap.tab") == "route"
+        assert "km/h with 50 m of sight" in seen.page.locator("#route-worst").inner_text()
+
+
+def test_on_a_wall_screen_everything_is_larger_and_the_map_fills_it(page: RunningPage, drive: Drive) -> None:
+    drive()
+    with shown(page) as seen:
+        seen.page.set_viewport_size(WALL)  # type: ignore[arg-type]
+        near(seen, cell_of("ice"), 18.5)
+        waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
+        waits(seen, f"document.getElementById('map').width > {WALL['width'] // 2}")
+        size = seen.page.evaluate(
+            "[document.documentElement.scrollWidth, document.documentElement.scrollHeight, gripmap.view.width,"
+            " gripmap.view.height, parseFloat(getComputedStyle(document.body).fontSize)]"
+        )
+        assert size[0] <= WALL["width"]
+        assert size[1] <= WALL["height"]
+        assert size[2] > 0.75 * WALL["width"]
+        assert size[3] > 0.85 * WALL["height"]
+        assert size[4] >= 20
+        assert sum(kinds(seen)) > 0
+        look(seen, "wall")
+
+
+@pytest.mark.parametrize("phone", [False, True], ids=["desk", "phone"])
+def test_axe_finds_nothing_serious_in_any_panel(page: RunningPage, drive: Drive, phone: bool) -> None:
+    drive("ice", "passed", "dry")
+    with shown(page, phone=phone) as seen:
+        near(seen, cell_of("ice"))
+        waits(seen, "document.body.dataset.alerts === '1'")
+        _choose(seen, cell_of("ice"))
+        found = scan.findings(seen)
+        if found is None:
+            pytest.skip(scan.MISSING)
+        assert found == []
+
+
+def test_axe_would_see_a_button_without_a_name(page: RunningPage) -> None:
+    with shown(page) as seen:
+        seen.page.evaluate("document.getElementById('controls').append(document.createElement('button'))")
+        found = scan.findings(seen, ("legend",))
+        if found is None:
+            pytest.skip(scan.MISSING)
+        assert any("button-name" in one for one in found)
+
+
+def _choose(seen: Opened, cell: int) -> None:
+    seen.page.evaluate("([tile, local]) => gripmap.choose(tile, local)", [cell >> 14, cell & 0x3FFF])

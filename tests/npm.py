@@ -1,0 +1,85 @@
+"""Files of npm packages that tests and benchmarks use in a browser: pinned, kept in `.page/tools`, never committed.
+
+`python -m tests.npm axe-core` fetches one; `make browser-test` and `make page-bench` do. Where a file is not there,
+what wants it is skipped and says so.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+import tarfile
+import tempfile
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from tests.house import ROOT
+
+FOLDER: Final = ROOT / ".page" / "tools"
+
+
+class Package(NamedTuple):
+    """A version, and of each file wanted its path inside the package and its SHA-256."""
+
+    version: str
+    files: dict[str, str]
+
+
+PACKAGES: Final = {
+    "axe-core": Package(  # MPL-2.0
+        "4.11.0",
+        {"axe.min.js": "e9e5863c33a874f09bc01acd9234b7e3c871479f5eef8802fa582544465e6d01"},
+    ),
+    "maplibre-gl": Package(  # BSD-3-Clause
+        "5.24.0",
+        {
+            "dist/maplibre-gl.js": "45a9b07a9189ce56054c620a947ccf41e291e58c95e9b61533b740aaa65ee5cb",
+            "dist/maplibre-gl.css": "ab1e70d59ec40465bae7e7030da2f3ccf28133fd502e62bd598eefbadfd7a732",
+        },
+    ),
+}
+
+
+def file_of(name: str, path: str) -> Path | None:
+    """A file of a package; None where it was not fetched, or is not the pinned one."""
+    found = FOLDER / name / Path(path).name
+    if not found.is_file() or hashlib.sha256(found.read_bytes()).hexdigest() != PACKAGES[name].files[path]:
+        return None
+    return found
+
+
+def fetch(name: str) -> None:
+    """Have the files of a package.
+
+    Raises:
+        ValueError: what came is not what is pinned.
+    """
+    package = PACKAGES[name]
+    if all(file_of(name, path) for path in package.files):
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        words = ["npm", "pack", "--silent", f"{name}@{package.version}", "--pack-destination", folder]
+        subprocess.run(words, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        with tarfile.open(next(Path(folder).glob("*.tgz"))) as packed:
+            (FOLDER / name).mkdir(parents=True, exist_ok=True)
+            for path in package.files:
+                source = packed.extractfile(f"package/{path}")
+                assert source is not None
+                (FOLDER / name / Path(path).name).write_bytes(source.read())
+    if missing := [path for path in package.files if file_of(name, path) is None]:
+        raise ValueError(f"{name} {package.version}: {', '.join(missing)} is not what is pinned")
+
+
+def main(names: list[str]) -> int:
+    """Fetch what is named; what cannot be had is said, and tests that want it are skipped."""
+    for name in names:
+        try:
+            fetch(name)
+        except (OSError, subprocess.CalledProcessError) as error:
+            print(f"{name} was not fetched ({error}); what wants it is skipped", file=sys.stderr)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
