@@ -8,7 +8,7 @@ PAPERS := .venv/.papers
 TESTS := $(BIN)/python -m pytest -q --numprocesses $$(( $$(getconf _NPROCESSORS_ONLN) + 1 )) --dist loadfile
 export PYTHONDONTWRITEBYTECODE :=  # what was parsed once is kept: tests start hundreds of processes
 
-.PHONY: setup demo test test-all test-shuffled check package docs lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test usability figures roads-bench browser-test
+.PHONY: setup demo test test-all test-shuffled check package docs lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test usability figures roads-bench page-bench browser-test
 
 setup: $(STAMP)  ## make .venv and install everything, pinned
 
@@ -63,6 +63,10 @@ faults-quick: setup  ## the same mechanisms in two minutes
 
 roads-bench: setup  ## how often cells are joined to the right link, against SUMO's traffic; writes .roads/figures.json
 	$(BIN)/python -m tests.benchmarks.roads
+
+page-bench: setup  ## the live page measured, beside MapLibre in the same browser, and what leaves the house; .page/figures.json
+	$(BIN)/python -m tests.npm axe-core maplibre-gl
+	$(BIN)/python -m tests.benchmarks.page
 
 usability: setup  ## the first hour of a new user as figures; wants chromium and unshare; writes .usability/figures.json
 	$(BIN)/python -m tests.usability

@@ -38,6 +38,7 @@ CAMPAIGNS: Final = {
     "demo": Campaign("make demo", ".demo", "demo"),
     "bench": Campaign("make bench", ".bench", "bench"),
     "faults": Campaign("make faults", ".faults", "faults"),
+    "page": Campaign("make page-bench", ".page", "page"),
     "roads": Campaign("make roads-bench", ".roads", "roads"),
     "usability": Campaign("make usability", ".usability", "usability"),
     "edge": Campaign("edge-agent evaluate --out .evaluation/edge", ".evaluation/edge", "edge-agent evaluate"),

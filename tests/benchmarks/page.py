@@ -1,0 +1,318 @@
+"""`make page-bench`: the live page measured, beside MapLibre with the same cells as GeoJSON in the same browser.
+
+Writes `.page/figures.json` and prints the table. Times are of this machine and its software renderer: they are worth
+something beside each other only. Wants Chromium, and npm for MapLibre and axe-core; what is missing fails its row.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import functools
+import http.server
+import json
+import math
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_service.archive import export, geo
+from fleet_service.page.colours import FOUR, GROUND, LITTLE, TWO
+from schemas import keys
+from schemas.runtime import figures
+from schemas.runtime.figures import Figure
+from schemas.thresholds import NS
+from tests import browser, npm
+from tests.benchmarks import page_stage
+from tests.benchmarks.page_outside import outside
+from tests.benchmarks.page_stage import CELLS, Stage, pinned, seen_town, stage
+from tests.browser import Opened
+from tests.fleet_service.page import scan
+from tests.sight import SIGHTS, difference, lab
+from tests.waiting import until
+
+OUT: Final = Path(".page")
+SEED: Final = 20_319
+CHANGED_HZ: Final = 1000  # cells a second
+PUT_S: Final = 0.25  # of four tiles each is put once a second, as a service does
+PUSHES: Final = 120
+FIRST: Final = 100  # number of the first push: what is there before is none of them
+WATCHERS: Final = (400, 300, 200, 100, 50)
+WATCHED_PUSHES: Final = 20
+VIEWPORT: Final = {"width": 1600, "height": 1100}
+ROUNDS: Final = 3
+ALL: Final = (*FOUR, *TWO, LITTLE, GROUND)
+
+# A picture counts from the moment at which all cells were painted; performance.now() begins with the navigation.
+_WATCH: Final = """
+  globalThis.shown = null; globalThis.numbers = [];
+  document.addEventListener("DOMContentLoaded", () => new MutationObserver(() => {
+    if (!shown && document.body.dataset.drawn >= CELLS) globalThis.shown = performance.now();
+    for (const place of globalThis.markers ?? []) {
+      const number = gripmap.now.at_place(...place)[0]?.vehicles;
+      if (number && !numbers.some(one => one[0] === number)) numbers.push([number, Date.now()]);
+    }
+  }).observe(document.body, { attributeFilter: ["data-drawn"] }));
+""".replace("CELLS", str(CELLS))
+_MOVES: Final = """async () => {
+  const began = performance.now();
+  let frames = 0;
+  while (performance.now() - began < 3000) {
+    move(frames);
+    await new Promise(requestAnimationFrame);
+    frames += await drawn() ? 1 : 0;
+  }
+  return 1000 * frames / (performance.now() - began);
+}"""
+_OURS: Final = """() => {
+  globalThis.move = k => {
+    gripmap.view.shift(9 * Math.sin(k / 5), 4 * Math.cos(k / 7));
+    gripmap.view.turn(1 + .01 * Math.sin(k / 9));
+  };
+  globalThis.drawn = () => { gripmap.drawNow(); return document.body.dataset.drawn > 0; };
+}"""
+_THEIRS: Final = """() => {
+  globalThis.move = k => {
+    map.jumpTo({ zoom: map.getZoom() + Math.log2(1 + .01 * Math.sin(k / 9)) });
+    map.panBy([-9 * Math.sin(k / 5), -4 * Math.cos(k / 7)], { animate: false });
+  };
+  globalThis.drawn = () => new Promise(done => { map.once("render", () => done(true)); map.triggerRepaint(); });
+}"""
+_MAPLIBRE: Final = """<!doctype html><meta charset="utf-8"><link rel="stylesheet" href="maplibre-gl.css">
+<style>body { margin: 0 } #map { width: 1184px; height: 1000px }</style><div id="map"></div>
+<script src="maplibre-gl.js"></script><script>
+const colour = ["step", ["coalesce", ["get", "mu"], 1], "#4c007b", .2, "#aa5271", .4, "#f58c41", .6, "#eeea79"];
+const paint = { "fill-antialias": false, "fill-color": colour };
+const layers = [{ id: "cells", type: "fill", source: "cells", paint }];
+const style = { version: 8, sources: { cells: { type: "geojson", data: "town.geojson" } }, layers };
+const map = new maplibregl.Map({
+  container: "map", center: [LON, LAT], zoom: ZOOM - 1, fadeDuration: 0, attributionControl: false, style,
+});
+map.once("idle", () => { globalThis.shown = performance.now(); });
+</script>"""
+
+
+@contextmanager
+def opened(address: str) -> Iterator[Opened]:
+    """An address in a large window, that notes when all was painted."""
+    with browser.opened("about:blank") as seen:
+        size: Any = VIEWPORT
+        seen.page.set_viewport_size(size)
+        seen.page.add_init_script(_WATCH)
+        seen.page.goto(address)
+        until(lambda: seen.page.evaluate("globalThis.shown"), 120.0)
+        yield seen
+
+
+def drawn(on: Stage) -> dict[str, float]:
+    """First picture and frames, ours and MapLibre's in turn; what the page asked of others, and said in errors."""
+    ours: list[tuple[float, float]] = []
+    theirs: list[tuple[float, float]] = []
+    errors, foreign = list[str](), list[str]()
+    with maplibre(on) as other:
+        for _ in range(ROUNDS):
+            with opened(seen_town(on.address, on.town)) as seen:
+                first = float(seen.page.evaluate("shown / 1000"))
+                seen.page.evaluate(_OURS)
+                ours.append((first, float(seen.page.evaluate(_MOVES))))
+                errors += seen.errors
+                foreign += [url for url in seen.requests if not url.startswith((on.address, "data:", "about:"))]
+            if other is not None:
+                with opened(other) as seen:
+                    first = float(seen.page.evaluate("shown / 1000"))
+                    seen.page.evaluate(_THEIRS)
+                    theirs.append((first, float(seen.page.evaluate(_MOVES))))
+    for line in (*errors, *foreign):
+        print(f"  {line}", file=sys.stderr)
+    picture, frames = (float(np.median([one[k] for one in ours])) for k in (0, 1))
+    found = {"first_picture_s": picture, "frames_hz": frames}
+    found |= {"console_errors": float(len(errors)), "foreign_requests": float(len(foreign))}
+    their_picture, their_frames = (float(np.median([one[k] for one in theirs] or [math.nan])) for k in (0, 1))
+    return found | {
+        "maplibre_first_picture_s": their_picture, "maplibre_frames_hz": their_frames, "fps": frames / their_frames,
+    }  # fmt: skip
+
+
+@contextmanager
+def maplibre(on: Stage) -> Iterator[str | None]:
+    """The address of MapLibre with the town as GeoJSON, from a server of this process; None where npm has none."""
+    files = [npm.file_of("maplibre-gl", path) for path in npm.PACKAGES["maplibre-gl"].files]
+    if not all(files):
+        print("  no MapLibre: npm did not fetch it", file=sys.stderr)
+        yield None
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        for file in files:
+            assert file is not None
+            (Path(folder) / file.name).write_bytes(file.read_bytes())
+        town = pa.Table.from_batches([on.town.table(tile) for tile in on.town.tiles]).select(["cell", "mu"])
+        export.write(geo.with_cells(town), Path(folder) / "town.geojson")
+        x, y = on.town.corner
+        longitude = 360.0 * x / 2**14 - 180.0
+        latitude = math.degrees(math.atan(math.sinh(math.pi * (1.0 - 2.0 * y / 2**14))))
+        text = _MAPLIBRE.replace("LON", str(longitude)).replace("LAT", str(latitude))
+        (Path(folder) / "index.html").write_text(text.replace("ZOOM", str(page_stage.ZOOM)))
+        handler = functools.partial(_Quiet, directory=folder)
+        with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+            threading.Thread(target=server.serve_forever, daemon=True).start()
+            yield f"http://127.0.0.1:{server.server_port}/index.html"
+            server.shutdown()
+
+
+class _Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        """Say nothing."""
+
+
+def pushed_ms(on: Stage) -> float:
+    """95 % of the times from a put at the router to the painted cell, under CHANGED_HZ changed cells a second."""
+    with opened(seen_town(on.address, on.town)) as seen:
+        tiles, put = list(on.town.tiles), dict[int, float]()
+        seen.page.evaluate("all => { globalThis.markers = all }", [[tile, on.town.local(tile)] for tile in tiles])
+        due = time.monotonic()
+        for k in range(PUSHES):
+            tile, number = tiles[k % len(tiles)], FIRST + k
+            payload = on.town.change(tile, int(CHANGED_HZ * PUT_S), number)
+            put[number] = 1000.0 * time.time()
+            on.session.put(keys.map_key(tile), payload)
+            due += PUT_S
+            time.sleep(max(due - time.monotonic(), 0.0))
+        until(lambda: seen.page.evaluate(f"numbers.some(one => one[0] === {FIRST + PUSHES - 1})"), 30.0)
+        drawn_at = {int(number): float(at) for number, at in seen.page.evaluate("numbers")}
+    # a put that the next of its tile overtook is drawn with that
+    late = [
+        min((at for number, at in drawn_at.items() if number >= k and (number - k) % len(tiles) == 0), default=math.inf)
+        - begun
+        for k, begun in put.items()
+    ]
+    return float(np.quantile(late, 0.95, method="higher"))
+
+
+def bytes_per_cell(on: Stage) -> float:
+    """Bytes of all blocks, uncompressed, over their cells."""
+    tiles = ",".join(map(str, on.town.tiles))
+    with urllib.request.urlopen(f"{on.address}blocks?tiles={tiles}", timeout=30) as answer:
+        return len(answer.read()) / CELLS
+
+
+async def _watched(on: Stage, count: int) -> float:
+    """95 % of the times [s] from a put to each of so many watchers; infinite where one heard less than all."""
+    host, _, port = on.address.removeprefix("http://").rstrip("/").partition(":")
+    heard = [dict[int, float]() for _ in range(count)]
+    local = on.town.local(on.town.marker)
+    begins = base64.b64encode(struct.pack("<I", on.town.marker))[:5]
+
+    async def watch(own: dict[int, float]) -> None:
+        reader, writer = await asyncio.open_connection(host, int(port), limit=1 << 22)
+        writer.write(f"GET /events HTTP/1.1\r\nHost: {host}:{port}\r\n\r\n".encode())
+        while line := await reader.readline():
+            if line.startswith(b"data: " + begins):
+                block = base64.b64decode(line[6:])
+                cells = int.from_bytes(block[12:16], "little")
+                place = np.frombuffer(block, "<u2", cells, 32 + 4 * cells)
+                vehicles = np.frombuffer(block, "u1", cells, 32 + 11 * cells)
+                for number in vehicles[place >> 2 == local].tolist():
+                    own[number] = time.time()
+
+    tasks = [asyncio.create_task(watch(own)) for own in heard]
+    while json.loads(await asyncio.to_thread(_get, f"{on.address}health"))["watchers"] < count:
+        await asyncio.sleep(0.2)
+    put = {}
+    for number in range(1, WATCHED_PUSHES + 1):
+        payload = await asyncio.to_thread(on.town.change, on.town.marker, 250, number)
+        put[number] = time.time()
+        on.session.put(keys.map_key(on.town.marker), payload)
+        await asyncio.sleep(0.5)
+    await asyncio.sleep(3.0)
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    late = [own.get(number, math.inf) - begun for own in heard for number, begun in put.items()]
+    return float(np.quantile(late, 0.95, method="higher"))
+
+
+def _get(address: str) -> bytes:
+    with urllib.request.urlopen(address, timeout=30) as answer:
+        found: bytes = answer.read()
+        return found
+
+
+def watchers(on: Stage) -> float:
+    """How many watch with 95 % of the pushes within a second, the page on one core; 0: fewer than the least tried."""
+    pinned(on.process, 0)
+    for count in WATCHERS:
+        late = asyncio.run(_watched(on, count))
+        print(f"  {count} watchers: p95 {late:.3f} s", file=sys.stderr)
+        until(lambda: json.loads(_get(f"{on.address}health"))["watchers"] == 0, 60.0)
+        if late <= 1.0:
+            return float(count)
+    return 0.0
+
+
+def accessible(on: Stage) -> float:
+    """Serious findings of axe-core in all panels; NaN where it is not there."""
+    with opened(seen_town(on.address, on.town)) as seen:
+        seen.page.evaluate(
+            "([tile, local]) => gripmap.choose(tile, local)", [on.town.marker, on.town.local(on.town.marker)]
+        )
+        found = scan.findings(seen)
+    for line in found or ():
+        print(f"  {line}", file=sys.stderr)
+    return math.nan if found is None else float(len(found))
+
+
+def colour_distance() -> float:
+    """The least between any two classes and the ground, of all kinds of sight (CIEDE2000)."""
+    pairs = [(a, b) for k, a in enumerate(ALL) for b in ALL[:k]]
+    return min(difference(lab(a, sight), lab(b, sight)) for sight in SIGHTS for a, b in pairs)
+
+
+def measured() -> list[Figure]:
+    """All figures, in the order of their table."""
+    with stage(SEED) as on:
+        found = drawn(on)
+        found["push_p95_ms"] = pushed_ms(on)
+        found["bytes_per_cell"] = bytes_per_cell(on)
+        found["axe_serious"] = accessible(on)
+        found["watchers"] = watchers(on)
+    found["colour_distance"] = colour_distance()
+    rows: list[tuple[str, str, float | None, Any]] = [
+        ("first_picture_s", f"s, {CELLS} cells, the middle of {ROUNDS}", 0.5, "less"),
+        ("maplibre_first_picture_s", "s", None, "less"), ("frames_hz", "frames/s", None, "more"),
+        ("maplibre_frames_hz", "frames/s", None, "more"), ("fps", "times MapLibre + GeoJSON", 5.0, "more"),
+        ("push_p95_ms", f"ms, put to drawn, {CHANGED_HZ} changed cells/s", 500.0, "less"),
+        ("bytes_per_cell", "bytes", 16.0, "less"), ("watchers", "with p95 of a push within 1 s, one core", 200, "more"),
+        ("foreign_requests", "requests", 0, "less"), ("console_errors", "errors", 0, "less"),
+        ("axe_serious", "findings", 0, "less"), ("colour_distance", "CIEDE2000, the least", 10.0, "more"),
+    ]  # fmt: skip
+    own = [Figure(f"page.{name}", found[name], unit, bar, better) for name, unit, bar, better in rows]
+    return own + outside()
+
+
+def main() -> int:
+    """Measure and write; 1 where a bar does not hold."""
+    began = time.time_ns()
+    rows = measured()
+    OUT.mkdir(exist_ok=True)
+    figures.write(OUT / "figures.json", "page", [SEED], rows)
+    print(figures.markdown(rows))
+    print(f"{(time.time_ns() - began) / NS:.0f} s", file=sys.stderr)
+    return 0 if all(row.holds for row in rows) else 1
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except subprocess.CalledProcessError as error:
+        sys.exit(str(error))

@@ -1,0 +1,237 @@
+"""What leaves the house for others' systems, measured: DATEX II, OGC API Features, links of a road network."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import urllib.request
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pyarrow as pa
+
+from deploy.router import open_router
+from fleet_service.client import map_client
+from fleet_service.client.datex import Supplier, publication
+from fleet_service.client.datex_feed import DatexFile
+from fleet_service.client.stretches import Stretches
+from fleet_service.client.watching import standing_alerts
+from fleet_service.page.server import PageSettings, run
+from schemas import grid
+from schemas.config import ZenohSettings
+from schemas.runtime import figures
+from schemas.runtime.figures import Figure
+from schemas.runtime.zenoh_session import open_session
+from schemas.thresholds import NS
+from schemas.wire import Alert
+from tests.benchmarks import roads
+from tests.fleet_service.conftest import running
+from tests.fleet_service.page import street
+from tests.house import ROOT
+from tests.waiting import until
+
+SCHEMA: Final = ROOT.parent / "shared" / "datex" / "DATEXII_3_D2Payload.xsd"
+OURS: Final = Supplier("se", "GripMap bench")
+STEPS, SEED, LEAST_ENDED = 40, 20_319, 20
+PATIENCE_S: Final = 120.0
+_SPACES: Final = {
+    "sit": "http://datex2.eu/schema/3/situation", "loc": "http://datex2.eu/schema/3/locationReferencing",
+    "com": "http://datex2.eu/schema/3/common",
+}  # fmt: skip
+READERS: Final = {
+    "GDAL": "import pyogrio; found = pyogrio.read_dataframe('OAPIF:{address}', layer='grip')",
+    "geopandas": "import geopandas; found = geopandas.read_file('{address}collections/grip/items?limit=10000')",
+}
+_COUNT: Final = "; print(len(found), int((found.basis == 'bound').sum()), int(found.mu.notna().sum()))"
+
+
+def records(document: bytes) -> list[ET.Element]:
+    """The records of a publication."""
+    return list(ET.fromstring(document).iterfind(".//sit:situationRecord", _SPACES))
+
+
+def is_over(record: ET.Element) -> bool:
+    """Whether a record has an end."""
+    return record.find(".//com:overallEndTime", _SPACES) is not None
+
+
+def is_valid() -> Callable[[bytes], bool] | None:
+    """What tells whether a publication is valid; None where the schema is not there."""
+    if not SCHEMA.exists():
+        print(f"  the schema of DATEX II is not at {SCHEMA}", file=sys.stderr)
+        return None
+    import xmlschema
+
+    schema = xmlschema.XMLSchema11(SCHEMA)
+    return lambda document: bool(schema.is_valid(document.decode()))
+
+
+def made_up(valid: Callable[[bytes], bool] | None) -> tuple[float, float]:
+    """Publications that are not valid, and situations whose alert was over and that were not ended, of STEPS steps.
+
+    Alerts of cells on a road come and go at random. NaN where the schema is not there, or hardly anything ended.
+    """
+    rng, stretches = np.random.default_rng(SEED), Stretches()
+    before: bytes | None = None
+    invalid = unended = 0
+    ended = set[str]()
+    standing = dict[tuple[int, int], bool]()
+    for step in range(STEPS):
+        now = (1_800_000_000 + 30 * step) * NS
+        for x, sector in zip(rng.integers(0, 60, 8).tolist(), (2 * rng.integers(0, 2, 8)).tolist(), strict=True):
+            raised = bool(rng.random() < 0.4)
+            if raised == standing.get((x, sector), False):
+                continue
+            standing[x, sector] = raised
+            cell = int(grid.interleave(np.array([street.MIDDLE[0] + 5 * x]), np.array([street.MIDDLE[1]]))[0])
+            latitude, longitude = (float(v) for v in grid.centre(cell))
+            mu = float(rng.uniform(0.1, 0.3))
+            stretches.take(Alert(cell, sector, raised, now, mu, mu / 2, mu + 0.1, 0.95, 3, latitude, longitude, "made"))
+        stretches.changes()
+        before = publication(OURS, stretches.standing, now, before)
+        told = records(before)
+        ended |= {f"{one.get('id')}" for one in told if is_over(one)}
+        unended += abs(sum(not is_over(one) for one in told) - len(stretches.standing))
+        invalid += valid is not None and not valid(before)
+    enough = len(ended) >= LEAST_ENDED
+    return (float(invalid) if valid and enough else math.nan), (float(unended) if enough else math.nan)
+
+
+def driven() -> dict[str, float]:
+    """A service, the page and six cars on ice that melts: what the page's publication and its features say.
+
+    `leaked`: cells of situations that the map does not call measured; `unended`: situations that a pull finds open when
+    their alert is over; `readers_failed`: of GDAL, geopandas and, where it is there, ogrinfo.
+    """
+    street.PARTS["melted"] = street.PARTS["ice"]._replace(mu=0.85)
+    router, endpoints = open_router(listen="tcp/127.0.0.1:0")
+    settings = ZenohSettings(connect=endpoints)
+    with tempfile.TemporaryDirectory() as folder, router, running(settings, Path(folder) / "archive"):
+        file = DatexFile(OURS, Path(folder) / "situations.xml", lambda _: None)
+        stop, lines = threading.Event(), list[str]()
+        page = threading.Thread(target=run, args=(PageSettings(settings, port=0, datex=file), stop, lines.append))
+        page.start()
+        session = open_session(settings)
+        assert session is not None
+        try:
+            with session:
+                until(lambda: lines)
+                address = lines[0].removeprefix("page: ")
+                seq = street.put(session, ("ice", "passed", "wet"), time.time_ns())
+                until(lambda: records(pulled(address)), PATIENCE_S)
+                until(lambda: count(address) == street.known("ice", "passed", "wet"), PATIENCE_S)
+                table = map_client.served_table(map_client.ask(settings, {}))
+                leaked = len(cells_of(pulled(address)) - measured_cells(table))
+                failed = sum(not opens(reader, address) for reader in READERS)
+                failed += shutil.which("ogrinfo") is not None and not ogrinfo_opens(address)
+                for _ in range(12):
+                    if not standing_alerts(session):
+                        break
+                    time.sleep(1.0)
+                    seq = street.put(session, ("melted",), time.time_ns(), seq)
+                until(lambda: not standing_alerts(session), PATIENCE_S)
+                time.sleep(1.0)  # a pull
+                unended = sum(not is_over(one) for one in records(pulled(address)))
+        finally:
+            stop.set()
+            page.join(10.0)
+    return {"leaked": float(leaked), "unended": float(unended), "readers_failed": float(failed)}
+
+
+def pulled(address: str) -> bytes:
+    """The publication; an empty one while there is none."""
+    try:
+        with urllib.request.urlopen(f"{address}datex2/situation.xml", timeout=30) as answer:
+            found: bytes = answer.read()
+            return found
+    except OSError:
+        return b"<none/>"
+
+
+def count(address: str) -> int:
+    """Features that there are."""
+    try:
+        with urllib.request.urlopen(f"{address}collections/grip/items", timeout=30) as answer:
+            return int(json.loads(answer.read())["numberReturned"])
+    except OSError:
+        return 0
+
+
+def cells_of(document: bytes) -> set[int]:
+    """Cells on which situations lie."""
+    found = set[int]()
+    for record in records(document):
+        words = record.findtext(".//loc:posList", "", _SPACES).split()
+        point = record.find(".//loc:pointCoordinates", _SPACES)
+        if point is not None:
+            words = [child.text or "nan" for child in point]
+        numbers = np.array(words, float).reshape(-1, 2)
+        found |= {int(cell) for cell in np.atleast_1d(grid.cell_of(numbers[:, 0], numbers[:, 1]))}
+    return found
+
+
+def measured_cells(table: pa.Table) -> set[int]:
+    """Cells of which the map has a value."""
+    is_measured = np.array(table["basis"].to_pylist()) == "measured"
+    return set(table["cell"].to_numpy()[is_measured].tolist())
+
+
+def opens(reader: str, address: str) -> bool:
+    """Whether a reader has all features, the bounds among them without a value."""
+    script = READERS[reader].format(address=address) + _COUNT
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False)
+    whole, bounds = street.known("ice", "passed", "wet"), street.known("passed")
+    held = done.stdout.split() == [str(whole), str(bounds), str(whole - bounds)]
+    if not held:
+        print(f"  {reader}: {done.stdout} {done.stderr[-500:]}", file=sys.stderr)
+    return held
+
+
+def ogrinfo_opens(address: str) -> bool:
+    """Whether GDAL's program lists all features."""
+    words = ["ogrinfo", "-ro", "-al", "-q", f"OAPIF:{address}", "grip"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
+    held = done.stdout.count("OGRFeature(grip)") == street.known("ice", "passed", "wet")
+    if not held:
+        print(f"  ogrinfo: {done.stdout[:300]} {done.stderr[-500:]}", file=sys.stderr)
+    return held
+
+
+def join_right() -> float:
+    """`roads.join_right` of this commit: measured by `make roads-bench` before, or now."""
+    path = roads.FOLDER / "figures.json"
+    rows = json.loads(path.read_text()) if path.exists() else [{}]
+    if rows[0].get("commit") != figures.commit(Path(roads.__file__)):
+        try:
+            roads.main()
+        except (OSError, subprocess.CalledProcessError) as error:
+            print(f"  the roads were not measured: {error}", file=sys.stderr)
+            return math.nan
+        rows = json.loads(path.read_text())
+    return next(float(row["value"]) for row in rows if row.get("name") == "roads.join_right")
+
+
+def outside() -> list[Figure]:
+    """All figures of what leaves the house."""
+    invalid, unended = made_up(is_valid())
+    try:
+        found = driven()
+    except TimeoutError as error:
+        print(f"  no figures of the drive: {error}", file=sys.stderr)
+        found = dict.fromkeys(("leaked", "unended", "readers_failed"), math.nan)
+    return [
+        Figure("datex.invalid", invalid, f"of {STEPS} publications", 0),
+        Figure("datex.bound_leaked", found["leaked"], "cells of situations that are not measured", 0),
+        Figure("datex.unended", unended + found["unended"], "situations without an end, alert over", 0),
+        Figure("roads.join_right", join_right(), f"of fixes, {roads.NOISE_M:g} m noise, the worst seed", 0.95, "more"),
+        Figure("oapif.readers_failed", found["readers_failed"], "of GDAL, geopandas (and ogrinfo)", 0),
+    ]
