@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, field_validator
 
 from schemas.errors import InputError
 from schemas.thresholds import NS, SLIPPERY_MU
@@ -77,6 +77,27 @@ class AgentConfig(MonitoringSettings):
         return Path(str(self.spool).replace("{name}", name))
 
 
+class ArchiveSettings(Settings):
+    """Where the archive is."""
+
+    path: Path | None = Field(default=None, description="folder, one service per archive; `--archive` goes before it")
+    second: str | None = Field(
+        default=None,
+        alias="copy",
+        description="bucket that holds all of it too, e.g. s3://bucket/folder; what is not there is not acknowledged",
+    )
+    store: dict[str, SecretStr] = Field(
+        default_factory=dict,
+        description="how obstore reaches the bucket: endpoint, region, access_key_id, secret_access_key …; what is not "
+        "here comes from the environment (AWS_…)",
+    )
+
+    @property
+    def options(self) -> dict[str, str]:
+        """`store` as it is, with its secrets."""
+        return {name: value.get_secret_value() for name, value in self.store.items()}
+
+
 class ServiceConfig(MonitoringSettings):
     """Settings of a fleet service."""
 
@@ -87,6 +108,9 @@ class ServiceConfig(MonitoringSettings):
         min_length=1,
         max_length=8,
         description="region key expressions of this service's share (quadkey chunks of 4, 3, 3 digits)",
+    )
+    archive: ArchiveSettings = Field(
+        default=ArchiveSettings(), description="a folder, or where the archive and its copy are"
     )
     segment_s: Positive = Field(default=0.5, le=1.0, description="longest time an admitted row waits for its segment")
     put_s: Positive = Field(default=1.0, description="shortest time between two puts of one tile")
@@ -127,6 +151,11 @@ class ServiceConfig(MonitoringSettings):
     fleet: Path | None = Field(
         default=None, description="enrolment file; reports of vehicles that are not on it are not looked at"
     )
+
+    @field_validator("archive", mode="before")
+    @classmethod
+    def _folder(cls, given: object) -> object:
+        return {"path": given} if isinstance(given, str | Path) else given
 
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -176,7 +205,8 @@ def explain(error: ValidationError, where: str) -> InputError:
     """The first complaint of pydantic as an error that names the field and the fix."""
     first = error.errors(include_url=False)[0]
     field = ".".join(str(part) for part in first["loc"]) or "content"
-    given = json.dumps(first["input"], default=str)
+    secret = "store" in first["loc"]
+    given = "…" if secret else json.dumps(first["input"], default=str)
     shown = given if len(given) <= 60 else given[:57] + "..."
     problem = (
         "is missing" if first["type"] == "missing" else f"{first['msg'][0].lower()}{first['msg'][1:]} (got {shown})"

@@ -24,6 +24,8 @@ from fleet_service.app.clock import TimeNow
 from fleet_service.app.memory import SLOTS, Memory, remember, visited
 from fleet_service.app.past import PastQuery, ask
 from fleet_service.app.precompile import warm_up
+from fleet_service.archive.bucket import CopyError
+from fleet_service.archive.copies import copy_for
 from fleet_service.archive.files import lock
 from fleet_service.archive.layout import Cut
 from fleet_service.archive.load import count_set_aside, set_aside
@@ -58,6 +60,7 @@ from schemas.wire import Alert, Kind
 
 # Rows that wait for the disk at the most; beyond, nothing is taken from the queue until a segment is written.
 WAITING_ROWS = 1_000_000
+WAITING_BATCHES = 1_000_000  # likewise, of rows that are on disk and not yet in the copy: 100 MB
 CHECKPOINT_WAIT_S = 0.2  # between two looks whether the service stops
 T = TypeVar("T")
 CHECKPOINT_MOST_S = 10.0  # for a good segment; a full disk gives none, and other jobs make room
@@ -92,10 +95,11 @@ class Engine:
         self._tracks, self._places = Tracks(), Bucket(NEW_CELLS_AT_ONCE, NEW_CELLS_PER_HOUR)
         self._turn = 0  # of the alerts that are told again
         self.failing = False  # the last segment could not be written
+        self.copy = copy_for(config, root)  # before anything is read: an empty disk is filled from it
         self.counts["witnesses_damaged"] += mend(root / "keys")
         self._guard = threading.Lock()
         self._acks, self._now = Acks(), 0
-        self._log: SegmentLog[BatchId] = SegmentLog(root, config.name)
+        self._log: SegmentLog[BatchId] = SegmentLog(root, config.name, self.copy)
         self._wanted: queue.SimpleQueue[tuple[Future[Any], Callable[[], object]]] = queue.SimpleQueue()
         self._ended: list[Alert] = []  # alerts that nobody was told the end of yet
         memory = remember(root, config, set_aside)
@@ -182,12 +186,14 @@ class Engine:
         """Give the archive free."""
         self.survived()
         self._log.close()
+        if self.copy is not None:
+            self.copy.close()
         self._lock_file.close()
 
     @property
     def full(self) -> bool:
-        """Whether too many rows wait for the disk."""
-        return self._log.rows >= WAITING_ROWS
+        """Whether too many rows wait for the disk, or batches for the copy."""
+        return self._log.rows >= WAITING_ROWS or self._log.unsettled >= WAITING_BATCHES
 
     @property
     def unsettled(self) -> int:
@@ -334,8 +340,11 @@ class Engine:
         try:
             self._intake.sync()
             self._intake.settled(durable())
-        except OSError:
-            self.counts["segment_failures"] += 1
+        except OSError as error:
+            if isinstance(error, CopyError) and self.copy is not None:
+                self.counts["copy_failures"] = self.copy.failures
+            else:
+                self.counts["segment_failures"] += 1
             self.failing = True
         else:
             self.failing = False

@@ -23,6 +23,7 @@ from fleet_service.app import beside
 from fleet_service.app.engine import Engine
 from fleet_service.app.memory import remember
 from fleet_service.archive import requests
+from fleet_service.archive.copies import Copy
 from fleet_service.archive.layout import Cut
 from fleet_service.archive.requests import Erasure
 from fleet_service.archive.retention import destroy_key, erased, forget_witness, key_of
@@ -43,9 +44,20 @@ def asked(engine: Engine, config: ServiceConfig, root: Path, stop: threading.Eve
             continue
         if told is None:  # the service stops; the next one does it
             break
+        if engine.copy is not None:
+            told["copy"] = _followed(engine.copy)
         requests.settle(question, told)
         rows, answered = rows + told["rows"], answered + 1
     return f"erased: {answered} requests, {rows} rows" if answered else None
+
+
+def _followed(copy: Copy) -> str | None:
+    """Let what was erased go from the copy too; what keeps it, and then the upkeep does it later."""
+    try:
+        copy.follow()
+    except OSError as error:
+        return str(error)
+    return None
 
 
 def _erase(

@@ -30,6 +30,7 @@ from schemas.wire import Kind
 log = logging.getLogger(__name__)
 ROUND_ROWS: Final = 250_000  # of one round of compaction: a second of work, 150 MB
 INVENTORY_S: Final = 300.0  # thousands of files are looked through in a tenth of a second
+FOLLOW_S: Final = 30.0  # after which the archive's copy has what compaction, checkpoints and snapshots made
 DAY_S: Final = 86_400.0
 ASKED_S: Final = 2.0  # between two looks whether an erasure is asked for
 SOON_S: Final = 60.0  # after the start; the first turn of a job does not wait for its whole interval
@@ -100,6 +101,11 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
 
         return done
 
+    def following(_: threading.Event) -> str | None:
+        if engine.copy is not None:
+            engine.copy.follow()
+        return None
+
     return [
         Job("compaction", config.compact_s, with_room(compaction)),
         Job("checkpoint", config.checkpoint_s, checkpoint),
@@ -107,6 +113,7 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
         Job("retention", DAY_S if config.raw_days else 0.0, with_room(retention)),
         Job("inventory", INVENTORY_S, inventory),
         Job("old_cells", DAY_S, old_cells),
+        Job("following", 0.0 if engine.copy is None else FOLLOW_S, following),
         Job("erasure", ASKED_S, lambda stop: erasing.asked(engine, config, root, stop)),
     ]
 

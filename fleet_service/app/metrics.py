@@ -45,6 +45,7 @@ class Pulse(NamedTuple):
 def metrics(engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path) -> list[Metric]:
     """All values, now."""
     counts = dict(engine.counts)
+    away_s = 0.0 if engine.copy is None else engine.copy.away_s
     found = [Metric(name, "counter", text, _below(counts, prefix), label) for prefix, name, label, text in _FAMILIES]
     found += [Metric(name, "counter", text, {"": counts.get(name, 0)}) for name, text in _SINGLE.items()]
     kinds = {"observation": counts.get(Kind.OBSERVATION, 0), "state": counts.get(Kind.STATE, 0)}
@@ -62,6 +63,7 @@ def metrics(engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path) -> 
         gauge("clock_lag_seconds", "by which the system's clock is behind", pulse.clock_lag_s),
         gauge("report_lag_seconds", "between the end of the newest visit and its arrival", engine.report_lag_s),
         gauge("unsettled_batches", "batches that are admitted and not on disk yet", engine.unsettled),
+        gauge("copy_away_seconds", "for which the archive's copy takes no segments", away_s),
         gauge("cells", "cells and sectors with a belief", engine.fusion.size),
         gauge("window_observations", "observations younger than the checkpoint", engine.fusion.waiting),
         gauge("alerts", "cells under an alert", engine.alerts),
@@ -78,7 +80,9 @@ def troubles(engine: Engine, pulse: Pulse, config: ServiceConfig) -> list[str]:
         found.append(f"a segment is being written for {engine.hangs_s:.0f} s")
     if abs(pulse.clock_lag_s) > CLOCK_S:
         found.append(f"the system's clock is {abs(pulse.clock_lag_s):.0f} s off by what is known")
-    if engine.failing:
+    if engine.copy is not None and engine.copy.trouble is not None:
+        found.append(engine.copy.trouble)
+    elif engine.failing:
         found.append("segments cannot be written")
     if pulse.queued > FULL * config.queue_batches:
         found.append("the queue is full")

@@ -13,6 +13,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from fleet_service.archive.copies import Copy
 from fleet_service.archive.layout import Cut
 from fleet_service.archive.segments import Rows, Writer
 from schemas.wire import Kind
@@ -26,6 +27,7 @@ class _Load(Generic[Batch]):
     def __init__(self) -> None:
         self.waiting: dict[Kind, list[Rows]] = {kind: [] for kind in Kind}
         self.batches: list[Batch] = []
+        self.segments: list[Path] = []
 
     @property
     def rows(self) -> int:
@@ -38,13 +40,16 @@ class _Load(Generic[Batch]):
             self.waiting[kind] = self.waiting[kind] + waiting
         self.batches += other.batches
 
-    def write(self, writer: Writer) -> None:
-        """Write each kind that is not written yet, then make all of it durable."""
+    def write(self, writer: Writer, copy: Copy | None) -> None:
+        """Write each kind that is not written yet, then make all of it durable, in the second place too."""
         for kind, waiting in self.waiting.items():
             if waiting:
-                writer.write(kind, {name: np.concatenate([part[name] for part in waiting]) for name in waiting[0]})
+                rows = {name: np.concatenate([part[name] for part in waiting]) for name in waiting[0]}
+                self.segments.append(writer.write(kind, rows))
                 self.waiting[kind] = []
         writer.sync()
+        if copy is not None:
+            copy.settle(self.segments)
 
 
 class SegmentLog(Generic[Batch]):
@@ -53,10 +58,11 @@ class SegmentLog(Generic[Batch]):
     Args:
         root: of the archive.
         shard: name of the service.
+        copy: of the archive; with one, durable is what is in both places.
     """
 
-    def __init__(self, root: Path, shard: str) -> None:
-        self._writer = Writer(root, shard)
+    def __init__(self, root: Path, shard: str, copy: Copy | None = None) -> None:
+        self._writer, self._copy = Writer(root, shard), copy
         self._next: _Load[Batch] = _Load()
         self._load: _Load[Batch] = _Load()  # what was handed over
         self._written: Future[None] | None = None
@@ -99,13 +105,13 @@ class SegmentLog(Generic[Batch]):
             self._load.take(self._next)
             self._next = _Load()
             self._begun = time.monotonic()
-            self._written = self._thread.submit(self._load.write, self._writer)
+            self._written = self._thread.submit(self._load.write, self._writer, self._copy)
 
     def end(self) -> list[Batch]:
         """Wait for the write that was begun; returns the batches that are durable by it, each once.
 
         Raises:
-            OSError: the disk is full or broken; what is not durable waits for the next write.
+            OSError: the disk is full or broken, or the copy is not reached; what is not durable waits for the next.
         """
         if self._written is None:
             return []

@@ -106,6 +106,7 @@ class Forgotten(NamedTuple):
 
     rows: int
     files: tuple[Path, ...]
+    kept: str | None = None  # why the archive's copy holds it still
 
 
 def forget_vehicle(root: Path, vehicle: str, month: str) -> Forgotten:

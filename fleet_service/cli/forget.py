@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from fleet_service.cli.common import ArchiveReport, add_archive, add_dry_run, confirmed, on_archive
+from schemas.errors import InputError
 
 if TYPE_CHECKING:
     from fleet_service.archive.requests import Erasure
@@ -22,6 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_archive(parser)
     parser.add_argument("--period", metavar="MONTH", required=True, help="e.g. 2026-01")
     parser.add_argument("--vehicle", metavar="NAME", help="only this vehicle; its rows are removed")
+    parser.add_argument("--config", metavar="FILE", help="the service's: how the archive's copy is reached")
     parser.add_argument("--put-to", metavar="URI", help="the mirror, where what was rewritten is put again")
     add_dry_run(parser)
 
@@ -44,22 +48,24 @@ def _forget(arguments: argparse.Namespace) -> ArchiveReport:
         return ArchiveReport(f"would be done: {what}", {"rows": 0, "key": False})
     if not confirmed(arguments, what):
         return ArchiveReport("nothing forgotten", {"rows": 0, "key": False})
-    done = _erased(root, Erasure(month, vehicle))
+    done = _erased(root, Erasure(month, vehicle), arguments.config)
+    still = "" if done.kept is None else f"; the copy holds it still, and the service tries again ({done.kept})"
     if vehicle is None:
-        return ArchiveReport(what, {"rows": 0, "key": True})
-    line = f"{done.rows} rows removed" if done.rows else f"no rows of {vehicle} in {month}: nothing removed"
-    report: dict[str, object] = {"rows": done.rows, "key": False, "files": len(done.files)}
+        return ArchiveReport(what + still, {"rows": 0, "key": True, "copy": done.kept})
+    removed = f"{done.rows} rows removed" if done.rows else f"no rows of {vehicle} in {month}: nothing removed"
+    line = removed + still
+    report: dict[str, object] = {"rows": done.rows, "key": False, "files": len(done.files), "copy": done.kept}
     if arguments.put_to is not None:
         report["put"] = mirror.put(root, arguments.put_to, done.files)
         line += f", {report['put']} files put to {arguments.put_to}"
     return ArchiveReport(line, report)
 
 
-def _erased(root: Path, wanted: Erasure) -> Forgotten:
-    """Erase, or let the service that holds the archive do it.
+def _erased(root: Path, wanted: Erasure, config: str | None) -> Forgotten:
+    """Erase, in the archive's copy too, or let the service that holds the archive do it.
 
     Raises:
-        InputError: there is no such month, or a file is damaged.
+        InputError: there is no such month, a file is damaged, or the copy is not reached.
         OSError: a file cannot be read or written.
     """
     from fleet_service.archive import requests
@@ -70,14 +76,44 @@ def _erased(root: Path, wanted: Erasure) -> Forgotten:
     looked = time.monotonic()
     while question is not None:  # a service that ends meanwhile leaves it to us
         if (told := requests.answer_to(question)) is not None:
-            return Forgotten(told["rows"], tuple(root / path for path in told["files"]))
+            return Forgotten(told["rows"], tuple(root / path for path in told["files"]), told.get("copy"))
         time.sleep(ASK_S)
         if time.monotonic() - looked > LOOK_S:
             looked = time.monotonic()
             if not held(root):
                 question.unlink(missing_ok=True)
                 question = None
-    if wanted.vehicle is None:
-        forget_period(root, wanted.month)
-        return Forgotten(0, ())
-    return forget_vehicle(root, wanted.vehicle, wanted.month)
+    with _copied(root, config):
+        if wanted.vehicle is None:
+            forget_period(root, wanted.month)
+            return Forgotten(0, ())
+        return forget_vehicle(root, wanted.vehicle, wanted.month)
+
+
+@contextmanager
+def _copied(root: Path, path: str | None) -> Iterator[None]:
+    """Let the archive's copy follow, if it has one.
+
+    Raises:
+        InputError: it is not known how to reach it, and nothing was done; or it was not reached.
+    """
+    from fleet_service.archive.copied import copy_of
+    from fleet_service.archive.copies import Copy
+    from schemas.config import ServiceConfig, load
+
+    config = load(path, ServiceConfig)
+    url = config.archive.second or copy_of(root)
+    if url is None:
+        yield
+        return
+    if config.archive.second is None:
+        fix = "give --config with the service's configuration"
+        raise InputError("config", f"the archive has a copy at {url}, where it is to be forgotten too", fix)
+    with closing(Copy(root, url, config.archive.options)) as copy:
+        copy.begin(config.name)  # what only the copy has comes first, or it would be found there later
+        yield
+        try:
+            copy.follow()
+        except OSError as error:
+            fix = "start the service, which goes on with it, when the copy is reached"
+            raise InputError("archive.copy", f"it is forgotten here, and not yet at {url} ({error})", fix) from error

@@ -27,7 +27,7 @@ LEAVE_AT_LAST_S = 2.7  # after a signal; the process is to have ended within 3 s
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--config", metavar="FILE", help="JSON; every setting has a default")
-    parser.add_argument("--archive", metavar="DIR", type=Path, required=True, help="one service per archive")
+    parser.add_argument("--archive", metavar="DIR", type=Path, help="one service per archive; else the configuration's")
     parser.add_argument("--weather", metavar="FILE", type=Path, help="Parquet of road weather to begin with")
 
 
@@ -40,11 +40,14 @@ def run(arguments: argparse.Namespace) -> int:
     os.umask(os.umask(0o077) | PRIVATE)
     config = load(arguments.config, ServiceConfig)
     log_as(config.log, sys.stderr, service=config.name)
+    root = arguments.archive or config.archive.path
+    if root is None:
+        raise InputError("archive", "is missing", "give --archive DIR, or archive.path in the configuration")
     if arguments.weather is not None:
         config = config.model_copy(update={"weather": arguments.weather})
     try:
         log_line = line_logger(config.log, sys.stdout, service=config.name)
-        service = Service(config, arguments.archive, log_line)
+        service = Service(config, root, log_line)
     except OSError as error:
         problem = f"cannot use {error.filename} ({error.strerror})"
         raise InputError("archive", problem, "give a folder you may read and write") from error

@@ -14,6 +14,7 @@ from pathlib import Path
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
 from tests.benchmarks.agent import agent
+from tests.benchmarks.cluster import cluster
 from tests.benchmarks.contract import contract
 from tests.benchmarks.estimators import estimators
 from tests.benchmarks.fusion import fusion
@@ -28,7 +29,7 @@ from tests.benchmarks.step import bank, step
 FOLDER = Path(".bench")
 PARTS: dict[str, Callable[[], list[Figure]]] = {
     part.__name__: part
-    for part in (step, bank, estimators, agent, contract, fusion, ingest, growth, service, shards, state)
+    for part in (step, bank, estimators, agent, contract, fusion, ingest, growth, service, shards, state, cluster)
 }
 
 

@@ -87,7 +87,7 @@ CHANGES: Final[dict[str, dict[str, str | tuple[list[str], list[str]]]]] = {
 }  # fmt: skip
 SHOWN_BELOW: Final = {
     "retention": {"--yes"},
-    "forget": {"--yes", "--put-to"},  # of terminals: test_commands.py; of mirrors: archive/test_retention.py
+    "forget": {"--yes", "--put-to", "--config"},  # test_commands.py; archive/test_retention.py; app/test_copy.py
     "completion": {"shell"},
     "certs": {"--renew-days", "--revoke", "--dry-run"},  # enrolment/test_certificates.py
     "run": {"--config", "--archive", "--weather"},

@@ -74,7 +74,7 @@ def test_one_vehicle_is_forgotten_and_the_others_are_not_touched(tmp_path: Path)
     rolled = [pq.read_table(p, partitioning=None) for p in (tmp_path / rollup.TABLE).rglob("*.parquet")]
     assert sum(table["observations"].to_numpy().sum() for table in rolled) == 144
     assert compact(tmp_path) == (0, 0, 0)
-    assert retention.forget_vehicle(tmp_path, "sim-003", MONTH) == (0, ())
+    assert retention.forget_vehicle(tmp_path, "sim-003", MONTH) == (0, (), None)
 
 
 def test_what_could_tell_of_a_forgotten_vehicle_goes_too_here_and_in_the_mirror(tmp_path: Path) -> None:

@@ -1,0 +1,274 @@
+"""The second place of an archive: a bucket that holds what the folder holds, under the same names.
+
+What an acknowledgement rests on (segments, keys, who the vehicles are) is put before it (`settle`). All else follows
+(`follow`): puts first, then deletes, so that at any instant the copy holds every row at least once, as the folder does.
+A start (`begin`) gets what only the bucket has, on an empty disk all, and puts what only the folder has.
+Only what the journal knows to have been here is deleted there.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from threading import Lock
+from typing import Final
+
+from fleet_service.archive.bucket import CopyError, ObjectBucket
+from fleet_service.archive.copied import Copied, Stamp, stamp_of
+from fleet_service.archive.files import sync_tree
+from fleet_service.archive.layout import CHECKPOINTS
+from fleet_service.archive.load import BAD
+from schemas.config import ServiceConfig
+from schemas.errors import InputError
+from schemas.runtime.durable import written
+
+LOG: Final = "inbox/"
+KEYS: Final = "keys/"
+# In this order they are looked through: compaction adds to the later ones before it takes from the log, and retention
+# rolls up before it takes from the observations, so that what has gone from one is found in the next.
+FOLDERS: Final = ("inbox", "observations", "states", "rollup", "map", "weather", CHECKPOINTS, "keys")
+OWNER: Final = "service.json"
+_LAST: Final = "manifest.json"  # of a checkpoint: without it the folder is none
+_PRIVATE: Final = ("tried",)  # notes of this disk
+QUICK_S: Final = 5.0  # of one request that an acknowledgement waits for; the service's worker may wait as long
+SLOW_S: Final = 300.0  # of one that nobody waits for: a compacted file has tens of megabytes
+TURN_S: Final = 20.0  # of `settle`, which then says that it has come so far
+BACK_OFF_S: Final = 0.5  # after the first failure; doubles
+MOST_BACK_OFF_S: Final = 8.0
+_AT_ONCE: Final = 8  # requests
+
+
+class Copy:
+    """The copy of one archive; `settle` from one thread, `follow` from another.
+
+    Args:
+        root: of the archive.
+        url: of the copy.
+        options: of the store, see `ObjectBucket`.
+
+    Raises:
+        InputError: the URL or an option is not usable, or obstore is not installed.
+        OSError: the journal cannot be read or written.
+
+    Attributes:
+        failures: requests of `settle` that failed.
+    """
+
+    def __init__(self, root: Path, url: str, options: Mapping[str, str]) -> None:
+        self._root, self._url = root, url
+        self._quick, self._slow = ObjectBucket(url, options, QUICK_S), ObjectBucket(url, options, SLOW_S)
+        self._copied = Copied(root, url)
+        self._following = Lock()
+        self._pool = ThreadPoolExecutor(_AT_ONCE, "copy")
+        self.failures, self._in_a_row, self._not_before, self._error = 0, 0, 0.0, ""
+        self._since: float | None = None
+
+    def close(self) -> None:
+        """Leave the copy as it is."""
+        self._pool.shutdown(cancel_futures=True)
+        self._copied.close()
+
+    @property
+    def away_s(self) -> float:
+        """For how long it has not taken what is to be acknowledged [s]; 0: it does."""
+        since = self._since
+        return 0.0 if since is None else time.monotonic() - since
+
+    @property
+    def trouble(self) -> str | None:
+        """What an operator is to know; None while all goes well."""
+        if self._since is None:
+            return None
+        waits = f"nothing is acknowledged for {self.away_s:.0f} s"
+        return f"the copy at {self._url} does not take segments, {waits}: {self._error}"
+
+    def begin(self, service: str) -> int:
+        """Make folder and bucket the same: get what only the bucket has, put what only the folder has; returns how
+        many files were got. Nothing may run on the archive.
+
+        Raises:
+            InputError: the bucket cannot be reached, or is another service's.
+            OSError: the folder cannot be read or written.
+        """
+        try:
+            self._claim(service)
+            got = self._fetch(self._slow.sizes())
+            self._follow(with_log=True)
+        except CopyError as error:
+            fix = "see that it is reached, and endpoint, region and credentials; start again, nothing is lost"
+            raise InputError("archive.copy", f"{self._url} cannot be used ({error})", fix) from error
+        return got
+
+    def settle(self, segments: Iterable[Path]) -> None:
+        """Put segments that are written, and the keys; all of it is in the bucket when this returns.
+
+        Raises:
+            CopyError: not all of it is; the next call goes on, and puts nothing twice. After a failure nothing is
+                tried for a moment, and for longer after each further one.
+        """
+        if time.monotonic() < self._not_before:
+            raise CopyError(f"is tried again: {self._error}")
+        try:
+            missing = [path for path in segments if self._copied.of(self._name(path)) is None]
+            own = self._files(("keys",))
+            keys = [self._root / name for name, stamp in own.items() if self._copied.of(name) != stamp]
+            self._put_soon([*keys, *missing])
+        except CopyError as error:
+            self.failures += 1
+            self._error, self._since = str(error), self._since or time.monotonic()
+            self._not_before = time.monotonic() + min(BACK_OFF_S * 2.0**self._in_a_row, MOST_BACK_OFF_S)
+            self._in_a_row = min(self._in_a_row + 1, 10)
+            raise
+        self._in_a_row, self._since = 0, None
+
+    def follow(self) -> int:
+        """Put what is new or was rewritten, then delete what is gone; returns how many objects that changed. The log
+        is put by `settle` alone.
+
+        Raises:
+            CopyError: not all of it was done; the next call goes on.
+            OSError: the journal cannot be written.
+        """
+        return self._follow(with_log=False)
+
+    def _put_soon(self, paths: Sequence[Path]) -> None:
+        deadline = time.monotonic() + TURN_S
+        for first in range(0, len(paths), _AT_ONCE):
+            if time.monotonic() > deadline:
+                raise CopyError(f"{len(paths) - first} segments are still to be put")
+            some = paths[first : first + _AT_ONCE]
+            try:
+                if len(some) == 1:
+                    self._put(some[0], self._quick)
+                else:
+                    list(self._pool.map(lambda path: self._put(path, self._quick), some))
+            except FileNotFoundError:  # compacted meanwhile: the rows are in files that follow
+                self._follow(with_log=True)
+                return
+
+    def _follow(self, *, with_log: bool) -> int:
+        if not self._following.acquire(timeout=QUICK_S):
+            raise CopyError("compacted files are being put")
+        try:
+            known = self._copied.all()  # before the files: what comes meanwhile is not taken for gone
+            local = self._files(FOLDERS)
+            new = [
+                name for name, stamp in local.items()
+                if known.get(name) != stamp and (with_log or not name.startswith(LOG))
+            ]  # fmt: skip
+            new.sort(key=lambda name: name.endswith(_LAST))
+            vanished = [name for name in new if not self._put_there(name)]
+            gone = [] if vanished else [name for name in known if name not in local and not self._aside(name).exists()]
+            gone.sort(key=lambda name: not name.endswith(_LAST))
+            for name in gone:
+                self._slow.delete(name)
+                self._copied.remove(name)
+            self._copied.sync()
+            return len(new) - len(vanished) + len(gone)
+        finally:
+            self._following.release()
+
+    def _put_there(self, name: str) -> bool:
+        """Put a file; False if it has gone meanwhile."""
+        try:
+            self._put(self._root / name, self._slow)
+        except FileNotFoundError:
+            return False
+        return True
+
+    def _put(self, path: Path, bucket: ObjectBucket) -> None:
+        name, stamp = self._name(path), stamp_of(path)
+        if self._copied.of(name) is None and (name.startswith(LOG) or name.endswith(".key")):
+            bucket.put_new(name, path.read_bytes())
+        elif name.startswith(KEYS):
+            bucket.put(name, path.read_bytes())  # who the vehicles are grows meanwhile, and is then put again
+        else:
+            bucket.put(name, path)
+        self._copied.add(name, stamp)
+
+    def _claim(self, service: str) -> None:
+        mine = json.dumps({"service": service}).encode()
+        there = self._slow.get(OWNER)
+        if there is None:
+            self._slow.put_new(OWNER, mine)
+        elif there != mine:
+            with suppress(ValueError, KeyError, TypeError):
+                there = str(json.loads(there)["service"]).encode()
+            problem = f"{self._url} is the copy of another service, {there.decode(errors='replace')[:60]}"
+            raise InputError("archive.copy", problem, "give each service a folder of its own in the bucket")
+
+    def _fetch(self, there: Mapping[str, int]) -> int:
+        """Get what the bucket has and the folder has not, and note what of the folder it has not."""
+        local = self._files(FOLDERS)
+        for name in self._copied.all():
+            if name not in there or (name in local and local[name].size != there[name]):
+                self._copied.remove(name)
+        known = self._copied.all()
+        whole = {name.rpartition("/")[0] for name in there if name.endswith(f"/{_LAST}")}
+        wanted = [
+            name for name in there
+            if name not in local and _ours(name)
+            and (name not in known or self._aside(name).exists())
+            and (not name.startswith(CHECKPOINTS) or name.rpartition("/")[0] in whole)
+        ]  # fmt: skip
+        list(self._pool.map(self._get, wanted))
+        paths = [self._root / name for name in wanted]
+        sync_tree(self._root, {path.parent for path in paths})
+        for name, path in zip(wanted, paths, strict=True):  # only now: power loss would else make them look deleted
+            self._copied.add(name, stamp_of(path))
+            self._aside(name).unlink(missing_ok=True)
+        return len(wanted)
+
+    def _get(self, name: str) -> None:
+        path, secret = self._root / name, name.startswith(KEYS)
+        path.parent.mkdir(mode=0o700 if secret else 0o777, parents=True, exist_ok=True)
+        with written(path, 0o600 if secret else None, named=False) as file:
+            for part in self._slow.parts(name):
+                file.write(part)
+
+    def _name(self, path: Path) -> str:
+        return path.relative_to(self._root).as_posix()
+
+    def _aside(self, name: str) -> Path:
+        return self._root / f"{name}{BAD}"
+
+    def _files(self, folders: Iterable[str]) -> dict[str, Stamp]:
+        """Names and stamps of what is to be in the copy, in the order of the folders."""
+        found: dict[str, Stamp] = {}
+        for folder in folders:
+            for path in sorted((self._root / folder).rglob("*")):
+                name = self._name(path)
+                if _ours(name):
+                    with suppress(FileNotFoundError):
+                        if path.is_file():
+                            found[name] = stamp_of(path)
+        return found
+
+
+def _ours(name: str) -> bool:
+    """Whether a name is that of a file which belongs into the copy: no draft, none set aside."""
+    folder, *rest = name.split("/")
+    hidden = any(part.startswith(".") for part in rest)
+    return folder in FOLDERS and bool(rest) and not hidden and not name.endswith(BAD) and rest[-1] not in _PRIVATE
+
+
+def copy_for(config: ServiceConfig, root: Path) -> Copy | None:
+    """The copy that the settings want, which holds then what the folder holds, and the folder what it holds.
+
+    Raises:
+        InputError, OSError: as `Copy` and its `begin`.
+    """
+    wanted = config.archive
+    if wanted.second is None:
+        return None
+    copy = Copy(root, wanted.second, wanted.options)
+    try:
+        copy.begin(config.name)
+    except BaseException:
+        copy.close()
+        raise
+    return copy

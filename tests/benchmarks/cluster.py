@@ -1,0 +1,57 @@
+"""What a second place costs: acknowledgements of a service whose archive has a copy, and of one without, in turn.
+
+The copy is a real S3 server on this machine, a process of its own; a bucket over a network adds its way there.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from deploy.router import open_router
+from schemas import keys
+from schemas.config import ZenohSettings
+from schemas.runtime.figures import Figure
+from schemas.runtime.zenoh_session import open_session
+from tests.benchmarks.service import ack_delays_s, process, until
+from tests.buckets import bucket_server
+
+TURNS = 3  # of each, so that what else the machine does hits both
+BAR = 2.0
+
+
+def delays_s(folder: Path, archive: dict[str, Any]) -> list[float]:
+    """Of a new service with such an archive."""
+    with ExitStack() as stack:
+        router, (endpoint, *_) = open_router(listen="tcp/127.0.0.1:0")
+        stack.enter_context(router)
+        config = folder / "service.json"
+        config.write_text(json.dumps({"zenoh": {"connect": [endpoint]}, "archive": archive}))
+        stack.enter_context(process("-m", "fleet_service.cli", "run", "--config", str(config)))
+        client = open_session(ZenohSettings(connect=[endpoint]))
+        assert client is not None
+        stack.enter_context(client)
+        until(lambda: [reply for reply in client.liveliness().get(keys.shard_key("*")) if reply.ok])
+        return ack_delays_s(client)
+
+
+def cluster() -> list[Figure]:
+    """Acknowledgements with a copy of the archive in a bucket, over those without."""
+    alone: list[float] = []
+    both: list[float] = []
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        for turn in range(TURNS):
+            alone += delays_s(folder, {"path": str(folder / f"alone-{turn}")})
+            with bucket_server(folder / f"objects-{turn}") as bucket:
+                both += delays_s(folder, {"path": str(folder / f"both-{turn}"), **bucket.settings})
+                objects = sum(name.startswith("inbox/") for name in bucket.objects())
+            if not objects:
+                raise RuntimeError("nothing was put into the bucket")
+    least = statistics.median(alone)
+    said = f"of {least:.3f} s without, p50 of {len(both)}"
+    return [Figure("cluster.ack_p50_s", statistics.median(both) / least, said, BAR)]

@@ -1,0 +1,108 @@
+"""A real S3 server, a process of its own on this machine, that a test can take away, freeze and bring back."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from tests.waiting import until
+
+BUCKET, PREFIX = "grip", "north/map"
+SECRET = "not-to-be-read"
+
+
+class BucketServer:
+    """An S3 server that keeps its objects in a folder, so that they outlive it."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        (folder / BUCKET).mkdir(parents=True)
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            self._port = int(free.getsockname()[1])
+        self._process: subprocess.Popen[bytes] | None = None
+        self.url = f"s3://{BUCKET}/{PREFIX}"
+        self.store = {
+            "endpoint": f"http://127.0.0.1:{self._port}", "region": "eu-north-1", "disable_bulk_delete": "true",
+            "access_key_id": "tester", "secret_access_key": SECRET,
+        }  # fmt: skip
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The part of a service's configuration."""
+        return {"copy": self.url, "store": self.store}
+
+    def start(self) -> None:
+        """Serve, as soon as this returns."""
+        words = ["-m", "localbucket", str(self._folder), "--port", str(self._port)]
+        quiet = subprocess.DEVNULL
+        self._process = subprocess.Popen([sys.executable, *words], stdout=quiet, stderr=quiet)
+        until(self._answers)
+
+    def stop(self) -> None:
+        """Be gone: connections are refused."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+
+    def away(self, how: str) -> None:
+        """Be "stopped", or "frozen": take connections and answer nothing."""
+        if how == "stopped":
+            self.stop()
+        else:
+            assert self._process is not None
+            self._process.send_signal(signal.SIGSTOP)
+
+    def back(self, how: str) -> None:
+        """Go on after `away`."""
+        if how == "stopped":
+            self.start()
+        else:
+            assert self._process is not None
+            self._process.send_signal(signal.SIGCONT)
+
+    def objects(self) -> dict[str, bytes]:
+        """All that is there."""
+        base = self._folder / BUCKET / PREFIX
+        found = [path for path in base.rglob("*") if path.is_file() and not path.name.startswith(".")]
+        return {path.relative_to(base).as_posix(): path.read_bytes() for path in found}
+
+    def place(self, name: str) -> Path:
+        """Where an object lies."""
+        return self._folder / BUCKET / PREFIX / name
+
+    def _answers(self) -> bool:
+        try:
+            socket.create_connection(("127.0.0.1", self._port), 1.0).close()
+        except OSError:
+            return False
+        return True
+
+
+@contextmanager
+def bucket_server(folder: Path) -> Iterator[BucketServer]:
+    """A server, for the block."""
+    made = BucketServer(folder)
+    made.start()
+    try:
+        yield made
+    finally:
+        made.stop()
+
+
+def held(root: Path) -> dict[str, bytes]:
+    """What of an archive is to be in its copy."""
+    from fleet_service.archive.copies import FOLDERS
+
+    paths = [path for name in FOLDERS for path in (root / name).rglob("*") if path.is_file()]
+    return {
+        path.relative_to(root).as_posix(): path.read_bytes()
+        for path in paths
+        if path.name != "tried" and not path.name.startswith(".") and path.suffix != ".bad"
+    }

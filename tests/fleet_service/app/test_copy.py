@@ -1,0 +1,237 @@
+"""Acknowledged means two places: a disk that is lost, a bucket that is away, and a service killed between the two."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+import zenoh
+
+from fleet_service.app.engine import Engine
+from fleet_service.archive import reading, segments
+from fleet_service.archive.copies import OWNER
+from fleet_service.archive.pseudonyms import Pseudonyms
+from fleet_service.cli import main
+from fleet_service.ingest.inbox import Message
+from fleet_service.replay import checkpoints
+from schemas import wire
+from schemas.config import ServiceConfig, ZenohSettings
+from schemas.wire import Batch, Kind
+from tests.buckets import SECRET, BucketServer, bucket_server, held
+from tests.fleet_service.app.test_erasing import MONTH, pseudonyms_of
+from tests.fleet_service.app.test_kill import archived, identities
+from tests.fleet_service.app.test_service import Fleet
+from tests.fleet_service.examples import SECOND, batch, key
+from tests.waiting import until
+
+PATIENCE_S = 120.0  # a start, on a machine that is busy
+VEHICLES, BATCHES = 4, 12
+
+
+@pytest.fixture
+def bucket(tmp_path: Path) -> Iterator[BucketServer]:
+    pytest.importorskip("obstore", reason="pip install 'gripmap[objects]'")
+    with bucket_server(tmp_path / "objects") as server:
+        yield server
+
+
+def settings(bucket: BucketServer) -> ServiceConfig:
+    return ServiceConfig.model_validate({"archive": bucket.settings})
+
+
+def reports(mu: float, first: int, last: int) -> list[Batch]:
+    now = time.time_ns() - 2 * SECOND
+    return [batch(f"sim-{v:03}", seq, now, [mu] * 3) for seq in range(first, last + 1) for v in range(VEHICLES)]
+
+
+def take(engine: Engine, sent: list[Batch]) -> None:
+    engine.ingest(
+        [Message(s.kind, key(s.vehicle), wire.encode(s), wire.ENCODING[s.kind]) for s in sent], time.time_ns()
+    )
+
+
+def known(engine: Engine) -> dict[str, pa.Table]:
+    """All that a service would keep of itself: map, trust, batches, alerts."""
+    return dict(engine._image().tables)
+
+
+@pytest.mark.parametrize("with_checkpoint", [False, True])
+def test_a_service_starts_on_an_empty_disk_with_all_that_it_knew(
+    bucket: BucketServer, tmp_path: Path, with_checkpoint: bool
+) -> None:
+    root, new, config = tmp_path / "archive", tmp_path / "new", settings(bucket)
+    first, second = reports(0.15, 1, 4), reports(0.15, 5, 9)
+    with closing(Engine(config, root)) as engine:
+        take(engine, first)
+        assert len(engine.flush()) == VEHICLES
+        if with_checkpoint:
+            checkpoints.save(root, engine._image())
+            assert engine.copy is not None
+            engine.copy.follow()
+        take(engine, second)
+        engine.flush()
+        assert engine.alerts > 0
+        rows = sum(table.num_rows for table in reading.read(root, Kind.OBSERVATION, ["row"]))
+    without = ServiceConfig()
+    with closing(Engine(without, root)) as engine:
+        expected = known(engine)
+    with closing(Engine(config, new)) as engine:
+        assert held(new).keys() == held(root).keys()
+        missing = rows - sum(table.num_rows for table in reading.read(new, Kind.OBSERVATION, ["row"]))
+        assert (rows, missing) == (3 * len(first + second), 0)  # cluster.empty_disk.rows_missing
+        assert engine.alerts > 0
+        found = known(engine)
+        assert found.keys() == expected.keys()
+        assert [name for name in expected if not found[name].equals(expected[name])] == []
+        take(engine, first + second)
+        assert engine.counts["duplicates"] == len(first + second)
+        assert len(engine.flush()) == VEHICLES  # they are acknowledged again, and nothing is written
+        assert len(segments.paths(new, Kind.OBSERVATION)) == len(segments.paths(root, Kind.OBSERVATION))
+
+
+def test_nothing_is_acknowledged_by_an_engine_while_the_bucket_is_away(bucket: BucketServer, tmp_path: Path) -> None:
+    sent = reports(0.7, 1, 2)
+    with closing(Engine(settings(bucket), tmp_path / "archive")) as engine:
+        bucket.stop()
+        take(engine, sent)
+        assert engine.flush() == []
+        assert (engine.failing, engine.counts["copy_failures"], engine.counts["segment_failures"]) == (True, 1, 0)
+        take(engine, sent)  # what comes again is known, and not acknowledged for that
+        assert engine.flush() == []
+        assert engine.fusion.size > 0  # the map goes on
+        bucket.start()
+        acks: list[tuple[str, bytes]] = []
+
+        def acknowledged() -> bool:
+            acks.extend(engine.flush())
+            return bool(acks)
+
+        until(acknowledged)
+        assert sorted(vehicle for vehicle, _ in acks) == sorted({one.vehicle for one in sent})
+        assert engine.copy is not None
+        assert engine.copy.away_s == 0
+
+
+@contextmanager
+def service(
+    router: ZenohSettings, folder: Path, bucket: BucketServer
+) -> Iterator[tuple[subprocess.Popen[bytes], str]]:  # fmt: skip
+    """A service process with a copy that is ready, and its health's address; it is gone after the block."""
+    config = folder / "service.json"
+    archive = {"path": str(folder / "archive"), **bucket.settings}
+    told = {"zenoh": {"connect": router.connect}, "segment_s": 0.05, "archive": archive, "metrics_port": 0}
+    config.write_text(json.dumps(told))
+    words = [sys.executable, "-m", "fleet_service.cli", "run", "--config", str(config)]
+    said = folder / "said"
+    with said.open("w") as out:
+        process = subprocess.Popen(words, stdout=out)
+    try:
+        until(lambda: said.read_text().startswith("ready: ") and "\n" in said.read_text(), PATIENCE_S)
+        yield process, said.read_text().splitlines()[0].split()[-1]
+    finally:
+        process.kill()
+        process.wait()
+
+
+def health(address: str) -> str:
+    try:
+        with urllib.request.urlopen(f"{address}/healthz", timeout=10) as reply:
+            return str(reply.read().decode())
+    except urllib.error.HTTPError as error:
+        return error.read().decode()
+
+
+def drive(fleet: Fleet, sent: list[Batch]) -> bool:
+    """Send what is not acknowledged again, as spools do; whether all is."""
+    for one in fleet.unsettled(sent)[:20]:
+        fleet.publish(one)
+    return not fleet.unsettled(sent)
+
+
+@pytest.mark.parametrize("kind", ["stopped", "frozen"])
+def test_a_bucket_goes_and_comes_back_and_nothing_is_lost_or_doubled(
+    router: ZenohSettings, session: zenoh.Session, bucket: BucketServer, tmp_path: Path, kind: str
+) -> None:
+    root, fleet = tmp_path / "archive", Fleet(session)
+    before, during = reports(0.8, 1, BATCHES), reports(0.6, BATCHES + 1, 2 * BATCHES)
+    with service(router, tmp_path, bucket) as (process, address):
+        until(lambda: drive(fleet, before), PATIENCE_S)
+        assert "does not take segments" not in health(address)
+        bucket.away(kind)
+        until(lambda: not drive(fleet, during) and "does not take segments" in health(address), PATIENCE_S)
+        assert SECRET not in health(address)
+        assert len(fleet.unsettled(during)) == len(during)  # nothing of it is acknowledged
+        bucket.back(kind)
+        until(lambda: drive(fleet, during), PATIENCE_S)
+        process.terminate()
+        assert process.wait(20) == 0
+    found = archived(tmp_path)
+    assert len(found) == len(set(found)) == 3 * len(before + during)
+    _same_in_the_bucket(bucket, root)
+
+
+@pytest.mark.parametrize("kind", ["stopped", "frozen"])
+def test_a_service_killed_between_disk_and_bucket_loses_and_doubles_nothing(
+    router: ZenohSettings, session: zenoh.Session, bucket: BucketServer, tmp_path: Path, kind: str
+) -> None:
+    root, fleet = tmp_path / "archive", Fleet(session)
+    before, during = reports(0.8, 1, BATCHES), reports(0.6, BATCHES + 1, 2 * BATCHES)
+    with service(router, tmp_path, bucket) as (process, _):
+        until(lambda: drive(fleet, before), PATIENCE_S)
+        written = len(archived(tmp_path))
+        bucket.away(kind)
+        until(lambda: not drive(fleet, during) and len(archived(tmp_path)) > written, PATIENCE_S)
+        process.kill()
+        process.wait()
+        assert len(fleet.unsettled(during)) == len(during)
+    bucket.back(kind)
+    with service(router, tmp_path, bucket) as (process, _):
+        until(lambda: drive(fleet, during), PATIENCE_S)
+        process.terminate()
+        assert process.wait(20) == 0
+    found = archived(tmp_path)
+    assert len(found) == len(set(found)) == 3 * len(before + during)
+    assert all(one in found for one in identities(fleet, tmp_path))
+    _same_in_the_bucket(bucket, root)
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_an_erased_vehicle_leaves_the_bucket_too(
+    router: ZenohSettings, session: zenoh.Session, bucket: BucketServer, tmp_path: Path, beside: bool
+) -> None:
+    root, fleet, sent = tmp_path / "archive", Fleet(session), reports(0.8, 1, BATCHES)
+    words = ["forget", "--archive", str(root), "--period", MONTH, "--vehicle", "sim-001", "--yes"]
+    with service(router, tmp_path, bucket) as (process, _):
+        until(lambda: drive(fleet, sent), PATIENCE_S)
+        gone = Pseudonyms(root / "keys").of("sim-001", time.time_ns())
+        if beside:
+            assert main(words) == 0
+        process.terminate()
+        assert process.wait(20) == 0
+    if not beside:
+        assert main(words) == 2  # it has a copy, and it is not told how to reach it
+        assert main([*words, "--config", str(tmp_path / "service.json")]) == 0
+    new = tmp_path / "new"
+    with closing(Engine(settings(bucket), new)):
+        others = pseudonyms_of(new)
+        assert len(others) == 3 * BATCHES * (VEHICLES - 1)
+        assert gone not in others
+    kept = {name: content for name, content in bucket.objects().items() if not name.startswith("observations/")}
+    assert not any(bytes.fromhex(gone) in content for name, content in kept.items() if name.endswith(".witnesses"))
+
+
+def _same_in_the_bucket(bucket: BucketServer, root: Path) -> None:
+    there, here = bucket.objects(), held(root)
+    log = {name for name in here if name.startswith(("inbox/", "keys/"))}
+    assert {name for name in there if name.startswith(("inbox/", "keys/"))} == log
+    assert all(there[name] == here[name] for name in log)
+    assert json.loads(there[OWNER]) == {"service": "shard-0"}

@@ -1,0 +1,239 @@
+"""The second place: what is settled is there, what goes here goes there, and an empty disk has it all again."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from datetime import date
+from pathlib import Path
+
+import pytest
+
+from fleet_service.archive import copies, layout, segments
+from fleet_service.archive.bucket import CopyError
+from fleet_service.archive.compaction import compact
+from fleet_service.archive.copied import copy_of
+from fleet_service.archive.copies import OWNER, Copy
+from fleet_service.archive.load import set_aside
+from fleet_service.archive.log import SegmentLog
+from fleet_service.archive.pseudonyms import Pseudonyms
+from fleet_service.archive.retention import retire
+from schemas.config import ServiceConfig, load
+from schemas.errors import InputError
+from schemas.wire import Kind
+from tests.buckets import SECRET, BucketServer, bucket_server, held
+from tests.fleet_service.archive.rows import identities, rows_of
+from tests.waiting import until
+
+NAME = "shard-0"
+Make = Callable[[Path], Copy]
+
+
+@pytest.fixture
+def bucket(tmp_path: Path) -> Iterator[BucketServer]:
+    pytest.importorskip("obstore", reason="pip install 'gripmap[objects]'")
+    with bucket_server(tmp_path / "objects") as server:
+        yield server
+
+
+@pytest.fixture
+def make(bucket: BucketServer) -> Iterator[Make]:
+    """A copy of an archive, which was begun."""
+    made: list[Copy] = []
+
+    def begun(root: Path) -> Copy:
+        root.mkdir(exist_ok=True)
+        made.append(Copy(root, bucket.url, bucket.store))
+        made[-1].begin(NAME)
+        return made[-1]
+
+    yield begun
+    for copy in made:
+        copy.close()
+
+
+def there(bucket: BucketServer) -> dict[str, bytes]:
+    return {name: content for name, content in bucket.objects().items() if name != OWNER}
+
+
+def filled(root: Path, copy: Copy | None, seeds: range = range(3)) -> SegmentLog[int]:
+    """A log with segments of both kinds, which are settled."""
+    log: SegmentLog[int] = SegmentLog(root, NAME, copy)
+    Pseudonyms(root / "keys").of("sim-001", 0)
+    for seed in seeds:
+        for kind in Kind:
+            log.add(kind, rows_of(kind, 5, seed), [seed])
+        assert log.flush() == [seed, seed]
+    return log
+
+
+def test_what_is_settled_is_in_the_bucket_byte_for_byte(bucket: BucketServer, make: Make, tmp_path: Path) -> None:
+    root = tmp_path / "archive"
+    with closing(filled(root, make(root))):
+        assert len(there(bucket)) == 2 * 3 + 1
+        assert there(bucket) == held(root)
+
+
+def test_nothing_is_settled_while_the_bucket_is_away_and_all_of_it_once_when_it_is_back(
+    bucket: BucketServer, make: Make, tmp_path: Path
+) -> None:
+    root = tmp_path / "archive"
+    copy = make(root)
+    with closing(filled(root, copy)) as log:
+        bucket.stop()
+        log.add(Kind.OBSERVATION, rows_of(Kind.OBSERVATION, 5, 7), [7])
+        with pytest.raises(CopyError):
+            log.flush()
+        log.add(Kind.OBSERVATION, rows_of(Kind.OBSERVATION, 5, 8), [8])
+        with pytest.raises(CopyError, match="is tried again"):  # at once, and nothing was asked of the network
+            log.flush()
+        assert (copy.failures, log.unsettled, log.rows) == (1, 2, 0)
+        assert copy.away_s > 0
+        assert "nothing is acknowledged" in str(copy.trouble)
+        assert SECRET not in str(copy.trouble)
+        bucket.start()
+        done: list[int] = []
+
+        def settled() -> bool:
+            try:
+                done.extend(log.flush())
+            except CopyError:
+                return False
+            return True
+
+        until(settled)
+        assert done == [7, 8]
+        assert copy.trouble is None
+        assert there(bucket) == held(root)
+    assert len(identities(root, Kind.OBSERVATION)) == 5 * 5
+
+
+def test_a_put_that_landed_and_was_not_heard_of_is_no_fault(bucket: BucketServer, make: Make, tmp_path: Path) -> None:
+    root = tmp_path / "archive"
+    copy = make(root)
+    with closing(filled(root, None)):
+        (first, *others) = segments.paths(root, Kind.OBSERVATION)
+        bucket.place("inbox").mkdir(parents=True)
+        bucket.place(f"inbox/{first.name}").write_bytes(first.read_bytes())
+        copy.settle([first])
+        bucket.place(f"inbox/{others[0].name}").write_bytes(b"another's")
+        with pytest.raises(CopyError, match="another service"):
+            copy.settle([others[0]])
+
+
+def test_the_copy_follows_compaction_and_retention(bucket: BucketServer, make: Make, tmp_path: Path) -> None:
+    root = tmp_path / "archive"
+    copy = make(root)
+    with closing(filled(root, copy)):
+        assert compact(root).segments == 6
+        assert any(name.startswith("inbox/") for name in there(bucket))
+        assert copy.follow() > 0
+        assert there(bucket) == held(root)
+        assert not any(name.startswith("inbox/") for name in there(bucket))
+        assert copy.follow() == 0
+        retire(root, 31, date(2100, 1, 1))
+        assert not list(layout.compacted(root, Kind.OBSERVATION))
+        copy.follow()
+        assert there(bucket) == held(root)
+
+
+def test_a_segment_that_was_compacted_before_its_put_is_settled_by_what_it_became(
+    bucket: BucketServer, make: Make, tmp_path: Path
+) -> None:
+    root = tmp_path / "archive"
+    copy = make(root)
+    with closing(filled(root, None)):
+        gone = segments.paths(root, Kind.OBSERVATION)
+        compact(root)
+        copy.settle(gone)
+        assert there(bucket) == held(root)
+        assert any(name.startswith("observations/") for name in there(bucket))
+
+
+def test_an_empty_disk_has_all_of_it_again(bucket: BucketServer, make: Make, tmp_path: Path) -> None:
+    root, new = tmp_path / "archive", tmp_path / "new"
+    copy = make(root)
+    with closing(filled(root, copy)):
+        compact(root)
+        copy.follow()
+    with closing(filled(root, copy, range(3, 5))):
+        pass
+    (half := bucket.place("checkpoints/0000000001-000000000001/streams.arrow")).parent.mkdir(parents=True)
+    half.write_bytes(b"half a checkpoint")
+    make(new)
+    assert held(new) == held(root)
+    assert len(identities(new, Kind.OBSERVATION)) == 5 * 5
+    assert {path.stat().st_mode & 0o777 for path in (new / "keys").iterdir()} == {0o600}
+    assert copy_of(new) == bucket.url
+
+
+def test_what_was_cut_off_is_made_good_at_the_next_start(bucket: BucketServer, make: Make, tmp_path: Path) -> None:
+    root = tmp_path / "archive"
+    copy = make(root)
+    with closing(filled(root, copy)):
+        copy.close()
+    with closing(filled(root, None, range(3, 4))):  # written and not put
+        damaged = segments.paths(root, Kind.OBSERVATION)[0]
+        whole = damaged.read_bytes()
+        set_aside(damaged, "a bit has turned")
+        lost = bucket.place(f"inbox/{segments.paths(root, Kind.OBSERVATION)[1].name}")
+        lost.unlink()
+        make(root)
+        assert damaged.read_bytes() == whole
+        assert not list(root.rglob("*.bad"))
+        assert lost.exists()
+        assert there(bucket) == held(root)
+
+
+def test_a_bucket_is_of_one_service(bucket: BucketServer, make: Make, tmp_path: Path) -> None:
+    make(tmp_path / "archive")
+    (tmp_path / "other").mkdir()
+    with (
+        closing(Copy(tmp_path / "other", bucket.url, bucket.store)) as copy,
+        pytest.raises(InputError, match="another service, shard-0"),
+    ):
+        copy.begin("shard-1")
+
+
+@pytest.mark.parametrize("kind", ["stopped", "frozen"])
+def test_a_bucket_that_is_away_at_the_start_is_told_and_nothing_hangs(
+    bucket: BucketServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    monkeypatch.setattr(copies, "SLOW_S", 1.0)
+    bucket.away(kind)
+    with closing(Copy(tmp_path, bucket.url, bucket.store)) as copy, pytest.raises(InputError) as told:
+        copy.begin(NAME)
+    assert told.value.field == "archive.copy"
+    assert SECRET not in str(told.value)
+
+
+def test_settings_that_cannot_be_used_say_which_and_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("obstore", reason="pip install 'gripmap[objects]'")
+    for url, store, field in [
+        ("file:///elsewhere", {}, "archive.copy"),
+        ("s3://", {}, "archive.copy"),
+        ("s3://bucket", {"endpiont": SECRET}, "archive.store"),
+    ]:
+        with pytest.raises(InputError) as told:
+            Copy(tmp_path, url, store)
+        assert told.value.field == field
+        assert SECRET not in str(told.value)
+    monkeypatch.setitem(sys.modules, "obstore", None)
+    with pytest.raises(InputError, match="obstore, which is not installed.*gripmap\\[objects\\]"):
+        Copy(tmp_path, "s3://bucket", {})
+
+
+def test_a_folder_alone_is_an_archive_and_secrets_do_not_show(tmp_path: Path) -> None:
+    (path := tmp_path / "service.json").write_text('{"archive": "here"}')
+    assert load(path, ServiceConfig).archive.path == Path("here")
+    settings = {"path": "here", "copy": "s3://b/c", "store": {"secret_access_key": SECRET}}
+    path.write_text(json.dumps({"archive": settings}))
+    config = load(path, ServiceConfig)
+    assert (config.archive.second, config.archive.options) == ("s3://b/c", {"secret_access_key": SECRET})
+    assert SECRET not in repr(config)
+    path.write_text(json.dumps({"archive": {"store": {"secret_access_key": [SECRET]}}}))
+    with pytest.raises(InputError) as told:
+        load(path, ServiceConfig)
+    assert SECRET not in str(told.value)
