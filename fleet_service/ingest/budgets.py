@@ -15,7 +15,7 @@ from schemas.thresholds import METRES_PER_DEGREE, NS
 
 # A car on roads that are all new passes 3 cells of 10 m a second; of such a cell 1 kB is kept.
 NEW_CELLS_PER_HOUR: Final = 14_000.0
-NEW_CELLS_AT_ONCE: Final = 3_000.0
+NEW_CELLS_AT_ONCE: Final = 11_000.0  # an hour on such roads, that a service was away: its backlog reaches the map
 # A start, two kinds, and a region every quarter of an hour; after an outage a handful of starts.
 STREAMS_PER_HOUR: Final = 60.0
 STREAMS_AT_ONCE: Final = 120.0

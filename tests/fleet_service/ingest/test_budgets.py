@@ -19,7 +19,7 @@ from fleet_service.archive import reading
 from fleet_service.archive.pseudonyms import Pseudonyms, number
 from fleet_service.archive.retention import drop_checkpoints, forget_period
 from fleet_service.archive.witnesses import Witnesses, read
-from fleet_service.ingest.budgets import FASTEST, NEW_CELLS_AT_ONCE, STREAMS_AT_ONCE, Bucket, Tracks
+from fleet_service.ingest.budgets import FASTEST, NEW_CELLS_PER_HOUR, STREAMS_AT_ONCE, Bucket, Tracks
 from fleet_service.ingest.inbox import Message
 from schemas import grid, keys, wire
 from schemas.config import ServiceConfig
@@ -171,18 +171,19 @@ def everywhere(seq: int, count: int, now: int) -> Batch:
 
 
 def test_a_car_fills_no_memory_with_places_and_all_it_says_is_archived(engine: Engine) -> None:
-    now, sent = time.time_ns(), 0
+    now, sent, at_once = time.time_ns(), 0, 3_000
+    engine._places = Bucket(at_once, NEW_CELLS_PER_HOUR)
     for seq in range(200):
         at = now - (200 - seq) * 200 * SECOND
         one = everywhere(seq, 50, at)
         if len(np.unique(grid.region_of(one.columns["cell"]))) == 1:
             engine.ingest([message(one)], now)
             sent += 50
-    assert sent > 2 * NEW_CELLS_AT_ONCE
+    assert sent > 2 * at_once
     assert engine.counts[Kind.OBSERVATION] == sent, "nothing is refused"
     assert engine.counts["implausible_moves"] == 0
-    assert engine.counts["too_many_places"] > sent - 2 * NEW_CELLS_AT_ONCE
-    assert engine.fusion.size < 3 * NEW_CELLS_AT_ONCE
+    assert engine.counts["too_many_places"] > sent - 2 * at_once
+    assert engine.fusion.size < 3 * at_once
 
 
 def test_a_car_opens_so_many_streams_and_keeps_the_rest(engine: Engine) -> None:
