@@ -14,7 +14,7 @@ setup: $(STAMP)  ## make .venv and install everything, pinned
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[analytics,certs,demo,dev,inputs,metrics,page]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[analytics,certs,demo,dev,inputs,metrics,objects,page]'
 	$(BIN)/python -m deploy.precompile
 	touch $@
 
