@@ -77,7 +77,7 @@ def _erase(
     cut = engine.between(lambda: engine.written_to, stop)
     if cut is None:
         return None
-    told = json.dumps({**asdict(wanted), "config": config.model_dump(mode="json"), "cut": cut})
+    told = json.dumps({**asdict(wanted), "config": config.model_dump(mode="json", exclude={"archive"}), "cut": cut})
     output = beside.run("erasure", "fleet_service.app.erasing_process", [str(root)], stop, told)
     if output is None:
         return None
