@@ -88,7 +88,8 @@ ELSEWHERE = {
     "check": {"log": FIX, "--vehicle": FIX, "--out": FIX, "--fix": FIX,
               "--json": "test_what_the_doctor_found_is_json_for_a_program"},
     "calibrate": {"log": LEARNED, "--vehicle": LEARNED, "--out": LEARNED, "--trust": LEARNED},
-    "run": {"--trust": UNFIT, "--profile": LIVE, "--dbc": LIVE, "--ahead": LISTENS, "--route": LISTENS},
+    "run": {"--trust": UNFIT, "--profile": LIVE, "--dbc": LIVE, "--ahead": LISTENS, "--route": LISTENS,
+            "--vss": "test_the_command_prints_lines_of_the_drive"},
     "fleet": {"--warned": "test_of_a_fleet_the_share_that_is_warned_hears_and_the_others_do_not"},
     "completion": {"shell": "test_completion_is_a_script_of_the_shell"},
     "tune": {"log": "test_drives_of_one_s_own_are_searched_on", "--vehicle": "test_drives_of_one_s_own_are_searched_on",
@@ -155,9 +156,10 @@ def driven(words: list[str], monkeypatch: pytest.MonkeyPatch, folder: Path) -> o
     def note(
         vehicles: Sequence[Vehicle], names: Sequence[str], source: Iterator[Block], config: AgentConfig,
         estimator: str | None, duration_s: float, at_end: Callable[[], None] = lambda: None,
-        lookout: object | None = None, memberships: Memberships | None = None,
+        lookout: object | None = None, memberships: Memberships | None = None, *, vss: bool = False,
     ) -> int:  # fmt: skip
         assert lookout is None
+        assert not vss
         first = [next(source) for _ in range(3)]
         at_end()
         signals = [(block.t.tolist(), np.nan_to_num(block.signals).tolist()) for block in first]
