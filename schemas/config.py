@@ -21,7 +21,7 @@ Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 class Settings(BaseModel):
     """Base of every settings table: unknown names are refused, so that a misspelt one is not silently ignored."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, serialize_by_alias=True)  # what is written can be read
 
 
 class ZenohSettings(Settings):

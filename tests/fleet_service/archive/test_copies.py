@@ -233,6 +233,8 @@ def test_a_folder_alone_is_an_archive_and_secrets_do_not_show(tmp_path: Path) ->
     config = load(path, ServiceConfig)
     assert (config.archive.second, config.archive.options) == ("s3://b/c", {"secret_access_key": SECRET})
     assert SECRET not in repr(config)
+    again = ServiceConfig.model_validate_json(config.model_dump_json())
+    assert again.archive.second == "s3://b/c", "what is written can be read"
     path.write_text(json.dumps({"archive": {"store": {"secret_access_key": [SECRET]}}}))
     with pytest.raises(InputError) as told:
         load(path, ServiceConfig)
