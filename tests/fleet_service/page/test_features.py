@@ -159,13 +159,12 @@ def test_a_wrong_question_is_told_what_and_how_to_mend_it(bare: str, asked: str)
     assert b"; " in body
 
 
-def test_no_service_is_no_empty_map_and_no_visit_is_no_feature(
-    bare: str,
-    page: RunningPage,
-    drive: Drive,
-) -> None:
+def test_no_service_is_no_empty_map(bare: str) -> None:
     status, _, body = ask(bare, ITEMS)
     assert (status, body[:10]) == (503, b"no service")
+
+
+def test_no_visit_is_no_feature(page: RunningPage, drive: Drive) -> None:
     drawn(page, drive, "ice")
     nobody = int(street.cells(street.PARTS["dry"])[0])
     assert ask(page.address, f"{ITEMS}/{nobody}-0")[0] == 404
