@@ -146,11 +146,12 @@ def lost(kind: str, folder: Path, seconds: float) -> tuple[int, int]:
     return max(missing, 0) + feeds[0].lost + rows.late, samples
 
 
-def crashes(folder: Path, kills: int = KILLS) -> tuple[int, int]:
-    """Agents that did not notice each loss and each return of their sources, or did not end as they should; losses."""
+def crashes(folder: Path, kills: int = KILLS) -> tuple[list[str], int]:
+    """Agents that did not notice a loss or a return of their source, or did not end as they should: why; losses."""
     vehicle = folder / "car.json"
     vehicle.write_text(Vehicle.model_validate(PRESETS["sedan"].vehicle).model_dump_json(exclude_none=True))
-    bad = losses = 0
+    bad: list[str] = []
+    losses = 0
     for kind in (*COUNTED, "gpsd"):
         place, source = addresses(kind)
         name, dbc = written("can" if kind == "gpsd" else kind, folder)
@@ -163,18 +164,22 @@ def crashes(folder: Path, kills: int = KILLS) -> tuple[int, int]:
             words += ["--source", addresses("can")[1]]
         command = [sys.executable, "-c", "import sys; from edge_agent.cli import main; sys.exit(main(sys.argv[1:]))"]
         agent = subprocess.Popen([*command, *words], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
-        fine = _shows(agent, port, source, silent=True, patience_s=START_S)
-        for _ in range(kills):
+        missed = [] if _shows(agent, port, source, silent=True, patience_s=START_S) else ["no source at the start"]
+        for kill in range(kills):
             with peer(kind, place, 100_000) as running:
                 running.go()
                 running.until("ready")
                 running.go()
-                fine &= _shows(agent, port, source, silent=False)
+                if not _shows(agent, port, source, silent=False):
+                    missed.append(f"return {kill + 1}")
             losses += 1
-            fine &= _shows(agent, port, source, silent=True)
+            if not _shows(agent, port, source, silent=True):
+                missed.append(f"loss {kill + 1}")
         agent.terminate()
         said, _ = agent.communicate(timeout=PATIENCE_S)
-        bad += not (fine and agent.returncode == 0 and said.strip().endswith("}"))
+        if missed or agent.returncode or not said.strip().endswith("}"):
+            unseen = f"did not see {', '.join(missed)}" if missed else "saw all"
+            bad.append(f"{kind}: the agent {unseen}, ended with {agent.returncode} and said {said[-200:]!r}")
     return bad, losses
 
 
@@ -212,7 +217,9 @@ def figures(folder: Path, seconds: float, kills: int = KILLS) -> list[Figure]:
             Figure(f"live.{kind}.samples", float(sent), "samples"),
         ]
     bad, tries = crashes(folder, kills)
+    for reason in bad:
+        print(reason, file=sys.stderr)
     return [
-        *found, Figure("live.source_loss.crashes", float(bad), "crashes", 0.0),
+        *found, Figure("live.source_loss.crashes", float(len(bad)), "crashes", 0.0),
         Figure("live.source_loss.losses", float(tries), "losses"),
     ]  # fmt: skip
