@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 import time
 from contextlib import closing
 from pathlib import Path
@@ -21,8 +24,9 @@ from tests.faults.campaigns import CAMPAIGNS
 from tests.faults.census import take, told
 from tests.faults.crash_model import history
 from tests.faults.crash_spool import spool_history
-from tests.faults.frame import Campaign, Site, conduct
+from tests.faults.frame import RAISED, Campaign, Site, conduct
 from tests.fleet_service.examples import SECOND, batch, key
+from tests.waiting import until
 
 
 def test_every_campaign_owes_figures_of_the_table_and_none_is_owed_twice() -> None:
@@ -41,6 +45,31 @@ def test_a_figure_that_is_owed_and_not_given_does_not_hold(tmp_path: Path) -> No
     written = json.loads((tmp_path / "figures.json").read_text())[1:]
     assert [row["holds"] for row in written] == [True, False]
     assert "DOES NOT HOLD" in (tmp_path / "figures.md").read_text()
+
+
+RAISES = """
+import subprocess, threading
+from pathlib import Path
+from tests.faults.frame import Campaign, conduct, leave
+
+def run(site):
+    child = subprocess.Popen(["sleep", "600"])
+    Path("child").write_text(str(child.pid))
+    threading.Thread(target=threading.Event().wait).start()  # as a session that nobody closed
+    raise TimeoutError("not within 60 s")
+
+leave(lambda: len(conduct([Campaign("raises", run, ())], Path("out"), "test", True, 0)))
+"""
+
+
+def test_a_campaign_that_raises_ends_the_run_with_its_message_whatever_it_left_running(tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    command = [sys.executable, "-c", RAISES]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True, timeout=120)
+    assert done.returncode == RAISED
+    assert "TimeoutError: not within 60 s" in done.stderr
+    child = Path("/proc", (tmp_path / "child").read_text(), "stat")
+    until(lambda: not child.exists() or child.read_text().split()[2] == "Z")
 
 
 @pytest.fixture

@@ -5,21 +5,29 @@ how hard it was (kills, rates) is a `Figure` without a bar. To add one: write `t
 `def run(site: Site) -> list[Figure]`, and name it in `campaigns.py` with the figures that it owes.
 
 `quick` is for `make check`: seconds, the same mechanism, smaller numbers. A figure that is owed and not given fails.
+A campaign that raises ends the run with its traceback: what it measured is not known.
 """
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
 import sys
 import time
+import traceback
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple, NoReturn
 
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
+from schemas.runtime.process import end_now
 from tests.faults.bars import figure
+
+RAISED: Final = 2  # exit code; 1: a bar does not hold
 
 
 @dataclass(frozen=True)
@@ -61,6 +69,23 @@ def conduct(campaigns: Sequence[Campaign], out: Path, title: str, quick: bool, s
         figures.write(out / "figures.json", title, [seed], found)
         (out / "figures.md").write_text(figures.markdown(found) + "\n")
     return found
+
+
+def leave(run: Callable[[], int]) -> NoReturn:
+    """Run campaigns and end the process with their exit code; with RAISED and a traceback at once if one raises.
+
+    A session that is still open holds the interpreter's end up for minutes, and processes that were started would stay.
+    """
+    try:
+        code = run()
+    except Exception:  # noqa: BLE001 whatever it is, it is told and ends the run
+        traceback.print_exc()
+        for children in Path("/proc/self/task").glob("*/children"):
+            for child in children.read_text().split():
+                with suppress(ProcessLookupError):
+                    os.kill(int(child), signal.SIGKILL)
+        code = RAISED
+    end_now(code)
 
 
 def _one(campaign: Campaign, out: Path, quick: bool, seed: int) -> list[Figure]:

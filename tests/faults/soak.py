@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -16,7 +15,7 @@ from schemas.runtime import figures
 from schemas.runtime.figures import Figure
 from tests.faults.bars import figure
 from tests.faults.census import take
-from tests.faults.frame import Campaign, Site, conduct
+from tests.faults.frame import Campaign, Site, conduct, leave
 from tests.faults.processes import Part, stage
 
 PROCESSES, VEHICLES, RATE = 2, 20, 50.0  # 2 000 observations/s
@@ -97,4 +96,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    leave(main)
