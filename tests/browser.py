@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import Page
 
 NAMES: Final = ("chromium", "chromium-browser", "google-chrome")
+UNBOUND: Final = ("--disable-frame-rate-limit", "--disable-gpu-vsync")
 PHONE: Final = {"width": 390, "height": 844}
 DESK: Final = {"width": 1280, "height": 900}
 
@@ -50,14 +51,17 @@ class Opened:
 
 
 @contextmanager
-def opened(path: Path | str, *, phone: bool = False, ratio: float = 1.0) -> Iterator[Opened]:
-    """A file of this machine, or an address, in the browser; skips the test where there is none."""
+def opened(path: Path | str, *, phone: bool = False, ratio: float = 1.0, unbound: bool = False) -> Iterator[Opened]:
+    """A file of this machine, or an address, in the browser; skips the test where there is none.
+
+    `unbound`: as many pictures a second as it can paint, not as many as a screen shows.
+    """
     program = executable()
     if program is None:
         pytest.skip("no Chromium on this machine: apt install chromium")
     api: Any = pytest.importorskip("playwright.sync_api", reason="no Playwright: pip install 'gripmap[dev]'")
     with api.sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        browser = play.chromium.launch(executable_path=program, args=["--no-sandbox", *(UNBOUND if unbound else ())])
         context = browser.new_context(
             viewport=PHONE if phone else DESK, device_scale_factor=ratio, has_touch=phone, is_mobile=phone
         )

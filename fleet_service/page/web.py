@@ -15,12 +15,13 @@ from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from fleet_service.client.datex_feed import DatexFile
 from fleet_service.page import asked, colours, ogc, overlay, records, route
+from fleet_service.page.files import Files
 from fleet_service.page.health import ServiceHealth
 from fleet_service.page.moments import Moments
 from fleet_service.page.ogc import FeatureRoutes
@@ -75,21 +76,21 @@ class Routes:
     """The answers, a method each."""
 
     def __init__(self, sources: Sources) -> None:
-        self._of = sources
+        self._of, self._files = sources, Files(STATIC)
         self.features = FeatureRoutes(sources.world, sources.reader)
 
     async def index(self, request: Request) -> Response:
         """The page; to a program the landing page of OGC API Features."""
         if ogc.wants_json(request):
             return await self.features.landing(request)
-        return FileResponse(STATIC / "index.html", headers={"Cache-Control": "no-cache", "Vary": "Accept"})
+        found = self._files.answer("index.html", request, "Accept, Accept-Encoding")
+        assert found is not None
+        return found
 
     async def file(self, request: Request) -> Response:
         """One of its files, none else."""
-        path = STATIC / request.path_params["name"]
-        if path.parent != STATIC or not path.is_file():
-            return PlainTextResponse("no such file\n", 404)
-        return FileResponse(path, headers={"Cache-Control": "no-cache"})
+        found = self._files.answer(request.path_params["name"], request)
+        return PlainTextResponse("no such file\n", 404) if found is None else found
 
     async def settings(self, _: Request) -> Response:
         """Numbers and colours that the page computes with."""

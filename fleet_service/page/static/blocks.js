@@ -45,25 +45,33 @@ export function laidOver(before, change) {
 
 // All headings of a place as one: of each number the worst of what was measured, as records.py does for ancestors.
 export function worstOf(block) {
-  const rows = [];
-  for (let k = 0; k < block.count;) {
-    const place = block.place[k] >> 2, row = { place: place << 2, mu: 255, lower: 255, upper: 255, slippery: 0, vehicles: 0, last: 0, basis: BOUND, unknown: 0 };
-    let end = k, known = 0, borrowed = 0;
-    for (; end < block.count && block.place[end] >> 2 === place; end++) { known += block.basis[end] === MEASURED; borrowed += block.basis[end] === BORROWED; }
+  const made = { ...block, count: 0 }, n = block.count, { place, basis } = block;
+  for (const name of COLUMNS) made[name] = new block[name].constructor(n);
+  for (let k = 0, end; k < n; k = end) {
+    const at = made.count++, where = place[k] >> 2;
+    let known = 0, borrowed = 0;
+    for (end = k; end < n && place[end] >> 2 === where; end++) { known += basis[end] === MEASURED; borrowed += basis[end] === BORROWED; }
     const speaks = known ? MEASURED : borrowed ? BORROWED : BOUND;
+    let mu = NO_NUMBER, lower = NO_NUMBER, upper = NO_NUMBER, slippery = 0, vehicles = 0, last = 0;
     for (let i = k; i < end; i++) {
-      row.last = Math.max(row.last, block.last[i]);
-      if (block.basis[i] !== speaks) continue;
-      for (const name of ["mu", "lower", "upper"]) row[name] = Math.min(row[name], block[name][i]);
-      for (const name of ["slippery", "vehicles"]) row[name] = Math.max(row[name], block[name][i]);
+      last = Math.max(last, block.last[i]);
+      if (basis[i] !== speaks) continue;
+      mu = Math.min(mu, block.mu[i]);
+      lower = Math.min(lower, block.lower[i]);
+      upper = Math.min(upper, block.upper[i]);
+      slippery = Math.max(slippery, block.slippery[i]);
+      vehicles = Math.max(vehicles, block.vehicles[i]);
     }
-    row.basis = speaks;
-    row.unknown = block.level === 21 ? Math.ceil(254 * (end - k - known) / (end - k)) : block.unknown[k];
-    if (speaks === BOUND) row.mu = NO_NUMBER;
-    rows.push(row);
-    k = end;
+    made.place[at] = where << 2;
+    made.last[at] = last;
+    made.mu[at] = speaks === BOUND ? NO_NUMBER : mu;
+    made.lower[at] = lower;
+    made.upper[at] = upper;
+    made.slippery[at] = slippery;
+    made.basis[at] = speaks;
+    made.vehicles[at] = vehicles;
+    made.unknown[at] = block.level === 21 ? Math.ceil(254 * (end - k - known) / (end - k)) : block.unknown[k];
   }
-  const made = { ...block, count: rows.length };
-  for (const name of COLUMNS) made[name] = block[name].constructor.from(rows, row => row[name]);
+  for (const name of COLUMNS) made[name] = made[name].subarray(0, made.count);
   return made;
 }

@@ -5,19 +5,23 @@ import { CELL_LEVEL, TILE_LEVEL, TILES, columnOf, rowOf } from "./grid.js";
 
 const AT_ONCE = 200, MOST_TILES = 4000;
 
-// How many places a heading-wise square has beside its record: x and y of its corner in [0, 1], and its side.
+// What a block's rows have beside their record: column and row within the tile, the corner as x and y in [0, 1], the
+// side; for squares, where all headings are one, and for parts, a heading each.
 function ready(block) {
   const steps = 2 ** (block.level - TILE_LEVEL), side = 1 / (TILES * steps);
   const west = columnOf(block.tile) / TILES, north = rowOf(block.tile) / TILES;
   const lay = rows => {
-    const x = new Float64Array(rows.count), y = new Float64Array(rows.count), kind = new Uint8Array(rows.count);
-    for (let k = 0; k < rows.count; k++) {
+    const n = rows.count, x = new Float64Array(n), y = new Float64Array(n);
+    const column = new Uint8Array(n), row = new Uint8Array(n), kind = new Uint8Array(n);
+    for (let k = 0; k < n; k++) {
       const local = rows.place[k] >> 2;
-      x[k] = west + columnOf(local) * side;
-      y[k] = north + rowOf(local) * side;
+      column[k] = columnOf(local);
+      row[k] = rowOf(local);
+      x[k] = west + column[k] * side;
+      y[k] = north + row[k] * side;
       kind[k] = kindOf(rows.basis[k], rows.mu[k], rows.lower[k], rows.upper[k]);
     }
-    return { rows, x, y, kind, side };
+    return { rows, x, y, column, row, kind, side, west, north, steps };
   };
   let squares = null, parts = null;
   return {
@@ -93,6 +97,24 @@ export class Cells {
   forget(box) {
     for (const [tile, { west, north }] of this.tiles)
       if (west > box.east || west + 1 / TILES < box.west || north > box.south || north + 1 / TILES < box.north) this.tiles.delete(tile);
+  }
+
+  // What the cells that are held lie in, and tiles that are not held; null where there is none.
+  get extent() {
+    const found = { west: Infinity, north: Infinity, east: -Infinity, south: -Infinity };
+    const grow = (west, north, side) => {
+      found.west = Math.min(found.west, west);
+      found.north = Math.min(found.north, north);
+      found.east = Math.max(found.east, west + side);
+      found.south = Math.max(found.south, north + side);
+    };
+    for (const tile of this.known) {
+      const held = this.tiles.get(tile);
+      if (!held) { grow(columnOf(tile) / TILES, rowOf(tile) / TILES, 1 / TILES); continue; }
+      const { x, y, side } = held.parts;
+      for (let k = 0; k < x.length; k++) grow(x[k], y[k], side);
+    }
+    return Number.isFinite(found.west) ? found : null;
   }
 
   empty() {

@@ -21,7 +21,11 @@ export const groundColour = () => rule.ground;
 export function kindOf(basis, mu, lower, upper) {
   if ((basis !== MEASURED && basis !== BORROWED) || mu === NO_NUMBER) return HOLLOW;
   const width = upper - lower;
-  if (upper < rule.slippery || width < rule.narrow) return rule.edges.filter(edge => mu >= edge).length;
+  if (upper < rule.slippery || width < rule.narrow) {
+    let kind = 0;
+    while (kind < rule.edges.length && mu >= rule.edges[kind]) kind++;
+    return kind;
+  }
   if (width < rule.middling) return mu >= rule.slippery ? 5 : 4;
   return LITTLE;
 }

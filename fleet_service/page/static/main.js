@@ -4,7 +4,7 @@ import { BaseMap } from "./basemap.js";
 import { Cells } from "./cells.js";
 import { kindOf, setColours } from "./colours.js";
 import { byId, make } from "./elements.js";
-import { CELLS, CELL_LEVEL, cellAt, cellOf, columnOf, latitudeOf, localOfCell, longitudeOf, middleOf, rowOf, tileOfCell, TILES, worldX, worldY } from "./grid.js";
+import { CELLS, CELL_LEVEL, cellAt, cellOf, latitudeOf, localOfCell, longitudeOf, middleOf, tileOfCell, worldX, worldY } from "./grid.js";
 import { healthPanel } from "./health.js";
 import { legend } from "./legend.js";
 import { Live } from "./live.js";
@@ -20,10 +20,9 @@ const TABS = ["legend", "cell", "alerts", "route", "health", "share"];
 const LOOK_MS = 120, CLOCK_MS = 500, HEALTH_MS = 3000, LIST_MS = 15000;
 
 class App {
-  constructor(settings) {
-    Object.assign(this, { settings, alerts: [], route: [], routeFound: null, routeError: "", chosen: null, comparing: false, pinned: null, tab: "legend", away: [] });
+  constructor(settings, now) {
+    Object.assign(this, { settings, now, alerts: [], route: [], routeFound: null, routeError: "", chosen: null, comparing: false, pinned: null, tab: "legend", away: [] });
     this.show = { bounds: true, overlay: false, borrowed: false, recent: 0, sound: false };
-    this.now = new Cells();
     this.past = null;
     this.view = new View(byId("map"));
     this.view.moved = () => this.moved();
@@ -34,6 +33,7 @@ class App {
     this.now.changed = () => this.draw();
     this.frame = 0;
     this.looking = 0;
+    this.started = this.missed = false;
   }
 
   // What is shown in the large map: a moment, or now.
@@ -51,13 +51,21 @@ class App {
     setInterval(() => this.tick(), CLOCK_MS);
     setInterval(() => this.tab === "health" && this.panel(), HEALTH_MS);
     setInterval(() => { this.now.list(); this.timeline.load(); this.tab === "alerts" && this.panel(); }, LIST_MS);
-    await Promise.all([this.now.list(), this.timeline.load(), this.settings.overlay ? this.loadTruth() : null]);
-    const state = fromHash(location.hash);
-    if (state.x) await this.restore(state); else this.all();
+    const state = fromHash(location.hash), beside = Promise.all([this.timeline.load(), this.settings.overlay ? this.loadTruth() : null]);
+    if (state.at !== undefined || state.compare !== undefined) await beside;
+    this.started = true;
+    if (state.x) await this.restore(state);
+    else {
+      this.all();
+      await this.look();
+      this.all();  // now to the cells, not to their tiles
+    }
     this.open(this.tab);
     this.tick();
     await this.look();
+    await beside;
     document.body.dataset.ready = "1";
+    if (this.missed) this.reload();
   }
 
   async restore(state) {
@@ -91,11 +99,17 @@ class App {
     });
   }
 
+  // The whole map, and what comes to it, until somebody looks elsewhere.
   all() {
-    const tiles = [...this.cells.known];
-    if (!tiles.length) return;
-    const xs = tiles.map(columnOf), ys = tiles.map(rowOf), least = v => v.reduce((a, b) => Math.min(a, b)), most = v => v.reduce((a, b) => Math.max(a, b));
-    this.view.fit({ west: least(xs) / TILES, east: (most(xs) + 1) / TILES, north: least(ys) / TILES, south: (most(ys) + 1) / TILES });
+    const extent = this.cells.extent;
+    if (!extent) return;
+    this.view.fit(extent);
+    this.view.gone = false;
+  }
+
+  follow() {
+    const { view, past } = this, box = view.box, extent = view.gone || past ? null : this.now.extent;
+    if (extent && (extent.west < box.west || extent.east > box.east || extent.north < box.north || extent.south > box.south)) this.all();
   }
 
   resize() {
@@ -119,6 +133,7 @@ class App {
   }
 
   async look() {
+    if (!this.started) return;
     if (this.live.look(this.view)) this.draw();
     const level = this.view.level, box = this.view.box, stores = this.comparing ? [this.cells, this.pinned] : [this.cells];
     try { await Promise.all(stores.map(store => store.show(box, level))); } catch { this.note(say("error.asked")); }
@@ -128,8 +143,9 @@ class App {
   }
 
   async reload() {
+    if (!document.body.dataset.ready) { this.missed = true; return; }  // after the first picture
     await this.now.list();
-    if (!this.view.gone && !this.past) this.all();
+    this.follow();
     this.now.generation++;
     this.now.wanted.clear();
     const box = this.view.box;
@@ -142,7 +158,7 @@ class App {
     if (this.show.borrowed) { this.now.fetch(found.map(block => block.tile), this.view.level); return; }
     const missing = found.filter(block => block.level === this.view.level && !this.now.take(block)).map(block => block.tile);
     if (missing.length) this.now.fetch(missing, this.view.level).catch(() => {});
-    if (!this.view.gone) this.all();
+    this.follow();
     this.refreshPlace();
     this.draw();
     document.body.dataset.pushed = Number(document.body.dataset.pushed || 0) + found.length;
@@ -320,14 +336,14 @@ class App {
       cell: chosen ? cellOf(chosen.tile, chosen.local) : null, passed: show.bounds ? null : "0", overlay: show.overlay, borrowed: show.borrowed,
       recent: show.recent || null, sound: show.sound, route: this.route.map(point => point.map(v => v.toFixed(6)).join(",")).join("|"),
     };
-    if (this.view.gone) history.replaceState(null, "", toHash(state));
+    if (this.view.gone || this.cells.known.size) history.replaceState(null, "", toHash(state));
   }
 }
 
-await loadTexts();
+const now = new Cells();
+const [settings] = await Promise.all([fetch("/settings").then(answer => answer.json()), loadTexts(), now.list()]);
 document.title = say("title");
-const settings = await (await fetch("/settings")).json();
 setColours(settings);
-const app = new App(settings);
+const app = new App(settings, now);
 globalThis.gripmap = app;  // for a person at the console
 await app.start();

@@ -1,9 +1,10 @@
 // Drawing: squares where the map is far, four headings to a square where it is near; a bound is hollow, nobody is nothing.
 import { BORROWED } from "./blocks.js";
 import { HOLLOW, alertColour, fills, groundColour } from "./colours.js";
-import { CELLS, CELL_LEVEL, metresPerWorld, worldX, worldY } from "./grid.js";
+import { CELLS, CELL_LEVEL, TILES, metresPerWorld, worldX, worldY } from "./grid.js";
+import { Pixels } from "./pixels.js";
 
-const NEAR_PX = 14, LEAST_PX = 3, NOTCH_PX = 6;
+const NEAR_PX = 14, pixels = new Pixels();
 const BOUND_INK = "#7d7d7d", TRUTH_INK = "#000000", ROUTE_INK = "#0a4fb3";
 
 let hatch = null;
@@ -19,17 +20,20 @@ function hatching(pen) {
 
 // Returns how many places were drawn, by kind.
 export function paint(pen, view, cells, extra) {
-  pen.fillStyle = groundColour();
-  pen.fillRect(0, 0, view.width, view.height);
-  extra.base?.paint(pen, view);
-  for (const { box } of extra.away) regionAway(pen, view, box);
-  const drawn = new Array(8).fill(0), box = view.box;
-  const near = view.scale / CELLS >= NEAR_PX;
-  for (const tile of cells.tiles.values()) {
-    if (tile.west > box.east || tile.north > box.south || tile.west + 1 / 16384 < box.west || tile.north + 1 / 16384 < box.north) continue;
-    if (near && tile.block.level === CELL_LEVEL) headings(pen, view, tile.parts, extra, drawn);
-    else squares(pen, view, tile.squares, extra, drawn);
+  const drawn = new Array(8).fill(0), box = view.box, near = view.scale / CELLS >= NEAR_PX, passes = passing(extra);
+  const seen = [...cells.tiles.values()].filter(({ west, north }) =>
+    west <= box.east && north <= box.south && west + 1 / TILES >= box.west && north + 1 / TILES >= box.north);
+  const parted = tile => near && tile.block.level === CELL_LEVEL, below = extra.base || extra.away.length;
+  if (below) {
+    pen.fillStyle = groundColour();
+    pen.fillRect(0, 0, view.width, view.height);
+    extra.base?.paint(pen, view);
+    for (const region of extra.away) regionAway(pen, view, region.box);
   }
+  pixels.begin(pen.canvas.width, pen.canvas.height, pen.canvas.width / view.width, !below);
+  for (const tile of seen) if (!parted(tile)) pixels.squares(view, tile.squares, passes, drawn);
+  pixels.show(pen);
+  for (const tile of seen) if (parted(tile)) headings(pen, view, tile.parts, passes, drawn);
   if (extra.truth) truthDots(pen, view, extra.truth);
   for (const alert of extra.alerts) ring(pen, view, alert);
   if (extra.route.length) line(pen, view, extra.route);
@@ -37,52 +41,16 @@ export function paint(pen, view, cells, extra) {
   return drawn;
 }
 
-const passes = (rows, k, extra) => (extra.oldest === 0 || rows.last[k] >= extra.oldest) && (extra.bounds || rows.mu[k] !== 255);
-
-function squares(pen, view, { rows, x, y, kind, side }, extra, drawn) {
-  const wide = side * view.scale, px = Math.max(LEAST_PX, wide), colours = fills(), box = view.box;
-  let ink = -1;
-  for (const hollow of [true, false]) {  // colours lie over what is hollow
-    for (let k = 0; k < rows.count; k++) {
-      if ((kind[k] === HOLLOW) !== hollow || x[k] > box.east || x[k] + side < box.west || y[k] > box.south || y[k] + side < box.north || !passes(rows, k, extra)) continue;
-      const left = view.left(x[k]), top = view.top(y[k]);
-      drawn[kind[k]]++;
-      if (hollow) { frame(pen, left, top, px); continue; }
-      if (kind[k] !== ink) { ink = kind[k]; pen.fillStyle = colours[ink]; }
-      pen.fillRect(left, top, px, px);
-      if (rows.basis[k] === BORROWED) dotted(pen, left, top, px);
-      if (rows.unknown[k] && px >= NOTCH_PX && rows.basis[k] !== BORROWED) {
-        const notch = px * Math.sqrt(rows.unknown[k] / 254) * .8;
-        pen.fillStyle = groundColour();
-        pen.fillRect(left + (px - notch) / 2, top + (px - notch) / 2, notch, notch);
-        ink = -1;
-      }
-    }
-  }
-}
-
-function frame(pen, left, top, px) {
-  pen.fillStyle = groundColour();
-  pen.fillRect(left, top, px, px);
-  pen.strokeStyle = BOUND_INK;
-  pen.lineWidth = 1;
-  pen.strokeRect(left + .5, top + .5, px - 1, px - 1);
-}
-
-function dotted(pen, left, top, px) {
-  pen.strokeStyle = TRUTH_INK;
-  pen.setLineDash([2, 2]);
-  pen.strokeRect(left + .5, top + .5, px - 1, px - 1);
-  pen.setLineDash([]);
-}
+// What a person asked to see, or null: all.
+const passing = extra => extra.oldest === 0 && extra.bounds ? null : (rows, k) => (extra.oldest === 0 || rows.last[k] >= extra.oldest) && (extra.bounds || rows.mu[k] !== 255);
 
 // 0 east, 1 north, 2 west, 3 south: the triangle on that side of the square.
 export const SIDES = [[1, 0, 1, 1], [1, 0, 0, 0], [0, 0, 0, 1], [0, 1, 1, 1]];
 
-function headings(pen, view, { rows, x, y, kind, side }, extra, drawn) {
+function headings(pen, view, { rows, x, y, kind, side }, passes, drawn) {
   const px = side * view.scale, colours = fills(), box = view.box;
   for (let k = 0; k < rows.count; k++) {
-    if (x[k] > box.east || x[k] + side < box.west || y[k] > box.south || y[k] + side < box.north || !passes(rows, k, extra)) continue;
+    if (x[k] > box.east || x[k] + side < box.west || y[k] > box.south || y[k] + side < box.north || passes && !passes(rows, k)) continue;
     const left = view.left(x[k]), top = view.top(y[k]), [ax, ay, bx, by] = SIDES[rows.place[k] & 3];
     drawn[kind[k]]++;
     const cx = left + px / 2, cy = top + px / 2, inset = px * .04, toward = (v, middle) => v + Math.sign(middle - v) * inset;

@@ -14,6 +14,8 @@ export class Timeline {
     this.play = make("button", { type: "button", id: "play", onclick: () => this.timer ? this.stop() : this.start() }, say("time.play"));
     this.compare = make("button", { type: "button", id: "compare", "aria-pressed": "false", onclick: () => app.compare(!app.comparing) }, say("time.compare"));
     this.none = make("span", { class: "note" }, say("time.none"));
+    addEventListener("beforeprint", () => this.say(true));  // paper has no clock beside it
+    addEventListener("afterprint", () => this.say());
     footer.append(this.play, this.slider, this.shown, this.compare, this.none);
   }
 
@@ -37,8 +39,9 @@ export class Timeline {
     this.say();
   }
 
-  say() {
-    const words = this.at === null ? say("time.now") : say("time.shown", { moment: clock(this.at) });
+  say(printed = false) {
+    const now = printed ? say("time.printed", { moment: clock(this.app.live.now()) }) : say("time.now");
+    const words = this.at === null ? now : say("time.shown", { moment: clock(this.at) });
     this.shown.textContent = words;
     this.slider.setAttribute("aria-valuetext", words);
     const any = this.moments.length > 0;

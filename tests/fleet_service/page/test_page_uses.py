@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Final
 
 import pytest
@@ -84,6 +85,8 @@ def test_on_paper_are_the_map_and_the_words_and_nothing_to_press(page: RunningPa
         near(seen, cell_of("ice"), 17)
         waits(seen, f"document.body.dataset.kinds.split(',')[0] == {street.known('ice')}")
         seen.page.emulate_media(media="print")
+        seen.page.evaluate("dispatchEvent(new Event('beforeprint'))")
+        assert re.fullmatch(r"as of \d{4}-\d\d-\d\d \d\d:\d\d:\d\d", seen.page.locator("#moment").inner_text())
         for selector in ("#tabs", "#controls", "#play", "#slider"):
             assert not seen.page.locator(selector).is_visible(), selector
         for selector in ("#map", "#panel", "#scale", "#moment"):
@@ -92,6 +95,8 @@ def test_on_paper_are_the_map_and_the_words_and_nothing_to_press(page: RunningPa
         assert panel[0] <= panel[1] + 1, "no word is cut off"
         assert seen.page.pdf()[:5] == b"%PDF-"
         look(seen, "print")
+        seen.page.evaluate("dispatchEvent(new Event('afterprint'))")
+        assert seen.page.locator("#moment").inner_text() == "now"
 
 
 def test_a_dropped_gpx_is_a_route(page: RunningPage, drive: Drive) -> None:

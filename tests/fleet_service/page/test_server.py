@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gzip
 import http.client
 import json
 import signal
@@ -102,6 +103,18 @@ def test_a_file_outside_the_page_and_another_hosts_name_are_refused(bare: str) -
         assert ask(bare, path)[0] == 404
     assert ask(bare, "/", Host="elsewhere.example")[0] == 421
     assert ask(bare, "/", Host="localhost:1")[0] == 200
+
+
+def test_a_file_comes_packed_where_the_browser_takes_it_and_not_again_where_it_has_it(bare: str) -> None:
+    _, plain, text = ask(bare, "/static/main.js")
+    assert "content-encoding" not in plain
+    _, packed, body = ask(bare, "/static/main.js", **{"Accept-Encoding": "gzip"})
+    assert packed["content-encoding"] == "gzip"
+    assert gzip.decompress(body) == text
+    status, again, nothing = ask(bare, "/static/main.js", **{"If-None-Match": plain["etag"]})
+    assert (status, nothing) == (304, b"")
+    assert again["etag"] == packed["etag"] == plain["etag"]
+    assert "javascript" in plain["content-type"]
 
 
 def test_who_connects_is_told_what_stands_and_then_what_changes(page: RunningPage, drive: Drive) -> None:

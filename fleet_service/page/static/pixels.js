@@ -1,0 +1,82 @@
+// Squares as numbers in memory: of twenty thousand, each a call of the canvas, a browser without a graphics card paints
+// some eight pictures a second; written into one picture it is as many as it shows.
+import { BORROWED } from "./blocks.js";
+import { HOLLOW, fills, groundColour } from "./colours.js";
+
+const BOUND_INK = "#7d7d7d", DASH_INK = "#000000", LEAST_PX = 3, NOTCH_PX = 6, DASH_PX = 2;
+
+const word = colour => {  // "#rrggbb" as the four bytes of a point
+  const [r, g, b] = [1, 3, 5].map(k => parseInt(colour.slice(k, k + 2), 16));
+  return new Uint32Array(new Uint8Array([r, g, b, 255]).buffer)[0];
+};
+
+export class Pixels {
+  constructor() { this.canvas = document.createElement("canvas"); }
+
+  // Begin a picture of so many points, `ratio` to a pixel of the page; opaque where nothing lies below it.
+  begin(width, height, ratio, opaque) {
+    if (this.canvas.width !== width || this.canvas.height !== height || !this.image) {
+      Object.assign(this.canvas, { width, height });
+      this.image = new ImageData(Math.max(1, width), Math.max(1, height));
+      this.points = new Uint32Array(this.image.data.buffer);
+    }
+    Object.assign(this, { width, height, ratio, opaque, line: Math.max(1, Math.round(ratio)) });
+    this.ground = word(groundColour());
+    this.inks = fills().map(word);
+    this.bound = word(BOUND_INK);
+    this.dash = word(DASH_INK);
+    this.points.fill(opaque ? this.ground : 0);
+  }
+
+  show(pen) {
+    if (this.opaque) { pen.putImageData(this.image, 0, 0); return; }
+    this.canvas.getContext("2d").putImageData(this.image, 0, 0);
+    pen.drawImage(this.canvas, 0, 0, this.width / this.ratio, this.height / this.ratio);
+  }
+
+  // A tile's squares; those that are hollow lie below the coloured ones. Counts what is in view, by kind.
+  squares(view, { rows, column, row, kind, side, west, north, steps }, passes, drawn) {
+    const px = side * view.scale * this.ratio, least = LEAST_PX * this.ratio, notched = px >= NOTCH_PX * this.ratio;
+    const edges = first => {  // where the columns, or rows, begin and end; neighbours meet without a gap
+      const from = new Int32Array(steps), to = new Int32Array(steps);
+      for (let k = 0; k < steps; k++) {
+        from[k] = Math.round(first + k * px);
+        to[k] = Math.round(first + k * px + Math.max(px, least));
+      }
+      return [from, to];
+    };
+    const [lefts, rights] = edges(view.left(west) * this.ratio), [tops, bottoms] = edges(view.top(north) * this.ratio);
+    for (let hollow = 1; hollow >= 0; hollow--) {
+      for (let k = 0; k < rows.count; k++) {
+        const what = kind[k];
+        if ((what === HOLLOW) !== (hollow === 1) || passes && !passes(rows, k)) continue;
+        const left = lefts[column[k]], right = rights[column[k]], top = tops[row[k]], bottom = bottoms[row[k]];
+        if (right <= 0 || bottom <= 0 || left >= this.width || top >= this.height) continue;
+        drawn[what]++;
+        this.fill(left, top, right, bottom, hollow ? this.bound : this.inks[what]);
+        if (hollow) this.fill(left + this.line, top + this.line, right - this.line, bottom - this.line, this.ground);
+        else if (rows.basis[k] === BORROWED) this.dashed(left, top, right, bottom);
+        else if (notched && rows.unknown[k]) {
+          const notch = px * Math.sqrt(rows.unknown[k] / 254) * .8, x = Math.round(left + (px - notch) / 2), y = Math.round(top + (px - notch) / 2);
+          this.fill(x, y, Math.round(x + notch), Math.round(y + notch), this.ground);
+        }
+      }
+    }
+  }
+
+  // What is beyond the picture's edges is left out.
+  fill(left, top, right, bottom, ink) {
+    const { points, width } = this, from = Math.max(0, left), to = Math.min(width, right), last = Math.min(this.height, bottom);
+    for (let y = Math.max(0, top); y < last; y++)
+      for (let at = y * width + from, end = y * width + to; at < end; at++) points[at] = ink;
+  }
+
+  // A dashed line around.
+  dashed(left, top, right, bottom) {
+    const { line } = this, step = Math.round(DASH_PX * this.ratio);
+    for (let x = left; x < right; x += 2 * step)
+      for (const y of [top, bottom - line]) this.fill(x, y, Math.min(right, x + step), y + line, this.dash);
+    for (let y = top; y < bottom; y += 2 * step)
+      for (const x of [left, right - line]) this.fill(x, y, x + line, Math.min(bottom, y + step), this.dash);
+  }
+}
