@@ -1,7 +1,7 @@
 """The service without its network: messages in; alerts, tiles, acknowledgements and answers out.
 
-One worker calls `ingest`, `begin_flush`, `written`, `flush`, `tiles` and `fade_alerts`; queries come from other
-threads, so that a lock guards the map.
+One worker calls `ingest`, `begin_flush`, `written`, `flush`, `tile` and `fade_alerts`; queries come from other threads,
+so that a lock guards the map.
 """
 
 from __future__ import annotations
@@ -351,10 +351,14 @@ class Engine:
             self._tiles.acknowledge()
         return self._acks.messages(self._now)
 
+    def tile(self, tile: int, now: int) -> bytes:
+        """The Arrow stream of a tile as far as it is public; empty where nothing of it is."""
+        shown = self._tiles.make(tile, now)
+        return shown.payload if shown.cells.num_rows else b""
+
     def tiles(self, now: int) -> list[tuple[int, bytes]]:
-        """Tile and Arrow stream of every tile that changed since the last call, as far as it is public."""
-        made = ((tile, self._tiles.make(tile, now)) for tile in self.map.take_dirty())
-        return [(tile, shown.payload) for tile, shown in made if shown.cells.num_rows]
+        """Tile and `tile` of every one that changed since the last call and is not empty."""
+        return [(tile, stream) for tile in self.map.take_dirty() if (stream := self.tile(tile, now))]
 
     def whole_map(self, now: int) -> pa.Table:
         """All public cells; the lock is held for a few at a time, so that ingest goes on."""
@@ -387,14 +391,9 @@ class Engine:
         at = nanoseconds(query.at)
         if at > now:
             raise InputError("at", "lies in the future", "give a time that has been")
-        return ask(
-            self._root, PastQuery(query, at, self._config.lateness_s, only, self._config.public_vehicles), wanted
-        )
+        past = PastQuery(query, at, self._config.lateness_s, only, self._config.public_vehicles)
+        return ask(self._root, past, wanted)
 
     def cells(self, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None) -> int:
-        """Cells that an answer may have at the most.
-
-        Raises:
-            InputError: as `answer`.
-        """
+        """Cells that an answer may have at the most; errors as of `answer`."""
         return cells_asked(self._tiles, query, wanted, only)

@@ -29,6 +29,7 @@ _SINGLE: Final = {
     "overload": "messages dropped because the queue was full",
     "limited": "messages dropped because their vehicle sent too much",
     "late": "observations archived and not fused",
+    "tile_rounds_skipped": "rounds of tiles left out, since the one before was not done",
     "queries": "queries",
 }
 

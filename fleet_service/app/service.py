@@ -2,7 +2,7 @@
 
 subscribers ─► inbox ─► worker: ingest ─► alerts at once
                                 flush ─► thread: segment on disk ─► acknowledgements
-                                tiles once a second
+                                tiles once a second, with the time that is left
 queryables  ─► answers, in Zenoh's threads
 """
 
@@ -26,6 +26,7 @@ from fleet_service.ingest.inbox import Inbox, Message
 from fleet_service.ingest.rate_limit import RateLimiter
 from fleet_service.ingest.weather import WeatherMessage
 from fleet_service.serve.queryable import Answering, MapQueryable
+from fleet_service.serve.tile_rounds import SHARE_S, TileRounds
 from schemas import grid, keys, wire
 from schemas.config import ServiceConfig, load
 from schemas.query import MapQuery
@@ -41,6 +42,7 @@ HANGS_S: Final = 60.0  # of a segment that is being written: the disk is gone, a
 STATUS_S: Final = 5.0
 LEAVE_S: Final = 1.5  # of the three seconds in which a service is gone
 SURVIVED_S: Final = 20.0  # a service that is still there has not died of its checkpoint
+BEHIND: Final = 1000  # messages that wait; a worker that is so far behind puts one tile a turn
 LAG_S: Final = 1.0  # of the system's clock that is worth telling
 
 
@@ -68,7 +70,10 @@ class Service:
         self._upkeep = Upkeep(jobs, self.engine.counts, log_line)
         self.failure: BaseException | None = None  # of the worker; leaving the session after it may hang
         self._session: zenoh.Session | None = None
-        self._stepped_at = self._put_at = self._flushed_at = self._reported_at = self._repeated_at = time.monotonic()
+        self._rounds = TileRounds(
+            config.put_s, lambda: self.engine.map.take_dirty(), self._put_tile, self.engine.counts, time.monotonic
+        )
+        self._stepped_at = self._flushed_at = self._reported_at = self._repeated_at = time.monotonic()
         self._reported, self._began, self._survived = 0, self._stepped_at, False
 
     def run(self, stop: threading.Event) -> None:
@@ -158,18 +163,16 @@ class Service:
         if self.engine.full:
             stop.wait(IDLE_S)
         else:
-            self._take(session, self.inbox.drain(IDLE_S))
+            self._take(session, self.inbox.drain(0.0 if self._rounds.waiting else IDLE_S))
         now = self._stepped_at = time.monotonic()
         self._acknowledge(session, self.engine.written())
         if now - self._flushed_at >= self._config.segment_s:
             self._flushed_at = now
             self._acknowledge(session, self.engine.begin_flush())
             self.engine.update_weather(self._clock.now())
-        if now - self._put_at >= self._config.put_s:
-            self._put_at = now
-            if (at := self._clock.moment()).sure:
-                self._put_alerts(session, self.engine.fade_alerts(at.now))
-            self._put_tiles(session)
+        if self._rounds.begin() and (at := self._clock.moment()).sure:
+            self._put_alerts(session, self.engine.fade_alerts(at.now))
+        self._rounds.go_on(SHARE_S if len(self.inbox) < BEHIND else 0.0)
         if now - self._repeated_at >= REPEAT_S:
             self._repeated_at = now
             self._put_alerts(session, self.engine.repeated(REPEATED))
@@ -190,7 +193,7 @@ class Service:
                 break
             self._take(session, messages)
         self._acknowledge(session, self.engine.flush())
-        self._put_tiles(session)
+        self._rounds.finish(max(deadline - time.monotonic(), 0.0))
         self._status(time.monotonic())
 
     def _take(self, session: zenoh.Session, messages: list[Message]) -> None:
@@ -201,9 +204,10 @@ class Service:
         for vehicle, ack in acks:
             put(session, keys.ack_key(vehicle), ack, wire.ACK_ENCODING)
 
-    def _put_tiles(self, session: zenoh.Session) -> None:
-        for tile, stream in self.engine.tiles(self._clock.now()):
-            put(session, keys.map_key(tile), stream, wire.ARROW)
+    def _put_tile(self, tile: int) -> None:
+        stream = self.engine.tile(tile, self._clock.now())
+        if stream and self._session is not None:
+            put(self._session, keys.map_key(tile), stream, wire.ARROW)
 
     def _put_alerts(self, session: zenoh.Session, alerts: list[Alert]) -> None:
         for alert in alerts:

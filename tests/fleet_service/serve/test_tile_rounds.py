@@ -1,0 +1,87 @@
+"""Rounds of tiles: on a grid, each tile in turn, and never more of a turn of the worker than its share."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from fleet_service.serve.tile_rounds import SHARE_S, TileRounds
+
+COST_S = SHARE_S / 2.0  # that a tile takes
+
+
+class Made:
+    """Tiles that change, a clock, and what was put when."""
+
+    def __init__(self) -> None:
+        self.now, self.changed, self.puts, self.counts = 100.0, set[int](), list[tuple[int, float]](), Counter[str]()
+        self.rounds = TileRounds(1.0, self.take, self.put, self.counts, lambda: self.now)
+
+    def take(self) -> list[int]:
+        taken, self.changed = sorted(self.changed), set()
+        return taken
+
+    def put(self, tile: int) -> None:
+        self.puts.append((tile, self.now))
+        self.now += COST_S
+
+    def turn(self, seconds: float = 0.0) -> int:
+        """A turn of the worker that takes so long without its tiles; how many of these it put."""
+        self.now += seconds
+        before = len(self.puts)
+        self.rounds.begin()
+        self.rounds.go_on()
+        return len(self.puts) - before
+
+
+def test_a_turn_never_puts_more_tiles_than_its_share_and_every_tile_has_its_turn() -> None:
+    made = Made()
+    made.changed = set(range(1000))
+    turns = [made.turn(0.01) for _ in range(1000)]
+    assert max(turns) == 2
+    assert sorted(tile for tile, _ in made.puts) == list(range(1000))
+
+
+def test_rounds_for_which_there_is_no_time_are_counted_and_what_changed_meanwhile_is_in_the_next() -> None:
+    made = Made()
+    made.changed = set(range(300))  # three seconds of tiles alone, and as much of the rest of the turns
+    while len(made.puts) < 300:
+        made.turn(SHARE_S)
+        made.changed |= {3, 5}
+    skipped = made.counts["tile_rounds_skipped"]
+    assert skipped >= 2
+    while made.rounds.waiting or len(made.puts) == 300:
+        made.turn(SHARE_S)
+    assert [tile for tile, _ in made.puts[300:]] == [3, 5]
+    assert made.counts["tile_rounds_skipped"] == skipped
+
+
+def test_when_somebody_passed_does_not_move_the_moment_of_a_put() -> None:
+    moments = []
+    for passed in (0.13, 0.64, 0.97):
+        made = Made()
+        while not made.puts:
+            if made.now >= 100.0 + passed:
+                made.changed = {7}
+            made.turn(0.01)
+        moments.append(round(made.puts[0][1], 6))
+    assert len(set(moments)) == 1
+
+
+def test_a_worker_that_stood_still_begins_one_round_and_says_how_many_it_missed() -> None:
+    made = Made()
+    made.changed = {7}
+    made.turn(5.5)
+    assert [tile for tile, _ in made.puts] == [7]
+    assert made.counts["tile_rounds_skipped"] == 4
+    made.changed = {8}
+    assert made.turn(0.3) == 0
+    assert made.turn(0.3) == 1
+
+
+def test_a_service_that_leaves_puts_what_is_left_and_each_once() -> None:
+    made = Made()
+    made.changed = {1, 2, 3, 4, 5}
+    made.turn(1.0)
+    made.changed = {5, 6}
+    made.rounds.finish(1.0)
+    assert [tile for tile, _ in made.puts] == [1, 2, 3, 4, 5, 6]
