@@ -18,9 +18,9 @@ from fleet_service.fusion.observations import Observations, SmallArray
 from fleet_service.fusion.shared import ALARM_KERNELS, KERNELS, read_road, shared_parts
 from fleet_service.fusion.standing import ERRORS, UNKNOWN, Standing, classes, first_standing, unknown
 from fleet_service.fusion.store.cells import Cells
-from fleet_service.fusion.store.records import AGED, NOBODY, NONE, USED, Rows
+from fleet_service.fusion.store.records import AGED, ICE, NOBODY, NONE, USED, Rows
 from fleet_service.fusion.store.store import Store, distinct
-from fleet_service.fusion.trust import judged, newcomer
+from fleet_service.fusion.trust import judged, newcomer, slope_std
 from fleet_service.fusion.votes import PADDED, SCRATCH, P
 from fleet_service.fusion.weather import Reports, Weather, aged, no_reports, weather_of
 from fleet_service.fusion.window import Arrivals, Votes, absorb, commit
@@ -190,8 +190,17 @@ class Fusion:
         return _believed(self.store.state.live, KERNELS, slots)
 
     def alarming(self, slots: IntArray) -> FloatArray:
-        """As `believed`, with the doubt about gentle values that an alarm has to bear, see `shared`."""
-        return _believed(self.store.state.live, ALARM_KERNELS, slots)
+        """As `believed`, with the doubt about gentle values that an alarm has to bear, see `shared`.
+
+        Where the slope of the fleet's values is known, and KNOWN_SOURCES vehicles with a record told of ice within the
+        hour, there is no more doubt than the map has.
+        """
+        if not len(slots) or slope_std(self.store.peers, self.standings[-1]) > c.SLOPE_KNOWN:
+            return _believed(self.store.state.live, ALARM_KERNELS, slots)
+        hour = self.live.time[slots] - int(c.VOTE_RENEWAL_S * NS)
+        known = self.sources(slots, ICE, hour, least=c.TELLING_TRUST)[0] >= c.KNOWN_SOURCES
+        doubtful = _believed(self.store.state.live, ALARM_KERNELS, slots)
+        return np.where(known[:, None], self.believed(slots), doubtful)
 
     def slots_of(self, cell: IntArray, sector: IntArray | SmallArray) -> IntArray:
         """Slot of each cell and sector, -1 where nobody was."""
@@ -209,16 +218,18 @@ class Fusion:
         index = self.store.known(np.array([vehicle]))
         return np.where(index < 0, self.store.vehicles, index)
 
-    def sources(self, slots: IntArray, side: int, since: IntArray | int) -> tuple[IntArray, IntArray]:
+    def sources(
+        self, slots: IntArray, side: int, since: IntArray | int, least: float = c.SOURCE_TRUST
+    ) -> tuple[IntArray, IntArray]:  # fmt: skip
         """Corroborating sources: vehicles that reported GRIP or ICE of slots (k,) after `since` [ns] and are still
-        trusted; how many, and when the last did.
+        trusted, `least` at least; how many, and when the last did.
 
         At most SOURCES are remembered; the last time [ns] is 0 where there is none.
         """
         row, reporters = self.live.reporters[slots], self.store.state.live.reporters
         who = np.where(row[:, None] == NONE, NOBODY, reporters["source"][row, side])
         when = reporters["source_time"][row, side].astype(np.int64) * NS
-        trust = self.standings[-1].weights(np.maximum(who, 0)) >= c.SOURCE_TRUST
+        trust = self.standings[-1].weights(np.maximum(who, 0)) >= least
         counted = (who != NOBODY) & trust & (when > np.reshape(since, (-1, 1)))
         return counted.sum(axis=1), np.where(counted, when, 0).max(axis=1)
 

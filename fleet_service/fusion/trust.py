@@ -233,6 +233,14 @@ def _slope(peers: RecordArray, trust: FloatArray) -> float:
     return float(np.clip(products / squares, 0.0, c.SLOPE_MOST))
 
 
+def slope_std(peers: RecordArray, standing: Standing) -> float:
+    """How well the slope of the fleet's values is known: its standard deviation, SLOPE_STD before anybody told."""
+    vehicles = len(standing.weight)
+    trust = np.minimum(standing.weight.astype(np.float64), 1.0)
+    told = max(float((trust * peers["used_squares"][:vehicles]).sum()), 0.0)
+    return float(1.0 / np.sqrt(told + 1.0 / c.SLOPE_STD**2))
+
+
 def newcomer(established: bool) -> float:
     """Weight of a vehicle that was compared with nobody yet."""
     weight = float(_scaled(np.array([c.TRUST_PRIOR]))[0])

@@ -11,6 +11,7 @@ from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import (
     BOUND,
     REACH,
+    SLIPPERY_SHARE,
     VALUE,
     Bins,
     OwnError,
@@ -194,7 +195,7 @@ def update(
         if strength > 0.0:
             note_value(cells, row, entries, entry, strength)
     if weight * entries[entry].share >= c.SOURCE_TRUST:
-        if entries[entry].slippery >= c.SOURCE_SHARE and _witnesses(entries, entry):
+        if entries[entry].slippery >= c.SOURCE_SHARE and _witnesses(entries, entry, scratch[LIKELIHOOD]):
             _note_source(rows.reporters, sources, ICE, entries[entry].vehicle, time)
         elif entries[entry].slippery <= 1.0 - c.SOURCE_SHARE:
             _note_source(rows.reporters, sources, GRIP, entries[entry].vehicle, time)
@@ -207,9 +208,15 @@ def _aged(seconds: float) -> np.uint16:
 
 
 @refcount_free_inlined
-def _witnesses(entries: RecordArray, entry: int) -> bool:
-    """Whether a value of ice counts for an alert: from a vehicle with a record, or near the limit of what it says."""
-    near = entries[entry].used >= c.WITNESS_SHARE * USED * entries[entry].mean
+def _witnesses(entries: RecordArray, entry: int, likelihood: Bins) -> bool:
+    """Whether a value of ice counts for an alert: from a vehicle with a record, or near the limit of the ice it tells
+    of. A real likelihood of ice has a tail up to dry road, which is no part of what was near its limit."""
+    ice, moment = 0.0, 0.0
+    for i in range(mugrid.BINS):
+        part = likelihood[i] * SLIPPERY_SHARE[i]
+        ice += part
+        moment += part * mugrid.CENTRES[i]
+    near = entries[entry].used * ice >= c.WITNESS_SHARE * USED * moment
     return bool(near or entries[entry].weight >= c.TELLING_TRUST)
 
 

@@ -10,6 +10,9 @@ import pytest
 from fleet_service.fusion import Fusion, shared
 from fleet_service.fusion import constants as c
 from fleet_service.fusion.standing import BIAS_STDS, SPREADS, classes, unknown
+from fleet_service.fusion.store.records import ICE
+from fleet_service.fusion.trust import slope_std
+from schemas import mugrid
 from tests.fleet_service.examples import belief, interval, observations, value
 
 VEHICLES = 30
@@ -85,3 +88,29 @@ def test_a_slope_moves_a_gentle_value_up_and_a_hard_one_not() -> None:
         medians.append(float(np.interp(0.5, np.cumsum(p), np.linspace(0.086, 1.2, 32))))
     assert medians[0] > medians[1] + 0.1
     assert shared.KERNELS.shape[1:] == (32, 32)
+
+
+def test_the_doubt_of_an_alarm_ends_where_the_slope_is_known_and_two_with_a_record_told_of_ice() -> None:
+    fusion, _ = acquainted()
+    assert slope_std(fusion.store.peers, fusion.standings[-1]) < c.SLOPE_KNOWN
+    assert slope_std(Fusion(120.0).store.peers, Fusion(120.0).standings[-1]) == pytest.approx(c.SLOPE_STD)
+    doubt = []
+    for cell, who in ((70, [3, 4]), (71, [900, 901])):
+        o = observations([2500.0, 2501.0], who, value([0.3, 0.3], 0.04), cell=cell)
+        fusion.update(dataclasses.replace(o, used=np.full(2, 0.15, np.float32)))
+        slot = fusion.slots_of(np.array([cell]), np.array([0]))
+        doubt.append(float(np.abs(fusion.alarming(slot) - fusion.believed(slot)).max()))
+    assert doubt[0] == 0.0 < doubt[1]
+
+
+@pytest.mark.parametrize(("used", "witnesses"), [(0.1, 0), (0.19, 1)])
+def test_who_used_most_of_the_ice_it_tells_of_is_a_witness_whatever_it_says_of_dry_road(
+    used: float, witnesses: int
+) -> None:
+    fusion = Fusion(120.0)
+    tailed = np.maximum(value([0.2], 0.04), np.where(mugrid.CENTRES > 0.5, -4.0, -12.0))
+    assert np.exp(tailed)[0] @ mugrid.CENTRES / np.exp(tailed).sum() * c.WITNESS_SHARE > 0.19
+    o = observations([0.0], [1], tailed)
+    fusion.update(dataclasses.replace(o, used=np.array([used], np.float32)))
+    slot = fusion.slots_of(o.cell, o.sector)
+    assert fusion.sources(slot, ICE, 0)[0][0] == witnesses
