@@ -14,6 +14,7 @@ from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantil
 from edge_agent.estimators.friction_mixture.split_sides import BOTH, project
 from edge_agent.estimators.friction_mixture.step import step, velocity
 from edge_agent.estimators.friction_mixture.told import tell_beliefs
+from edge_agent.estimators.friction_mixture.told_interval import LOWER_END, UPPER_END
 from edge_agent.estimators.friction_mixture.workspace import MixtureContext, Scratch
 from schemas.mugrid import CENTRES
 from schemas.numeric import BoolArray, FloatArray
@@ -106,7 +107,7 @@ def _report_friction(friction: Quantiles, upper: float, output: FloatArray, firs
 def report_prior(design: MixtureDesign, output: FloatArray) -> None:
     """Write what is known before the first usable sample: the prior, and no motion with a wide spread."""
     write_unknown(output)
-    for k, level in enumerate((0.5, 0.05, 0.95)):
+    for k, level in enumerate((0.5, LOWER_END, UPPER_END)):
         value = quantile(design.mu, design.prior, design.prior, level)
         output[Column.MU + k] = value
         for wheel in range(4):

@@ -12,12 +12,9 @@ import math
 
 from edge_agent.estimators.friction_mixture.constants import PATCH_NODES
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
-from edge_agent.estimators.friction_mixture.friction_grid import quantile
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
-
-LOWER_END = 0.04  # safe deceleration rests on it: with .05 it lay above the truth for a fifth of the ice in town
 
 
 @compiled
@@ -36,16 +33,3 @@ def refute(patch: FloatArray, weight: FloatArray, log_likelihood: FloatArray) ->
         usual += weight[j] * math.exp(log_likelihood[j])
     for j in range(patch.shape[0]):
         patch[j] *= min(math.exp(log_likelihood[j]) / usual, 1.0)
-
-
-@compiled
-def reported_lower(
-    patch: FloatArray, design: MixtureDesign, weight: FloatArray, lower: float, blended: FloatArray
-) -> float:  # fmt: skip
-    """`lower` of the nodes of one friction with weight (NODES,), or less where a patch may be; blended is scratch."""
-    rest = 1.0
-    for j in range(PATCH_NODES):
-        rest -= patch[j]
-    for j in range(weight.shape[0]):
-        blended[j] = rest * weight[j] + (patch[j] if j < PATCH_NODES else 0.0)
-    return min(lower, quantile(design.mu, design.prior, blended, LOWER_END))

@@ -13,10 +13,10 @@ from edge_agent.estimators.common.readings import believe, rolling_speed
 from edge_agent.estimators.friction_mixture.constants import ALL_NODES, NODES, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.drive_split import FIRST_ODDS
-from edge_agent.estimators.friction_mixture.friction_grid import quantile
-from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles
+from edge_agent.estimators.friction_mixture.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.told_interval import find_interval
 from edge_agent.estimators.friction_mixture.wheel_readings import refuse_jumps
-from edge_agent.estimators.friction_mixture.workspace import BlockFeatures
+from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, Scratch
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
@@ -34,7 +34,7 @@ SLOWEST_M_S = 1.5  # below this speed of vehicle and wheels slip has no meaning,
 
 
 @compiled
-def start(memory: MixtureMemory, design: MixtureDesign, time: float, sample: FloatArray) -> int:
+def start(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, time: float, sample: FloatArray) -> int:
     """Begin the vehicle at its first sample with a finite time; all of its memory is zero."""
     if not math.isfinite(time):
         return flags.TIME_GAP
@@ -64,7 +64,7 @@ def start(memory: MixtureMemory, design: MixtureDesign, time: float, sample: Flo
         put(memory.mean[j], memory.overall_mean)
         put_square(memory.covariance[j], covariance)
     for friction in (memory.friction, memory.friction_left, memory.friction_right):
-        find_quantiles(design, design.prior, friction)
+        find_interval(design, design.prior, memory.patch, scratch.blended, friction)
     for kind in range(3):
         memory.drive_odds[kind] = FIRST_ODDS[kind]
     rolling = memory.rolling
@@ -75,14 +75,6 @@ def start(memory: MixtureMemory, design: MixtureDesign, time: float, sample: Flo
     memory.trust.strain = 1.0
     memory.started = True
     return flags.OK
-
-
-@compiled
-def find_quantiles(design: MixtureDesign, weight: FloatArray, friction: Quantiles) -> None:
-    """Median, 5 % and 95 % of the friction that the nodes of one friction have with weight (NODES,)."""
-    friction.median = quantile(design.mu, design.prior, weight, 0.5)
-    friction.lower = quantile(design.mu, design.prior, weight, 0.05)
-    friction.upper = quantile(design.mu, design.prior, weight, 0.95)
 
 
 @compiled

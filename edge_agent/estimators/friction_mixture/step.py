@@ -17,15 +17,16 @@ from edge_agent.estimators.friction_mixture.block_features import block_features
 from edge_agent.estimators.friction_mixture.constants import NODES, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.drive_split import learn_drive
-from edge_agent.estimators.friction_mixture.ice_patch import drive_onto, reported_lower
+from edge_agent.estimators.friction_mixture.ice_patch import drive_onto
 from edge_agent.estimators.friction_mixture.intake import begin_block, take_sample
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles
 from edge_agent.estimators.friction_mixture.mixing import awake, drive_on, match_moments, wake_or_sleep
 from edge_agent.estimators.friction_mixture.node_filter import predict_node
 from edge_agent.estimators.friction_mixture.residuals import gained_velocity
-from edge_agent.estimators.friction_mixture.restart import find_quantiles, recover, start
+from edge_agent.estimators.friction_mixture.restart import recover, start
 from edge_agent.estimators.friction_mixture.rolling_motion import watch_wheels
 from edge_agent.estimators.friction_mixture.split_sides import BOTH, LEFT, RIGHT, project
+from edge_agent.estimators.friction_mixture.told_interval import find_interval
 from edge_agent.estimators.friction_mixture.trust import judge
 from edge_agent.estimators.friction_mixture.weighing import measure
 from edge_agent.estimators.friction_mixture.workspace import Scratch
@@ -39,7 +40,7 @@ SLOWEST_SLIDING_M_S = 1.0  # slip of the health flag is taken against at least t
 def step(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, time: float, sample: FloatArray) -> int:
     """Take one sample (18,); returns health flags of this sample alone."""
     if not memory.started:
-        return start(memory, design, time, sample) | flags.RESET
+        return start(memory, design, scratch, time, sample) | flags.RESET
     health, whole = take_sample(memory, design, time, sample)
     if whole:
         finish_block(memory, design, scratch)
@@ -118,9 +119,7 @@ def _find_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scratc
         _find_side(memory, design, scratch, RIGHT, memory.friction_right)
         _find_side(memory, design, scratch, BOTH, memory.friction)
     else:
-        find_quantiles(design, memory.weight, memory.friction)
-        lower = memory.friction.lower
-        memory.friction.lower = reported_lower(memory.patch, design, memory.weight[:NODES], lower, scratch.blended)
+        find_interval(design, memory.weight[:NODES], memory.patch, scratch.blended, memory.friction)
         for side in (memory.friction_left, memory.friction_right):
             both = memory.friction
             side.median, side.lower, side.upper = both.median, both.lower, both.upper
@@ -131,8 +130,7 @@ def _find_side(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, side: int, friction: Quantiles
 ) -> None:  # fmt: skip
     project(memory.weight, design.sides.share[side], scratch.projected)
-    find_quantiles(design, scratch.projected, friction)
-    friction.lower = reported_lower(memory.patch, design, scratch.projected, friction.lower, scratch.blended)
+    find_interval(design, scratch.projected, memory.patch, scratch.blended, friction)
 
 
 @compiled

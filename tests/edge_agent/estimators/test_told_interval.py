@@ -1,0 +1,82 @@
+"""The interval that is told of a friction: its levels, and what patches of ice do to it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edge_agent.adaptation.memberships import Memberships
+from edge_agent.estimators.friction_mixture.constants import PATCH_NODES
+from edge_agent.estimators.friction_mixture.design import design_of
+from edge_agent.estimators.friction_mixture.friction_grid import quantile
+from edge_agent.estimators.friction_mixture.memory import MixtureMemory
+from edge_agent.estimators.friction_mixture.told_interval import (
+    DRAWN_IN,
+    LEARNED_END,
+    LOWER_END,
+    UPPER_END,
+    find_interval,
+)
+from edge_agent.estimators.friction_mixture.workspace import MixtureContext
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import nogil
+from schemas.runtime.records import Records, put_record, records
+from schemas.thresholds import SLIPPERY_MU
+
+DESIGN = design_of(Memberships(), adaptive=True)
+
+
+@nogil
+def _tell(
+    contexts: Records[MixtureContext], filters: Records[MixtureMemory], weight: FloatArray, patch: FloatArray
+) -> tuple[float, float, float]:
+    context, friction = contexts[0], filters[0].friction
+    find_interval(context.design, weight, patch, context.scratch.blended, friction)
+    return friction.lower, friction.median, friction.upper
+
+
+def told(weight: FloatArray, patch: float = 0.0) -> tuple[float, float, float]:
+    """Lower end, median, upper end of a belief, with this share of patches of ice."""
+    contexts = records(MixtureContext, 1)
+    put_record(contexts["design"][0], DESIGN)
+    return _tell(contexts, records(MixtureMemory, 1), weight, np.full(PATCH_NODES, patch / PATCH_NODES))
+
+
+def about(mu: float, width: float) -> FloatArray:
+    """A belief about this friction."""
+    weight = DESIGN.prior * np.exp(-0.5 * ((DESIGN.mu - mu) / width) ** 2)
+    return np.asarray(weight / weight.sum())
+
+
+def test_who_knows_nothing_tells_the_prior() -> None:
+    lower, median, upper = told(DESIGN.prior)
+    assert upper == pytest.approx(0.05 + UPPER_END * 1.15, abs=1e-3)
+    assert median == pytest.approx(0.625, abs=1e-3)
+    assert lower == pytest.approx(0.05 + LOWER_END * 1.15, abs=1e-3)
+
+
+def test_a_learned_upper_end_is_nearer_than_a_quantile_of_tempered_evidence() -> None:
+    weight = about(0.8, 0.1)
+    _, median, upper = told(weight)
+    assert median < upper < quantile(DESIGN.mu, DESIGN.prior, weight, UPPER_END)
+    assert upper == pytest.approx(quantile(DESIGN.mu, DESIGN.prior, weight, LEARNED_END), abs=2e-3)
+
+
+def test_a_long_upper_tail_is_not_cut_off() -> None:
+    weight = 0.85 * about(0.35, 0.05) + 0.15 * about(0.9, 0.05)
+    widest = quantile(DESIGN.mu, DESIGN.prior, weight, UPPER_END)
+    assert told(weight)[2] == pytest.approx(widest - DRAWN_IN, abs=1e-9)
+
+
+@pytest.mark.parametrize("mu", [0.2, 0.25, 0.3, 0.35, 0.4])
+def test_slippery_for_sure_is_said_at_95_percent_only(mu: float) -> None:
+    weight = about(mu, 0.08)
+    _, _, upper = told(weight)
+    assert (upper < SLIPPERY_MU) == (quantile(DESIGN.mu, DESIGN.prior, weight, UPPER_END) < SLIPPERY_MU)
+
+
+def test_a_patch_lowers_the_lower_end_alone() -> None:
+    lower, median, upper = told(about(0.8, 0.1))
+    icy, same_median, same_upper = told(about(0.8, 0.1), 0.1)
+    assert icy < 0.2 < lower
+    assert (same_median, same_upper) == (median, upper)
