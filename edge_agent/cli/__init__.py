@@ -49,23 +49,31 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line; returns the exit code."""
     arguments = commandline.joined(sys.argv[1:] if argv is None else argv)
     chosen = next((argument for argument in arguments if not argument.startswith("-")), None)
+    talk.speak(quiet=commandline.wants_quiet(arguments))
+    with nullcontext() if chosen is None or chosen in LIVE else talk.busy(chosen):  # what it loads takes a second
+        code, left = _run(arguments, limited=argv is None and chosen in LIVE, chosen=chosen)
+    if left:
+        from schemas.runtime.process import end_now
+
+        end_now(code)
+    return code
+
+
+def _run(arguments: Sequence[str], *, limited: bool, chosen: str | None) -> tuple[int, bool]:
+    """The exit code, and whether something was left behind that would keep the process from ending."""
     args = commandline.parser_of(*LINE, chosen).parse_args(arguments)
     level = logging.DEBUG if args.verbose else logging.ERROR if args.quiet else logging.INFO
     logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
-    talk.speak(quiet=args.quiet)
     from edge_agent.cli.common import left_behind
-    from schemas.runtime.process import end_now, limit_memory
+    from schemas.runtime.process import limit_memory
 
-    if argv is None and chosen in LIVE:
+    if limited:
         limit_memory()
     code = FAILED
     try:
-        with nullcontext() if chosen in LIVE else talk.busy(str(chosen)):
-            code = commandline.guarded(lambda: int(args.run(args)))
+        code = commandline.guarded(lambda: int(args.run(args)))
     except Exception:
         if not left_behind.is_set():
             raise
         traceback.print_exc()
-    if left_behind.is_set():
-        end_now(code)
-    return code
+    return code, left_behind.is_set()

@@ -67,9 +67,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         from schemas.runtime.process import limit_memory
 
         limit_memory(*UNUSED)
-    arguments = commandline.parser_of(*LINE, chosen).parse_args(given)
-    talk.speak(quiet=arguments.quiet)
-    if arguments.verbose:
-        logging.basicConfig(level=logging.DEBUG, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
-    with nullcontext() if chosen in LIVE else talk.busy(str(chosen)):
+    talk.speak(quiet=commandline.wants_quiet(given))
+    with nullcontext() if chosen is None or chosen in LIVE else talk.busy(chosen):  # what it loads takes a second
+        arguments = commandline.parser_of(*LINE, chosen).parse_args(given)
+        if arguments.verbose:
+            logging.basicConfig(level=logging.DEBUG, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
         return commandline.guarded(lambda: int(arguments.run(arguments)))

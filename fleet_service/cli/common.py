@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from schemas.config import moment
 from schemas.errors import InputError
+from schemas.runtime import talk
 
 if TYPE_CHECKING:
     from fleet_service.client.datex import Supplier
@@ -79,6 +80,7 @@ def confirmed(arguments: argparse.Namespace, what: str) -> bool:
     """Whether a person on a terminal agrees; who is no terminal has decided already."""
     if arguments.yes or not sys.stdin.isatty():
         return True
+    talk.hush()
     print(f"{what}. This cannot be undone. Go on? [y/N] ", end="", file=sys.stderr, flush=True)
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 

@@ -70,6 +70,11 @@ def add_command(commands: Any, name: str, about: str, example: str) -> argparse.
     return parser
 
 
+def wants_quiet(arguments: Sequence[str]) -> bool:
+    """Whether a command line asks for errors only, before it is parsed."""
+    return not {"-q", "--quiet"}.isdisjoint(arguments)
+
+
 class VersionAction(argparse.Action):
     """`--version`: that of the distribution that is installed."""
 

@@ -24,6 +24,7 @@ class _Voice:
         self.words = ""
         self.told: set[str] = set()
         self.shown: Any = None
+        self.timer: threading.Timer | None = None
         self.lock = threading.Lock()
 
 
@@ -65,18 +66,21 @@ def busy(words: str) -> Iterator[None]:
         yield
         return
     doing(words)
-    timer = threading.Timer(PATIENCE_S, _show)
-    timer.daemon = True
-    timer.start()
+    _voice.timer = threading.Timer(PATIENCE_S, _show)
+    _voice.timer.daemon = True
+    _voice.timer.start()
     try:
         yield
     finally:
+        hush()
+
+
+def hush() -> None:
+    """Let nothing turn from here on: the command is over, or asks its person something."""
+    timer, _voice.timer = _voice.timer, None
+    if timer is not None:
         timer.cancel()
         timer.join()
-        _hide()
-
-
-def _hide() -> None:
     with _voice.lock:
         shown, _voice.shown = _voice.shown, None
     if shown is not None:

@@ -69,17 +69,25 @@ def run(folder: Path) -> list[str]:
                     staying.pop()
                 continue
             line = [sys.executable, "-c", command] if "\n" in command else ["bash", "-c", command]
-            with log.open("wb") as out:
-                done = subprocess.run(
-                    line, cwd=folder, stdout=out, stderr=out, check=False, timeout=LONGEST_S,
-                    env={"PATH": f"{bin_folder}:/usr/bin:/bin", "HOME": str(Path.home())},
-                )  # fmt: skip
-            if done.returncode:
-                failed.append(f"{command}: {done.returncode}: {_last(log)}")
+            code = _ended(line, folder, log, {"PATH": f"{bin_folder}:/usr/bin:/bin", "HOME": str(Path.home())})
+            if code:
+                failed.append(f"{command}: {code}: {_last(log)}")
     finally:
         for words, process in staying:
             _end(words, process, failed)
     return failed
+
+
+def _ended(line: list[str], folder: Path, log: Path, environment: dict[str, str]) -> int | str:
+    """The exit code of a command, or that it did not end."""
+    with log.open("wb") as out:
+        try:
+            done = subprocess.run(
+                line, cwd=folder, stdout=out, stderr=out, check=False, timeout=LONGEST_S, env=environment
+            )
+        except subprocess.TimeoutExpired:  # the others are tried all the same
+            return f"did not end within {LONGEST_S:g} s"
+    return done.returncode
 
 
 def _wait(command: str, process: subprocess.Popen[bytes], log: Path) -> None:
