@@ -17,7 +17,9 @@ from typing import Final
 # A service writes a segment each second and starts within some; it is not away before that.
 SILENT_S: Final = 8.0
 FIRST_PROBE_S: Final = 4.0
-LONGEST_PROBE_S: Final = 300.0  # a thousand cars then cost a service that is away three messages a second
+# A thousand cars then cost a service that is away eight messages a second. After five minutes, cars came back one after
+# the other for longer than their backlog of an hour takes, and the service was idle in between.
+LONGEST_PROBE_S: Final = 120.0
 FIRST_WINDOW: Final = 16.0  # batches in flight; 3 kB, as much as TCP begins with
 LEAST_WINDOW: Final = 8.0  # a batch a vehicle, kind and second is put in any case
 LARGEST_WINDOW: Final = 512.0  # in a second, which is what a service takes for an answer: 100 kB
