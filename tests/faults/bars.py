@@ -22,7 +22,7 @@ BARS: Final = {
     "faults.kill.map_difference": Bar("of mu, its bounds, P(slippery)", 1e-6),
     "faults.kill.upkeep": Bar("jobs that the kills met", 2, "more"),
     "faults.kill.kills": Bar("processes killed", 200, "more"),
-    "faults.kill.offered_per_s": Bar("observations/s, drains included", 5000, "more"),
+    "faults.kill.offered_per_s": Bar("observations/s amid the kills", 5000, "more"),
     "faults.compaction.incomplete_reads": Bar("reads", 0),
     "faults.compaction.kills": Bar("kills", 5, "more"),
     "faults.compaction.reads": Bar("reads", 10, "more"),

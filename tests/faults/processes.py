@@ -143,12 +143,27 @@ class Stage:
         return [part.log for part in self.loads]
 
     def drain(self, patience_s: float) -> None:
-        """No new observations; wait until every generator has all of its batches settled, or patience ends."""
+        """No new observations; wait until every generator has all of its batches settled.
+
+        Ends before if none settles anything for `patience_s`: what is left in an outbox then is missing in the archive,
+        and counted there.
+        """
         for part in self.loads:
             part.line_with("ready: ")  # before, the signal would end it
             part.send(signal.SIGUSR1)
-        with suppress(TimeoutError):  # what is left in a outbox then is missing in the archive, and counted there
-            until(lambda: not any(part.alive for part in self.loads), patience_s)
+        with suppress(TimeoutError):
+            while any(part.alive for part in self.loads):
+                self._news(patience_s)
+
+    def _news(self, patience_s: float) -> None:
+        """Wait until the generators have told more than now, or are gone. TimeoutError: nothing for so long."""
+        told = sum(journal.stat().st_size for journal in self.journals)
+
+        def news() -> bool:
+            more = sum(journal.stat().st_size for journal in self.journals) > told
+            return more or not any(part.alive for part in self.loads)
+
+        until(news, patience_s)
 
 
 @contextmanager
