@@ -25,12 +25,11 @@ from tests.benchmarks.service import service
 from tests.benchmarks.shards import shards
 from tests.benchmarks.state import state
 from tests.benchmarks.step import bank, step
+from tests.benchmarks.tiles import tiles
 
 FOLDER = Path(".bench")
-PARTS: dict[str, Callable[[], list[Figure]]] = {
-    part.__name__: part
-    for part in (step, bank, estimators, agent, contract, fusion, ingest, growth, service, shards, state, cluster)
-}
+_ALL = (step, bank, estimators, agent, contract, fusion, ingest, growth, service, tiles, shards, state, cluster)
+PARTS: dict[str, Callable[[], list[Figure]]] = {part.__name__: part for part in _ALL}
 
 
 def main() -> int:

@@ -1,0 +1,177 @@
+"""Thin traffic over many tiles: how long an acknowledgement takes beside them, and a tile behind who asks for all.
+
+1 600 vehicles, each in a row of five tiles of its own, go back and forth and send a visit each 1.07 s. Router, service,
+vehicles and readers are processes of their own.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import zenoh
+
+from deploy.router import open_router
+from schemas import grid, keys, wire
+from schemas.config import ZenohSettings
+from schemas.proto import gripmap_pb2 as pb
+from schemas.runtime.figures import Figure
+from schemas.runtime.zenoh_session import open_session
+from schemas.wire import Batch, Kind
+from tests.benchmarks.service import LATITUDE, LONGITUDE, SECOND, ask, process, until
+from tests.fleet_service.examples import batch
+
+RATE = 1500  # visits/s of all vehicles
+VEHICLES, ROW = 1600, 5
+TILES = VEHICLES * ROW
+TURNS = (0, 1, 2, 3, 4, 3, 2, 1)  # of a vehicle: neighbouring tiles, as no car is in two towns at once
+WARM_S, MEASURED_S, PATIENCE_S = 8.0, 20.0, 60.0
+READERS, QUESTIONS = 2, 200
+_ACROSS = 2 ** (grid.TILE_ZOOM - grid.REGION_ZOOM)  # tiles of a region's side
+_ROWS = _ACROSS // ROW
+
+
+def visit(vehicle: int, turn: int) -> Batch:
+    """One vehicle's visit to the middle of one of its tiles."""
+    first = grid.cell_of(LATITUDE, LONGITUDE, grid.REGION_ZOOM)
+    x, y = (int(v) for v in grid.deinterleave(first))
+    region, place = divmod(vehicle, _ROWS * _ACROSS)
+    tile_y, row = divmod(place, _ROWS)
+    tile = grid.interleave(
+        np.array([(x + region) * _ACROSS + row * ROW + TURNS[turn]]), np.array([y * _ACROSS + tile_y])
+    )
+    latitude, longitude = grid.centre(tile, grid.TILE_ZOOM)
+    cell = grid.cell_of(latitude, longitude)
+    latitude, longitude = grid.centre(cell)
+    one = batch(f"thin-{vehicle:04d}", 1, time.time_ns(), [0.8], cell=cell, latitude=latitude, longitude=longitude)
+    return replace(one, region=int(grid.region_of(cell[0])))
+
+
+class Acks:
+    """When each batch was put, and for how long it waited for its acknowledgement."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.put: dict[tuple[str, int], float] = {}
+        self.waits: dict[tuple[str, int], float] = {}
+        self._subscriber = session.declare_subscriber(f"{keys.ROOT}/ack/*", self._hear)
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        now, (vehicle, streams) = time.perf_counter(), wire.decode_ack(sample.payload.to_bytes())
+        for stream in streams:
+            for first, last in stream.durable:
+                for seq in range(first, last + 1):
+                    self.waits[vehicle, seq] = now - self.put[vehicle, seq]
+
+    def of(self, since: float) -> list[float]:
+        """Waits of what was put since then; infinite where nothing came."""
+        return [self.waits.get(name, float("inf")) for name, at in list(self.put.items()) if at >= since]
+
+
+def drive(endpoint: str) -> None:
+    """Send until the time is over, wait for what is not acknowledged, and say how long each took."""
+    session = open_session(ZenohSettings(connect=[endpoint]))
+    assert session is not None
+    acks, encoding = Acks(session), wire.ENCODING[Kind.OBSERVATION]
+    cars = []
+    for vehicle in range(VEHICLES):
+        turns = [visit(vehicle, turn) for turn in range(len(TURNS))]
+        messages = [pb.ObservationBatch.FromString(wire.encode(one)) for one in turns]
+        cars.append((turns[0].vehicle, keys.observation_key(turns[0].region, turns[0].vehicle), messages))
+    began, sent = time.perf_counter(), 0
+    while time.perf_counter() - began < WARM_S + MEASURED_S:
+        turn, vehicle = divmod(sent, VEHICLES)
+        name, place, messages = cars[vehicle]
+        message, now = messages[turn % len(TURNS)], time.time_ns()
+        message.seq, message.leave_time[0], message.enter_time[0] = turn + 1, now, now - SECOND
+        acks.put[name, turn + 1] = time.perf_counter()
+        session.put(
+            place, message.SerializeToString(), encoding=encoding, congestion_control=zenoh.CongestionControl.BLOCK
+        )
+        sent += 1
+        time.sleep(max(began + sent / RATE - time.perf_counter(), 0.0))
+    took, since = time.perf_counter() - began, began + WARM_S
+    deadline = time.perf_counter() + PATIENCE_S
+    while len(acks.waits) < sent and time.perf_counter() < deadline:
+        time.sleep(0.05)
+    waits = acks.of(since)
+    found = {"p50": statistics.median(waits), "p99": float(np.quantile(waits, 0.99)), "rate": sent / took}
+    print(json.dumps({**found, "acknowledged": len(acks.waits) / sent}), flush=True)
+    session.close()
+
+
+def read(endpoint: str) -> None:
+    """Ask for the whole map again and again; a line for each whole answer."""
+    session = open_session(ZenohSettings(connect=[endpoint]))
+    assert session is not None
+    while True:
+        replies = [reply for reply in session.get(f"{keys.ROOT}/map/**", timeout=60.0) if reply.ok]
+        print(len(replies), flush=True)
+
+
+def _answers(endpoint: str, client: zenoh.Session, tile: str) -> tuple[list[float], int]:
+    """How long questions for one tile take [ms] while READERS ask for all; and tiles that these got."""
+    words = [sys.executable, "-c", f"from tests.benchmarks.tiles import read; read({endpoint!r})"]
+    readers = [subprocess.Popen(words, stdout=subprocess.PIPE, text=True) for _ in range(READERS)]
+    waits, pause = [], threading.Event()
+    try:
+        for reader in readers:
+            assert reader.stdout
+            reader.stdout.readline()
+        for _ in range(QUESTIONS):
+            began = time.perf_counter()
+            assert ask(client, tile), "the service does not know the tile"
+            waits.append(1e3 * (time.perf_counter() - began))
+            pause.wait(0.02)
+    finally:
+        for reader in readers:
+            reader.terminate()
+    got = sum(int(line) for reader in readers for line in reader.stdout or ())
+    for reader in readers:
+        reader.wait()
+    return waits, got
+
+
+def tiles() -> list[Figure]:
+    """1 500 visits/s over 8 000 tiles: acknowledgements, tiles put, and a small question behind large ones."""
+    puts: dict[str, int] = {}
+
+    def hear(sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
+        puts[key] = puts.get(key, 0) + 1
+
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        router, (endpoint, *_) = open_router(listen="tcp/127.0.0.1:0")
+        stack.enter_context(router)
+        config = folder / "service.json"
+        config.write_text(json.dumps({"zenoh": {"connect": [endpoint]}}))
+        words = ("-m", "fleet_service.cli", "run", "--archive", str(folder / "archive"), "--config", str(config))
+        stack.enter_context(process(*words))
+        client = open_session(ZenohSettings(connect=[endpoint]))
+        assert client is not None
+        stack.enter_context(client)
+        until(lambda: list(client.liveliness().get(f"{keys.ROOT}/shard/*")))
+        client.declare_subscriber(f"{keys.ROOT}/map/**", hear)
+        command = [sys.executable, "-c", f"from tests.benchmarks.tiles import drive; drive({endpoint!r})"]
+        done = subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True)
+        found = json.loads(done.stdout.splitlines()[-1])
+        small, got = _answers(endpoint, client, keys.map_key(int(grid.tile_of(visit(0, 0).columns["cell"][0]))))
+    return [
+        Figure("bench.tiles.ack_p99_s", found["p99"], "s, publish to acknowledgement, 8 000 tiles", 1),
+        Figure("bench.tiles.ack_p50_s", found["p50"], "s"),
+        Figure("bench.tiles.acknowledged", found["acknowledged"], "of the batches", 1, "more"),
+        Figure("bench.tiles.rate", found["rate"], "visits/s offered", 0.95 * RATE, "more"),
+        Figure("bench.tiles.shown", float(len(puts)), "tiles that were put", 0.95 * TILES, "more"),
+        Figure("bench.tiles.put_per_s", sum(puts.values()) / (WARM_S + MEASURED_S), "tiles/s that were put"),
+        Figure("bench.query.small_behind_all_p99_ms", float(np.quantile(small, 0.99)), "ms, beside two for all", 100),
+        Figure("bench.query.all_tiles", float(got), "tiles that who asked for all got meanwhile", TILES, "more"),
+    ]
