@@ -47,7 +47,7 @@ from fleet_service.replay import checkpoints
 from fleet_service.replay.checkpoints import Taken
 from fleet_service.replay.restart import image_of
 from fleet_service.serve.encode import batch_of
-from fleet_service.serve.query import answer, cells_asked
+from fleet_service.serve.query import AnswerSize, answer, size_asked
 from fleet_service.serve.tile_cache import TileCache
 from schemas import grid, wire
 from schemas.config import ServiceConfig, nanoseconds
@@ -394,6 +394,6 @@ class Engine:
         past = PastQuery(query, at, self._config.lateness_s, only, self._config.public_vehicles)
         return ask(self._root, past, wanted)
 
-    def cells(self, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None) -> int:
-        """Cells that an answer may have at the most; errors as of `answer`."""
-        return cells_asked(self._tiles, query, wanted, only)
+    def size(self, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None) -> AnswerSize:
+        """What an answer may have at the most; errors as of `answer`."""
+        return size_asked(self._tiles, query, wanted, only)

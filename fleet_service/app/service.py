@@ -64,7 +64,7 @@ class Service:
         self.engine = Engine(config, root)
         self._clock = SteadyClock(self.engine.seen)
         limits = RateLimiter(config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, known, self.engine.counts)
-        self._replies = MapQueryable(Answering(self.engine.cells, self._answer), self.engine.counts)
+        self._replies = MapQueryable(Answering(self.engine.size, self._answer), self.engine.counts)
         self.inbox = Inbox(config.queue_batches, self.engine.counts, limits)
         jobs = archive_jobs(self.engine, config, root, self._clock.moment)
         self._upkeep = Upkeep(jobs, self.engine.counts, log_line)

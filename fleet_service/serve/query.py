@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -49,12 +49,19 @@ def answer(
                 yield tile, payload
 
 
-def cells_asked(cache: TileCache, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None) -> int:
-    """Cells of all tiles that an answer looks at; arguments and errors as of `answer`."""
+class AnswerSize(NamedTuple):
+    """What an answer has at the most."""
+
+    cells: int
+    tiles: int
+
+
+def size_asked(cache: TileCache, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None) -> AnswerSize:
+    """Size of all tiles that an answer looks at; arguments and errors as of `answer`."""
     route = keys_along(query.route) if query.route else None
     tiles = [tile for tile in _tiles(cache, query, route, only) if only is not None or wanted(tile)]
     with cache.guard:
-        return sum(cache.state.count(tile) for tile in tiles)
+        return AnswerSize(sum(cache.state.count(tile) for tile in tiles), len(tiles))
 
 
 def _tiles(cache: TileCache, query: MapQuery, route: IntArray | None, only: int | None) -> list[int]:

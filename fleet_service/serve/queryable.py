@@ -24,6 +24,7 @@ from typing import Final, NamedTuple
 
 import zenoh
 
+from fleet_service.serve.query import AnswerSize
 from schemas import keys, query
 from schemas.errors import InputError
 from schemas.query import Format, MapQuery
@@ -32,6 +33,7 @@ log = logging.getLogger(__name__)
 TEXT: Final = "text/plain"
 # Cells times what one costs in its form: a tile of text is light, a city of it is not.
 COST: Final = {Format.ARROW: 1, Format.JSON: 20, Format.GEOJSON: 20}
+TILE_COST: Final = 750  # cells: half a millisecond, that a tile takes however few it has
 LIGHT: Final = 30_000  # 20 ms of an Arrow answer
 MOST: Final = 10_000_000  # ten million cells of Arrow, 700 MB; half a million as text, 250 MB
 PER_S: Final = 1_500_000  # cost that is answered in a second
@@ -45,12 +47,12 @@ class Answering(NamedTuple):
     """What answers.
 
     Attributes:
-        cells: how many cells an answer may have at the most.
+        size: how many cells and tiles an answer may have at the most.
         answer: gives tile and payload of every reply to a query, for the tiles that a predicate wants, and the only
             one, where the query's key is a tile's.
     """
 
-    cells: Callable[[MapQuery, Callable[[int], bool], int | None], int]
+    size: Callable[[MapQuery, Callable[[int], bool], int | None], AnswerSize]
     answer: Callable[[MapQuery, Callable[[int], bool], int | None], Iterable[tuple[int, bytes]]]
 
 
@@ -118,10 +120,12 @@ class MapQueryable:
             pairs: Iterable[tuple[str, str]] = request.parameters  # type: ignore[assignment] # stub: no iterable
             wanted = query.parse({name: value for name, value in pairs if not name.startswith("_")})  # Zenoh's own
             if wanted.at is None:
-                cost = self._answering.cells(wanted, *_wanted(request)) * COST[wanted.format]
+                asked = self._answering.size(wanted, *_wanted(request))
+                cost = asked.cells * COST[wanted.format]
                 if cost > MOST:
                     fix = "narrow bbox, or take format=arrow" if COST[wanted.format] > 1 else "narrow bbox"
                     raise InputError("bbox", "the answer would be too large", fix)
+                cost += asked.tiles * TILE_COST
         except InputError as error:
             self._refuse(request, error)
             return

@@ -128,8 +128,8 @@ def _answers(endpoint: str, client: zenoh.Session, tile: str) -> tuple[list[floa
             reader.stdout.readline()
         for _ in range(QUESTIONS):
             began = time.perf_counter()
-            assert ask(client, tile), "the service does not know the tile"
-            waits.append(1e3 * (time.perf_counter() - began))
+            known = ask(client, tile)
+            waits.append(1e3 * (time.perf_counter() - began) if known else float("inf"))
             pause.wait(0.02)
     finally:
         for reader in readers:

@@ -10,7 +10,17 @@ import pyarrow as pa
 import pytest
 import zenoh
 
-from fleet_service.serve.queryable import COST, LIGHT, LIGHT_PER_S, MOST, WAITING, Answering, MapQueryable
+from fleet_service.serve.query import AnswerSize
+from fleet_service.serve.queryable import (
+    COST,
+    LIGHT,
+    LIGHT_PER_S,
+    MOST,
+    TILE_COST,
+    WAITING,
+    Answering,
+    MapQueryable,
+)
 from schemas import keys
 from schemas.query import Format, MapQuery
 from tests.fleet_service.examples import TILE
@@ -39,7 +49,9 @@ def test_an_answer_that_fails_on_the_way_is_an_error_and_the_next_one_is_answere
 
     counts: Counter[str] = Counter()
     key = keys.map_key(TILE)
-    queryable = session.declare_queryable(key, MapQueryable(Answering(lambda *_: 1, answer), counts), complete=True)
+    queryable = session.declare_queryable(
+        key, MapQueryable(Answering(lambda *_: AnswerSize(1, 1), answer), counts), complete=True
+    )
     querier = session.declare_querier(key)
     matched(querier)
     first = texts(session, key + parameters)
@@ -54,7 +66,7 @@ def test_a_question_whose_answer_would_be_too_large_is_refused_with_the_way_to_a
     key, counts, asked = (
         keys.map_key(TILE),
         Counter[str](),
-        Answering(lambda *_: MOST // COST[Format.JSON] + 1, nothing),
+        Answering(lambda *_: AnswerSize(MOST // COST[Format.JSON] + 1, 1), nothing),
     )
     queryable = session.declare_queryable(key, MapQueryable(asked, counts), complete=True)
     querier = session.declare_querier(key)
@@ -73,19 +85,22 @@ def nothing(query: MapQuery, wanted: Callable[[int], bool], only: int | None) ->
     return iter(())
 
 
-def test_who_asks_for_little_does_not_wait_for_who_asks_for_much(session: zenoh.Session) -> None:
-    """The heavy answer does not end before the light one has come."""
+@pytest.mark.parametrize(
+    "much", [AnswerSize(LIGHT + 1, 1), AnswerSize(1, LIGHT // TILE_COST + 1)], ids=["cells", "tiles"]
+)
+def test_who_asks_for_little_does_not_wait_for_who_asks_for_much(session: zenoh.Session, much: AnswerSize) -> None:
+    """The heavy answer does not end before the light one has come; many tiles of a cell each are heavy too."""
     key, counts, light_came = keys.map_key(TILE), Counter[str](), threading.Event()
 
-    def cells(query: MapQuery, wanted: Callable[[int], bool], only: int | None) -> int:
-        return LIGHT + 1 if query.min_vehicles == 2 else 1
+    def size(query: MapQuery, wanted: Callable[[int], bool], only: int | None) -> AnswerSize:
+        return much if query.min_vehicles == 2 else AnswerSize(1, 1)
 
     def answer(query: MapQuery, wanted: Callable[[int], bool], only: int | None) -> Iterator[tuple[int, bytes]]:
         if query.min_vehicles == 2:
             assert light_came.wait(30.0)
         yield TILE, b"a tile"
 
-    queryable = session.declare_queryable(key, MapQueryable(Answering(cells, answer), counts), complete=True)
+    queryable = session.declare_queryable(key, MapQueryable(Answering(size, answer), counts), complete=True)
     querier = session.declare_querier(key)
     matched(querier)
     heavy = session.get(f"{key}?min_vehicles=2", timeout=60.0)
@@ -105,11 +120,11 @@ class Half:
     def __init__(self, session: zenoh.Session) -> None:
         self.counts, self.go, self.session = Counter[str](), threading.Event(), session
         self.begun = threading.Semaphore(0)
-        self.queryable = MapQueryable(Answering(self.cells, self.answer), self.counts)
+        self.queryable = MapQueryable(Answering(self.size, self.answer), self.counts)
         self.key = keys.map_key(TILE)
 
-    def cells(self, query: MapQuery, wanted: Callable[[int], bool], only: int | None) -> int:
-        return COSTS[query.min_vehicles]
+    def size(self, query: MapQuery, wanted: Callable[[int], bool], only: int | None) -> AnswerSize:
+        return AnswerSize(COSTS[query.min_vehicles], 0)
 
     def answer(self, query: MapQuery, wanted: Callable[[int], bool], only: int | None) -> Iterator[tuple[int, bytes]]:
         yield TILE, b"first"
