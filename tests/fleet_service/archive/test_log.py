@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from fleet_service.archive import segments
+from fleet_service.archive import layout, segments
 from fleet_service.archive.log import SegmentLog
+from fleet_service.archive.pseudonyms import kept_key
 from schemas.wire import Kind
+from tests.faults.crash_disk import CrashDisk
 from tests.fleet_service.archive.rows import identities, rows_of
 from tests.waiting import until
 
@@ -68,3 +71,21 @@ def test_what_cannot_be_written_is_not_settled_and_comes_with_the_next_each_row_
     assert sorted(log.flush()) == ["later", "seen", "state"]
     assert len(identities(tmp_path, Kind.OBSERVATION)) == 6
     assert len(identities(tmp_path, Kind.STATE)) == 3
+
+
+def test_a_segment_is_older_than_the_next_however_many_digits_their_numbers_have() -> None:
+    newer, older = (layout.segment_name("shard-0-0000000007", number) for number in (100_000_000, 99_999_999))
+    assert sorted([newer, older], key=layout.age) == [older, newer]
+
+
+def test_a_power_loss_after_the_first_key_was_given_never_takes_it_back(tmp_path: Path) -> None:
+    """A batch that is acknowledged under a forgotten key would come in again under another."""
+    for seed in range(20):
+        live, after = tmp_path / f"live-{seed}", tmp_path / f"after-{seed}"
+        live.mkdir()
+        disk = CrashDisk(live, random.Random(seed), None, range(0))
+        with disk.mounted():
+            key = kept_key(live / "keys" / "2026-01.key")
+        disk.image(after)
+        assert (after / "keys" / "2026-01.key").exists()
+        assert kept_key(after / "keys" / "2026-01.key") == key

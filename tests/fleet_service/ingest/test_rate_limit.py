@@ -12,7 +12,7 @@ import zenoh
 from fleet_service.ingest import rate_limit
 from fleet_service.ingest.acks import Acks
 from fleet_service.ingest.dedup import SequenceTracker
-from fleet_service.ingest.rate_limit import LEAST_BYTES, RateLimiter
+from fleet_service.ingest.rate_limit import JSON_COST, LEAST_BYTES, RateLimiter
 from schemas import wire
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.errors import InputError
@@ -52,6 +52,15 @@ def test_a_vehicle_may_send_a_burst_and_then_its_rate() -> None:
 def test_small_messages_cost_what_it_takes_to_read_one() -> None:
     found, _ = buckets(Clock())
     assert sum(found.allows("obs/a", 1) for _ in range(1000)) == BURST // LEAST_BYTES
+
+
+@pytest.mark.parametrize("encoding", ["application/json", "application/json;schema=gripmap"])
+def test_a_byte_of_json_costs_what_it_takes_to_read_it(encoding: str) -> None:
+    found, counts = buckets(Clock())
+    size = int(BURST) // (2 * JSON_COST)
+    assert [found.allows("a/car", size, encoding) for _ in range(3)] == [True, True, False]
+    assert counts["limited"] == 1
+    assert all(found.allows("a/other", size) for _ in range(2 * JSON_COST))
 
 
 def test_one_that_sends_too_much_takes_nothing_from_the_others() -> None:
