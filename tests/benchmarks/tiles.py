@@ -114,19 +114,22 @@ def read(endpoint: str) -> None:
     assert session is not None
     while True:
         replies = [reply for reply in session.get(f"{keys.ROOT}/map/**", timeout=60.0) if reply.ok]
-        print(len(replies), flush=True)
+        if replies:  # a session that has just been opened may not know yet who answers
+            print(len(replies), flush=True)
 
 
 def _answers(endpoint: str, client: zenoh.Session, tile: str) -> tuple[list[float], int]:
-    """How long questions for one tile take [ms] while READERS ask for all; and tiles that these got."""
+    """How long questions for one tile take [ms] while READERS ask for all, until each has an answer; tiles of these."""
     words = [sys.executable, "-c", f"from tests.benchmarks.tiles import read; read({endpoint!r})"]
     readers = [subprocess.Popen(words, stdout=subprocess.PIPE, text=True) for _ in range(READERS)]
-    waits, pause = [], threading.Event()
+    got: list[list[int]] = [[] for _ in readers]
+    ears = [threading.Thread(target=_count, args=pair) for pair in zip(readers, got, strict=True)]
+    for ear in ears:
+        ear.start()
+    waits: list[float] = []
+    pause, deadline = threading.Event(), time.monotonic() + 2 * PATIENCE_S
     try:
-        for reader in readers:
-            assert reader.stdout
-            reader.stdout.readline()
-        for _ in range(QUESTIONS):
+        while (len(waits) < QUESTIONS or not all(got)) and time.monotonic() < deadline:
             began = time.perf_counter()
             known = ask(client, tile)
             waits.append(1e3 * (time.perf_counter() - began) if known else float("inf"))
@@ -134,10 +137,14 @@ def _answers(endpoint: str, client: zenoh.Session, tile: str) -> tuple[list[floa
     finally:
         for reader in readers:
             reader.terminate()
-    got = sum(int(line) for reader in readers for line in reader.stdout or ())
-    for reader in readers:
-        reader.wait()
-    return waits, got
+            reader.wait()
+        for ear in ears:
+            ear.join()
+    return waits, min(map(sum, got))
+
+
+def _count(reader: subprocess.Popen[str], got: list[int]) -> None:
+    got.extend(int(line) for line in reader.stdout or ())
 
 
 def tiles() -> list[Figure]:
@@ -173,5 +180,11 @@ def tiles() -> list[Figure]:
         Figure("bench.tiles.shown", float(len(puts)), "tiles that were put", 0.95 * TILES, "more"),
         Figure("bench.tiles.put_per_s", sum(puts.values()) / (WARM_S + MEASURED_S), "tiles/s that were put"),
         Figure("bench.query.small_behind_all_p99_ms", float(np.quantile(small, 0.99)), "ms, beside two for all", 100),
-        Figure("bench.query.all_tiles", float(got), "tiles that who asked for all got meanwhile", TILES, "more"),
+        Figure(
+            "bench.query.all_tiles",
+            float(got),
+            "tiles that the slower of them got",
+            0.9 * TILES,
+            "more",
+        ),
     ]
