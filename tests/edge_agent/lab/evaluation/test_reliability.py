@@ -9,6 +9,7 @@ import pytest
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates
+from edge_agent.estimators.friction_mixture.told_interval import LEARNED_END, LOWER_END, UPPER_END
 from edge_agent.lab.evaluation.batch import DriveSet, estimates, realistic
 from edge_agent.lab.evaluation.measures import bounds, consistency
 from edge_agent.lab.evaluation.reliability import LEVELS, between_quantiles, on_the_grid, shares, watched
@@ -64,9 +65,14 @@ def test_watching_a_drive_changes_nothing_that_is_said_of_it(estimator: str, tur
 
 
 def test_the_whole_posterior_of_the_default_has_the_quantiles_that_it_tells_within_a_bin(turning: DriveSet) -> None:
+    """The ends are told at the levels at which they hold, and patches of ice lower the lower one."""
     reported, _ = watched(bank_of("aco-fckf", turning.vehicles), turning)
-    for level, output in ((0.05, reported.mu_lower), (0.5, reported.mu), (0.95, reported.mu_upper)):
-        for side in (-1.0, 1.0):
+    for least, most, output in (
+        (0.0, LOWER_END, reported.mu_lower),
+        (0.5, 0.5, reported.mu),
+        (LEARNED_END, UPPER_END, reported.mu_upper),
+    ):
+        for side, level in ((-1.0, most), (1.0, least)):
             beside = output + side * 1.15 / BINS
             moved = replace(turning, truth={f"true_mu_{w}": beside for w in ("fl", "fr", "rl", "rr")})
             _, ranks = watched(bank_of("aco-fckf", turning.vehicles), moved)
