@@ -82,8 +82,8 @@ def queued(made: Service) -> int:
 
 
 def turns(made: Service) -> tuple[int, int]:
-    """How often segments are written and tiles put in ten turns of .3 s each."""
-    clock, calls = [time.monotonic()], {"begin_flush": 0, "tiles": 0}
+    """How often segments are written and rounds of tiles begin in ten turns of .3 s each."""
+    clock, calls = [time.monotonic()], {"begin_flush": 0, "take_dirty": 0}
 
     def counted(name: str) -> Callable[..., list[Any]]:
         def call(*_: object) -> list[Any]:
@@ -95,12 +95,13 @@ def turns(made: Service) -> tuple[int, int]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(service, "time", SimpleNamespace(monotonic=lambda: clock[0]))
         patch.setattr(service, "IDLE_S", 0.0)
-        for name in calls:
-            patch.setattr(made.engine, name, counted(name))
+        patch.setattr(made._rounds, "_clock", lambda: clock[0])
+        for owner, name in ((made.engine, "begin_flush"), (made.engine.map, "take_dirty")):
+            patch.setattr(owner, name, counted(name))
         for _ in range(10):
             clock[0] += 0.3
             made._step(None, threading.Event())  # type: ignore[arg-type]
-    return calls["begin_flush"], calls["tiles"]
+    return calls["begin_flush"], calls["take_dirty"]
 
 
 def refused(engine: Engine) -> object:
