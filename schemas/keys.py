@@ -10,10 +10,12 @@ import re
 from typing import Final, NamedTuple
 
 from schemas import grid
-from schemas.config import NAME_PATTERN
+from schemas.config import NAME_PATTERN, REGION_PATTERN
 from schemas.errors import InputError
 
 ROOT: Final = "gripmap/v1"
+SERVES: Final = f"{ROOT}/serves"  # tokens of who serves which region, see `Served`
+_ALL: Final = "all"
 _CHUNKS: Final = (4, 3, 3, 4)
 
 
@@ -116,6 +118,38 @@ def alive_key(vehicle: str) -> str:
 def shard_key(service: str) -> str:
     """Liveliness token of a service."""
     return f"{ROOT}/shard/{service}"
+
+
+class Served(NamedTuple):
+    """A service's word that it serves a region: a liveliness token, there as long as the service is.
+
+    Attributes:
+        region: key expression, chunks of 4, 3 and 3 digits or `*`.
+        service: its name.
+        start: tells one start of it from another.
+    """
+
+    region: str
+    service: str
+    start: str
+
+    @property
+    def key(self) -> str:
+        """The token: `gripmap/v1/serves/<region>/<service>/<start>`, with `all` for `*`, which no key may have."""
+        return f"{SERVES}/{self.region.replace('*', _ALL)}/{self.service}/{self.start}"
+
+
+def parse_served(key: str) -> Served:
+    """Read such a token.
+
+    Raises:
+        InputError: it is none.
+    """
+    *found, service, start = ["", "", *key.removeprefix(f"{SERVES}/").split("/")]
+    region = "/".join(found[2:]).replace(_ALL, "*")
+    if not key.startswith(f"{SERVES}/") or not re.fullmatch(REGION_PATTERN, region):
+        raise InputError("key", f"{key[:80]!r} names no service's region", "see `Served`")
+    return Served(region, service, start)
 
 
 class Parsed(NamedTuple):

@@ -27,6 +27,7 @@ from fleet_service.ingest.rate_limit import RateLimiter
 from fleet_service.ingest.weather import WeatherMessage
 from fleet_service.serve.queryable import Answering, MapQueryable
 from fleet_service.serve.tile_rounds import SHARE_S, TileRounds
+from fleet_service.shards.serving import serving as serving_regions
 from schemas import grid, keys, wire
 from schemas.config import ServiceConfig, load
 from schemas.query import MapQuery
@@ -92,7 +93,13 @@ class Service:
         return 1 if self.failure is not None or self.engine.unsettled else 0
 
     def _serve(self, session: zenoh.Session, stop: threading.Event, address: str) -> None:
-        with session, self._upkeep, self._declared(session):
+        config = self._config
+        with (
+            session,
+            serving_regions(session, config.name, config.regions, stop),
+            self._upkeep,
+            self._declared(session),
+        ):
             self._session = session
             self._log_line(f"ready: {self._config.name}, {self.engine.fusion.size} cells from the archive{address}")
             watchdog.alive()

@@ -13,7 +13,7 @@ from schemas.runtime import commandline
 
 # The ending of a file decides what is asked for: a form of answer of the service.
 FORMS: Final = {".arrow": "arrow", ".parquet": "arrow", ".csv": "arrow", ".geojson": "geojson", ".json": "json"}
-NOBODY: Final = 1  # exit code where no service answers
+NOBODY: Final = 1  # exit code where nobody serves what was asked for, or some of it
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Ask, and print or write the answer; 1 where no service answers."""
+    """Ask, and print or write the answer; 1 where nobody serves some of what was asked for."""
     form = _form(arguments.out, arguments.format)
     from fleet_service.client import map_client
 
@@ -49,6 +49,9 @@ def run(arguments: argparse.Namespace) -> int:
         export.write(geo.with_cells(answer.table), arguments.out)
     else:
         map_client.write(answer, arguments.out)
+    if answer.gap is not None:
+        print(answer.gap, file=sys.stderr)
+        return NOBODY
     return 0
 
 

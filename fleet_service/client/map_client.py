@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import json
+import logging
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import pyarrow as pa
 import zenoh
 
-from schemas import grid, keys, query, tables
+from schemas import grid, keys, query, regions, tables
 from schemas.config import ServiceConfig, ZenohSettings, load
 from schemas.errors import InputError
+from schemas.numeric import IntArray
 from schemas.query import Format
-from schemas.runtime import commandline, zenoh_session
+from schemas.runtime import commandline, tokens, zenoh_session
 from schemas.wire.tile import decode_tile
 
+log = logging.getLogger(__name__)
 TIMEOUT_S: Final = 10.0
+NAMED: Final = 5  # regions that a sentence names
 PAST_S: Final = 60.0  # a moment of the past is rebuilt from the archive
 EVERYWHERE: Final = f"{keys.ROOT}/map/**"
 SERVED_S: Final = 1.0  # for a router to say who answers
@@ -29,11 +34,29 @@ SHOWN: Final = ("latitude", "longitude", "sector", "mu", "mu_lower", "mu_upper",
 
 @dataclass(frozen=True)
 class Answer:
-    """All replies to one query, joined; `table` for arrow, else `document`. `served`: whether a service was there."""
+    """All replies to one query, joined.
+
+    Attributes:
+        table: of an answer in Arrow.
+        document: of another.
+        served: whether a service was there.
+        missing: regions of what was asked for that nobody serves, or whose service went meanwhile.
+        regions: those that were served, where services tell them.
+    """
 
     table: pa.Table | None
     document: dict[str, object] | None
     served: bool = True
+    missing: tuple[str, ...] = ()
+    regions: tuple[str, ...] = ()
+
+    @property
+    def gap(self) -> str | None:
+        """What of the answer is missing, in words."""
+        if not self.missing:
+            return None
+        more = f" and {len(self.missing) - NAMED} more" if len(self.missing) > NAMED else ""
+        return f"nobody serves {', '.join(self.missing[:NAMED])}{more}: what is not there is not known"
 
 
 def settings(connect: str | None, config: Path | str | None) -> ZenohSettings:
@@ -48,11 +71,22 @@ def ask(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
     Raises:
         InputError: the query is refused, here or by a service, or no router answers.
     """
-    form = query.parse(parameters).format
-    with joined(connection) as session:
+    asked = query.parse(parameters)
+    with joined(connection) as session, tokens.watched(session) as services:
+        told = bool(services.here)
         payloads = sorted(replies(session, EVERYWHERE, parameters))
-        served = bool(payloads) or is_served(session, query.parse(parameters))
-    return replace(_joined(form, [payload for _, payload in payloads]), served=served)
+        whole = {token.region for token in services.here} - (gone := {token.region for token in services.gone})
+        told = told or bool(gone)
+        served = bool(payloads) or (bool(whole) if told else is_served(session, asked))
+    answer = replace(_joined(asked, [payload for _, payload in payloads]), served=served)
+    if not told:  # services of a former version, or an access list of one
+        return answer
+    tiles = {regions.region_of(tile) for key, _ in payloads if (tile := keys.parse(key).quadint) is not None}
+    whole |= {one for one in tiles if not any(regions.overlap(one, region) for region in gone)}
+    somewhere = asked.bbox is not None or asked.route is not None
+    missing = regions.unserved(asked, whole) if somewhere else sorted(gone)
+    found = tuple(sorted({token.region for token in services.here}))
+    return replace(answer, missing=tuple(missing), regions=found)
 
 
 def replies(session: zenoh.Session, key: str, parameters: Mapping[str, str]) -> Iterator[tuple[str, bytes]]:
@@ -72,14 +106,19 @@ def replies(session: zenoh.Session, key: str, parameters: Mapping[str, str]) -> 
 
 
 def served_table(answer: Answer) -> pa.Table:
-    """The cells of an answer in Arrow.
+    """The cells of an answer in Arrow; what is missing of it is logged, and named in the schema's metadata.
 
     Raises:
-        InputError: no service answered.
+        InputError: no service answered, or there is nothing of what was asked for and nobody serves some of it.
     """
     if not answer.served or answer.table is None:
         raise InputError("connect", "no service answers for the map", "start one; that is not the same as an empty map")
-    return answer.table
+    if answer.gap is None:
+        return answer.table
+    if not answer.table.num_rows:
+        raise InputError("connect", answer.gap, "start its service; that is not the same as an empty map")
+    log.warning("%s", answer.gap)
+    return answer.table.replace_schema_metadata({"missing": ",".join(answer.missing)})
 
 
 def is_served(session: zenoh.Session, asked: query.MapQuery) -> bool:
@@ -121,15 +160,30 @@ def joined(connection: ZenohSettings) -> zenoh.Session:
         raise InputError("connect", f"no router at {connection.connect}", "start one, or name its endpoint") from error
 
 
-def _joined(form: Format, payloads: list[bytes]) -> Answer:
-    if form is Format.ARROW:
+def _joined(asked: query.MapQuery, payloads: list[bytes]) -> Answer:
+    """Replies as one; along a route in its order, whatever came first."""
+    rank = regions.Rank(asked.route) if asked.route else None
+    if asked.format is Format.ARROW:
         parts = [decode_tile(payload) for payload in payloads]
-        return Answer(pa.concat_tables(parts) if parts else tables.MAP_SCHEMA.empty_table(), None)
+        table = pa.concat_tables(parts) if parts else tables.MAP_SCHEMA.empty_table()
+        if rank is not None:
+            table = table.take(rank.order(_numbers(table["cell"]), _numbers(table["sector"])))
+        return Answer(table, None)
     documents = [json.loads(payload) for payload in payloads]
-    if form is Format.JSON:
-        return Answer(None, {"tiles": documents})
+    if asked.format is Format.JSON:
+        return Answer(None, {"tiles": documents if rank is None else sorted(documents, key=_first(rank))})
     features = [feature for document in documents for feature in document["features"]]
+    if rank is not None:
+        features.sort(key=lambda feature: rank.of(feature["properties"]["cell"], feature["properties"]["sector"]))
     return Answer(None, {"type": "FeatureCollection", "features": features})
+
+
+def _numbers(column: pa.ChunkedArray[Any]) -> IntArray:
+    return np.asarray(column.to_numpy(), np.int64)
+
+
+def _first(rank: regions.Rank) -> Callable[[dict[str, Any]], int]:
+    return lambda tile: min(rank.of(cell["cell"], cell["sector"]) for cell in tile["cells"])
 
 
 def write(answer: Answer, path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The map watched: a line per changed tile and per stretch that became slippery or ceased to be."""
+"""The map watched: a line per changed tile, per stretch that turned slippery or ended, and where nobody serves."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import zenoh
 
 from fleet_service.client.map_client import TIMEOUT_S
 from fleet_service.client.stretches import StretchAlert, Stretches
-from schemas import grid, keys, query, wire
+from schemas import grid, keys, query, regions, wire
 from schemas.config import ZenohSettings
-from schemas.runtime import zenoh_session
+from schemas.runtime import tokens, zenoh_session
 from schemas.wire.tile import decode_tile
 
 GATHER_S: Final = 0.3  # for which alerts of neighbouring cells are gathered into one
@@ -46,8 +46,9 @@ def watch(
     Raises:
         InputError: the box cannot be read.
     """
-    box = query.parse({} if wishes.bbox is None else {"bbox": wishes.bbox}).bbox
-    stretches, lock = Stretches(), threading.Lock()
+    asked = query.parse({} if wishes.bbox is None else {"bbox": wishes.bbox})
+    box = asked.bbox
+    stretches, lock, away = Stretches(), threading.Lock(), set[str]()
 
     def near(key: str) -> int | None:
         tile = keys.parse(key).quadint
@@ -75,10 +76,18 @@ def watch(
             say(json.dumps({"event": "alert", **alert.values()}) if wishes.as_json else alert.line())
             hear(alert)
 
+    def tell_services() -> None:
+        nonlocal away
+        here = {token.region for token in services.here}
+        now = set(regions.unserved(asked, here)) if asked.bbox else {token.region for token in services.gone} - here
+        if now != away and (here or services.gone):
+            _say_regions(say, now - away, away - now, as_json=wishes.as_json)
+            away = now
+
     session = zenoh_session.open_session(connection, stop)
     if session is None:
         return
-    with session:
+    with session, tokens.watched(session) as services:
         if not wishes.only_alerts:
             session.declare_subscriber(f"{keys.ROOT}/map/**", changed)
         session.declare_subscriber(f"{keys.ROOT}/alert/**", alerted)
@@ -86,8 +95,10 @@ def watch(
             if near(keys.alert_key(int(grid.tile_of(alert.cell)))) is not None:
                 take(alert)
         say(json.dumps({"event": "watching"}) if wishes.as_json else "watching")
+        tell_services()
         while not stop.wait(GATHER_S):
             tell()
+            tell_services()
         tell()
 
 
@@ -95,6 +106,15 @@ def standing_alerts(session: zenoh.Session) -> list[wire.Alert]:
     """The alerts that stand, of all services that answer."""
     replies = (reply.ok for reply in session.get(f"{keys.ROOT}/alert/**", timeout=TIMEOUT_S) if reply.ok is not None)
     return [alert for reply in replies for alert in wire.decode_standing(reply.payload.to_bytes())]
+
+
+def _say_regions(say: Callable[[str], None], away: set[str], back: set[str], *, as_json: bool) -> None:
+    for event, found in (("away", away), ("back", back)):
+        if found and as_json:
+            say(json.dumps({"event": event, "regions": sorted(found)}))
+        elif found:
+            names = ", ".join(sorted(found))
+            say(f"nobody serves {names}" if event == "away" else f"{names} is served again")
 
 
 def _tile_line(tile: int, table: pa.Table, as_json: bool) -> str:

@@ -2,9 +2,9 @@
 
 | role    | puts                                     | hears and asks                      |
 |---------|------------------------------------------|-------------------------------------|
-| vehicle | obs/*/*/*/NAME, state/*/*/*/NAME, PRIVATE, token alive/NAME | map and alert; ack/NAME, PRIVATE |
-| owner   | nothing                                  | map and alert; PRIVATE of its own   |
-| reader  | nothing                                  | map and alert                       |
+| vehicle | obs/*/*/*/NAME, state/*/*/*/NAME, PRIVATE, token alive/NAME | map, alert and serves; ack/NAME, PRIVATE |
+| owner   | nothing                                  | map, alert, serves; PRIVATE of its own |
+| reader  | nothing                                  | map, alert and serves               |
 | weather | weather/**                               | nothing                             |
 | service | everything under gripmap/ but PRIVATE    | likewise                            |
 | router  | what others were let put, between routers | likewise                           |
@@ -26,6 +26,7 @@ from schemas import keys, wire
 QUESTION_BYTES: Final = 1024  # of payload and attachment; there is none
 PUBLIC: Final = (f"{keys.ROOT}/map/**", f"{keys.ROOT}/alert/**")
 WEATHER: Final = f"{keys.ROOT}/weather/**"
+SERVED: Final = f"{keys.SERVES}/**"
 EVERYTHING: Final = "gripmap/**"
 MESSAGES: Final = (
     "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable", "liveliness_token",
@@ -85,6 +86,9 @@ def access_control(fleet: Enrolment) -> Section:
         _rule("listened", ("egress",), ("declare_subscriber",), [f"{keys.ROOT}/{kind}/**" for kind in wire.Kind]),
         _rule("weather", ("ingress",), ("put",), [WEATHER]),
         _rule("weathered", ("egress",), ("declare_subscriber",), [WEATHER]),
+        # Who serves which region is no secret: else a region without a service looks like one without grip reports.
+        _rule("who", ("ingress",), ("liveliness_query", "declare_liveliness_subscriber"), [SERVED]),
+        _rule("there", ("egress",), ("liveliness_token",), [SERVED]),
         _rule("answered", ("egress",), ("declare_queryable",), [f"{keys.ROOT}/map/**"]),
     ]
     roles = {
@@ -97,7 +101,7 @@ def access_control(fleet: Enrolment) -> Section:
     if fleet.services:
         policies.append({"rules": ["private"], "subjects": ["role/services"]})
     if public := [*(["role/readers"] if fleet.readers else []), *fleet.vehicles, *fleet.owners]:
-        policies.append({"rules": ["ask", "told", "answered"], "subjects": public})
+        policies.append({"rules": ["ask", "told", "answered", "who", "there"], "subjects": public})
     if fleet.weather:
         policies.append({"rules": ["weather", "weathered"], "subjects": ["role/weather"]})
     if fleet.vehicles:

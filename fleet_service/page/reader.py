@@ -18,10 +18,10 @@ import zenoh
 from fleet_service.client import map_client
 from fleet_service.client.watching import standing_alerts
 from fleet_service.page.world import HeldWorld, box_of
-from schemas import grid, keys, tables, wire
+from schemas import grid, keys, regions, tables, wire
 from schemas.config import ZenohSettings
 from schemas.errors import InputError, WireError
-from schemas.runtime import zenoh_session
+from schemas.runtime import tokens, zenoh_session
 from schemas.wire.tile import decode_tile
 
 log = logging.getLogger(__name__)
@@ -47,6 +47,7 @@ class Reader:
         self._away_since: dict[int, float] = {}
         self._names: dict[str, set[str]] = {"alive": set(), "shard": set()}
         self._anything: Any = None
+        self._fallen: dict[str, float] = {}  # regions whose service said that it serves them, and went: since when
         self._served, self._stood, self._tried = False, 0.0, -AGAIN_S
 
     def run(self, stop: threading.Event) -> None:
@@ -54,7 +55,7 @@ class Reader:
         session = zenoh_session.open_session(self._connection, stop)
         if session is None:
             return
-        with session:
+        with session, tokens.watched(session) as services:
             self._session = session
             session.declare_subscriber(map_client.EVERYWHERE, self._tile)
             session.declare_subscriber(f"{keys.ROOT}/alert/**", self._alert)
@@ -67,6 +68,7 @@ class Reader:
                 elif served and time.monotonic() >= self._stood + REFRESH_S:
                     self._ask_standing(session)
                 self._served = served
+                self._note_fallen(services)
                 self._refresh(session)
                 stop.wait(ROUND_S)
             self._session = None
@@ -92,7 +94,22 @@ class Reader:
             {"region": grid.quadkey(region, grid.REGION_ZOOM), "box": box_of(region, grid.REGION_ZOOM),
              "served": region not in self._away_since, "since": self._away_since.get(region)}
             for region in list(self._queriers)
+        ] + [
+            {"region": region, "box": _box_of_expression(region), "served": False, "since": since}
+            for region, since in self._fallen.copy().items()
         ]  # fmt: skip
+
+    def _note_fallen(self, services: tokens.Watched) -> None:
+        """Regions without a service that had one, if no cell of theirs is known: those are seen by themselves."""
+        here = {token.region for token in services.here}
+        known = [keys.chunks(region, grid.REGION_ZOOM) for region in self._queriers]
+        fallen = {
+            token.region for token in services.gone
+            if token.region.startswith(tuple("0123"))
+            and not any(regions.covers(one, token.region) for one in here)
+            and not any(regions.overlap(one, token.region) for one in known)
+        }  # fmt: skip
+        self._fallen = {region: self._fallen.get(region, time.time()) for region in fallen}
 
     def names(self, kind: str) -> list[str]:
         """Names with a token; empty where this reader may not hear of them."""
@@ -193,6 +210,12 @@ class Reader:
         with contextlib.suppress(InputError):
             return any(True for _ in map_client.replies(session, map_client.EVERYWHERE, {}))
         return False
+
+
+def _box_of_expression(region: str) -> list[float]:
+    """West, south, east, north [deg] of what its first digits name."""
+    digits = region.partition("*")[0].replace("/", "")
+    return box_of(grid.from_quadkey(digits), len(digits))
 
 
 @contextlib.contextmanager

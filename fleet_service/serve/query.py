@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import Final, NamedTuple
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -13,13 +13,9 @@ from fleet_service.serve.neighbour_fill import impute
 from fleet_service.serve.tile_cache import ShownTile, TileCache, used_once
 from fleet_service.serve.view import joined
 from schemas import grid
-from schemas.errors import InputError
 from schemas.numeric import BoolArray, IntArray
 from schemas.query import Format, MapQuery
-from schemas.thresholds import METRES_PER_DEGREE
-
-ROUTE_STEP_M: Final = 4.0  # less than half a cell at 60° of latitude: no cell on the way is missed
-ROUTE_MOST_M: Final = 500_000.0
+from schemas.regions import keys_along
 
 
 def answer(
@@ -124,28 +120,3 @@ def _encoded(shown: ShownTile, rows: slice | BoolArray, form: Format, tile: int)
     else:
         cells = shown.cells.filter(pa.array(rows))
     return encode(cells, form, tile) if cells.num_rows else None
-
-
-def keys_along(route: Sequence[tuple[float, float]]) -> IntArray:
-    """Key (cell · 4 + sector) of everything that a route of (longitude, latitude) passes, in its order, each once.
-
-    Raises:
-        InputError: longer than ROUTE_MOST_M.
-    """
-    points = np.array(route)
-    scale = np.cos(np.radians(points[:-1, 1].mean()))
-    steps = np.diff(points, axis=0) * [METRES_PER_DEGREE * scale, METRES_PER_DEGREE]
-    lengths = np.hypot(*steps.T)
-    if lengths.sum() > ROUTE_MOST_M:
-        raise InputError(
-            "route", f"is {lengths.sum() / 1e3:.0f} km long", f"ask for {ROUTE_MOST_M / 1e3:.0f} km at most"
-        )
-    counts = np.maximum(np.ceil(lengths / ROUTE_STEP_M), 1).astype(np.int64)
-    leg = np.repeat(np.arange(len(counts)), counts)
-    share = (np.arange(len(leg)) - np.repeat(np.cumsum(counts) - counts, counts)) / counts[leg]
-    longitude, latitude = (points[leg] + share[:, None] * np.diff(points, axis=0)[leg]).T
-    cell = np.append(grid.cell_of(latitude, longitude), grid.cell_of(points[-1, 1], points[-1, 0]))
-    sector = grid.sector_of(np.arctan2(steps[:, 1], steps[:, 0]))[np.append(leg, leg[-1])].astype(np.int64)
-    keys = cell * grid.SECTORS + sector
-    _, first = np.unique(keys, return_index=True)
-    return np.asarray(keys[np.sort(first)])

@@ -253,7 +253,9 @@ def reader_overhears(ground: Ground) -> bool:
 @attempt
 def foreign_liveliness_token(ground: Ground) -> bool:
     session = ground.open(ROGUE, ROUTERS[1])
-    places = (keys.alive_key(HONEST), keys.shard_key(ROGUE), f"{keys.ROOT}/alive/{ROGUE}/more", keys.alive_key(ROGUE))
+    false = keys.Served("1202/310/*", ROGUE, "1f").key
+    foreign = (keys.alive_key(HONEST), keys.shard_key(ROGUE), f"{keys.ROOT}/alive/{ROGUE}/more", false)
+    places = (*foreign, keys.alive_key(ROGUE))
     tokens = [session.liveliness().declare_token(place) for place in places]
 
     def found() -> list[str]:
@@ -264,7 +266,8 @@ def foreign_liveliness_token(ground: Ground) -> bool:
     through = found()
     for token in tokens:
         token.undeclare()
-    return through != [keys.alive_key(ROGUE), keys.shard_key(SERVICE)]
+    own = {keys.alive_key(ROGUE), keys.shard_key(SERVICE)}
+    return {key for key in through if f"/{SERVICE}/" not in key} != own
 
 
 @attempt

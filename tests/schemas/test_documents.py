@@ -15,8 +15,7 @@ from fleet_service.fusion import weather as fused_weather
 from fleet_service.ingest import dedup, rate_limit, validation
 from fleet_service.ingest import weather as weather_in
 from fleet_service.serve import alerts
-from fleet_service.serve import query as answers
-from schemas import grid, mugrid, query, tables, thresholds, wire
+from schemas import grid, mugrid, query, regions, tables, thresholds, wire
 from schemas.config import NAME_PATTERN, ServiceConfig
 from schemas.keys import TOPICS
 from schemas.signals import Health
@@ -83,7 +82,7 @@ IN_README = (
     f"at most {SERVICE.oldest_s / 86400:.0f} days old",
     f"{SERVICE.vehicle_kb_s:.0f} kB/s, {SERVICE.vehicle_burst_kb:.0f} kB at once",
     f"counts {rate_limit.LEAST_BYTES} bytes at least",
-    f"{query.MAX_TEXT} characters, {query.MAX_ROUTE_POINTS} points of a route, {answers.ROUTE_MOST_M / 1e3:.0f} km",
+    f"{query.MAX_TEXT} characters, {query.MAX_ROUTE_POINTS} points of a route, {regions.ROUTE_MOST_M / 1e3:.0f} km",
     *(f"`{encoding}`" for encoding in ENCODINGS),
     *(f"`{name}/<" for name in TOPICS),
 )

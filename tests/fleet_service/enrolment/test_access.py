@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from fleet_service.enrolment.access import access_control
 from fleet_service.enrolment.enrol import Registry, Terms
 from schemas import keys
 from schemas.errors import InputError
+from schemas.runtime import tokens
 from schemas.runtime.zenoh_session import configuration
 from tests.faults.attempts import ATTEMPTS
 from tests.faults.ground import HONEST, Ground, ground
@@ -71,6 +73,7 @@ def test_a_vehicle_may_exactly_what_the_design_says() -> None:
         ("liveliness_token", keys.alive_key(HONEST)),
         ("declare_subscriber", keys.ack_key(HONEST)),
         *((message, place) for message in ("declare_subscriber", "query") for place in public),
+        *((message, f"{keys.SERVES}/**") for message in ("liveliness_query", "declare_liveliness_subscriber")),
     }
     assert allowed("egress") == {
         ("put", keys.ack_key(HONEST)),
@@ -78,6 +81,7 @@ def test_a_vehicle_may_exactly_what_the_design_says() -> None:
         *((m, place) for m in ("put", "reply") for place in public),
         *(("declare_subscriber", f"{keys.ROOT}/{kind}/**") for kind in ("obs", "state")),
         ("declare_queryable", f"{keys.ROOT}/map/**"),
+        ("liveliness_token", f"{keys.SERVES}/**"),
     }
     assert (listed["enabled"], listed["default_permission"]) == (True, "deny")
 
@@ -95,6 +99,29 @@ def heard(vehicle: zenoh.Session, name: str, listener: zenoh.Session) -> bool:
         until(arrived)
         publisher.undeclare()
     return True
+
+
+def test_reader_and_vehicle_see_who_serves_and_cannot_say_that_they_do(running: Network) -> None:
+    where = settings(next(iter(running.endpoints.values())), running.folder)
+    served = keys.Served("1202/310/*", SERVICE, "1f")
+    false = keys.Served("1202/311/*", HONEST, "2f")
+    with (
+        zenoh.open(configuration(where, SERVICE)) as service,
+        zenoh.open(configuration(where, HONEST)) as vehicle,
+        zenoh.open(configuration(where, READER)) as reader,
+    ):
+        vehicle.liveliness().declare_token(false.key)
+        token = service.liveliness().declare_token(served.key)
+
+        def sees(looks: zenoh.Session) -> bool:
+            return served in tokens.standing(looks)
+
+        for looks in (vehicle, reader):
+            until(partial(sees, looks))
+        with tokens.watched(reader) as seen:
+            assert seen.here == {served}
+            token.undeclare()
+            until(lambda: seen.gone == {served})
 
 
 def test_a_new_vehicle_comes_in_while_routers_are_restarted_one_at_a_time(running: Network) -> None:

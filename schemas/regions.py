@@ -1,0 +1,110 @@
+"""Regions as key expressions, what lies along a route, and what of it nobody serves. Pure.
+
+A region expression has three chunks, of 4, 3 and 3 quadkey digits; `*` is all of a chunk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from typing import Final
+
+import numpy as np
+
+from schemas import grid, keys
+from schemas.errors import InputError
+from schemas.numeric import IntArray
+from schemas.query import MapQuery
+from schemas.thresholds import METRES_PER_DEGREE
+
+ROUTE_STEP_M: Final = 4.0  # less than half a cell at 60° of latitude: no cell on the way is missed
+ROUTE_MOST_M: Final = 500_000.0
+EVERYWHERE: Final = "*/*/*"
+_ZOOMS: Final = (4, 7, grid.REGION_ZOOM)  # of an expression of one, two and three chunks
+
+Box = tuple[float, float, float, float]
+
+
+def overlap(one: str, other: str) -> bool:
+    """Whether two expressions have a region in common."""
+    return all(a == b or "*" in (a, b) for a, b in zip(one.split("/"), other.split("/"), strict=True))
+
+
+def covers(wide: str, narrow: str) -> bool:
+    """Whether an expression has all regions of another."""
+    return all(a in (b, "*") for a, b in zip(wide.split("/"), narrow.split("/"), strict=True))
+
+
+def region_of(tile: int) -> str:
+    """The region in which a tile lies."""
+    return keys.chunks(int(grid.parent(tile, grid.REGION_ZOOM, grid.TILE_ZOOM)), grid.REGION_ZOOM)
+
+
+def unserved(asked: MapQuery, served: Collection[str]) -> list[str]:
+    """Expressions of what a question is about and nobody serves; as few as there are. Of a question without a place
+    that is what lies within no service's region at all.
+
+    Raises:
+        InputError: the route is too long.
+    """
+    if asked.route is not None:
+        ahead = grid.region_of(keys_along(asked.route) // grid.SECTORS)
+        found = dict.fromkeys(keys.chunks(int(region), grid.REGION_ZOOM) for region in ahead)
+        return [region for region in found if not any(covers(wide, region) for wide in served)]
+    return list(_without(asked.bbox, served, (), 0))
+
+
+def _without(box: Box | None, served: Collection[str], above: tuple[str, ...], parent: int) -> Iterator[str]:
+    depth = len(above)
+    digits = _ZOOMS[depth] - (_ZOOMS[depth - 1] if depth else 0)
+    inside = np.arange(1 << 2 * digits) + (parent << 2 * digits)
+    if box is not None:
+        inside = inside[grid.touches(box, grid.bounds(inside, _ZOOMS[depth]))]
+    for one in inside.tolist():
+        chunks = (*above, grid.quadkey(one, _ZOOMS[depth])[-digits:])
+        region = "/".join((*chunks, *["*"] * (2 - depth)))
+        near = [wide for wide in served if overlap(wide, region)]
+        if not near:
+            yield region
+        elif not any(covers(wide, region) for wide in near):
+            yield from _without(box, near, chunks, one)
+
+
+class Rank:
+    """Places by when a route passes them; what it does not pass comes last."""
+
+    def __init__(self, route: Sequence[tuple[float, float]]) -> None:
+        self._place = {key: place for place, key in enumerate(keys_along(route).tolist())}
+
+    def of(self, cell: int, sector: int) -> int:
+        """When it is passed, as a number that only compares."""
+        return self._place.get(cell * grid.SECTORS + sector, len(self._place))
+
+    def order(self, cells: IntArray, sectors: IntArray) -> IntArray:
+        """Sorts cells and sectors (n,): indices (n,)."""
+        ranks = [self.of(cell, sector) for cell, sector in zip(cells.tolist(), sectors.tolist(), strict=True)]
+        return np.argsort(np.array(ranks, np.int64), kind="stable")
+
+
+def keys_along(route: Sequence[tuple[float, float]]) -> IntArray:
+    """Key (cell · 4 + sector) of everything that a route of (longitude, latitude) passes, in its order, each once.
+
+    Raises:
+        InputError: longer than ROUTE_MOST_M.
+    """
+    points = np.array(route)
+    scale = np.cos(np.radians(points[:-1, 1].mean()))
+    steps = np.diff(points, axis=0) * [METRES_PER_DEGREE * scale, METRES_PER_DEGREE]
+    lengths = np.hypot(*steps.T)
+    if lengths.sum() > ROUTE_MOST_M:
+        raise InputError(
+            "route", f"is {lengths.sum() / 1e3:.0f} km long", f"ask for {ROUTE_MOST_M / 1e3:.0f} km at most"
+        )
+    counts = np.maximum(np.ceil(lengths / ROUTE_STEP_M), 1).astype(np.int64)
+    leg = np.repeat(np.arange(len(counts)), counts)
+    share = (np.arange(len(leg)) - np.repeat(np.cumsum(counts) - counts, counts)) / counts[leg]
+    longitude, latitude = (points[leg] + share[:, None] * np.diff(points, axis=0)[leg]).T
+    cell = np.append(grid.cell_of(latitude, longitude), grid.cell_of(points[-1, 1], points[-1, 0]))
+    sector = grid.sector_of(np.arctan2(steps[:, 1], steps[:, 0]))[np.append(leg, leg[-1])].astype(np.int64)
+    keys = cell * grid.SECTORS + sector
+    _, first = np.unique(keys, return_index=True)
+    return np.asarray(keys[np.sort(first)])

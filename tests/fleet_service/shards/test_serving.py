@@ -1,0 +1,168 @@
+"""A region is served or it is not, and everyone knows: three services side by side, one of which goes."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from fleet_service.cli import main
+from fleet_service.client import map_client, watching
+from fleet_service.shards.serving import rivals, serving
+from schemas import grid, keys, query, regions, wire
+from schemas.config import ZenohSettings
+from schemas.errors import InputError
+from schemas.runtime import tokens
+from schemas.wire import Batch, Kind
+from tests.fleet_service.conftest import Running, running
+from tests.fleet_service.examples import SECOND, batch
+from tests.waiting import until
+
+# Three regions side by side, and a street that begins in the east, so that no order of tiles is its own.
+MIDDLE = int(grid.region_of(int(grid.cell_of(57.7, 11.97))))
+COLUMN, ROW = (int(one) for one in grid.deinterleave(MIDDLE))
+REGIONS = grid.interleave(np.array([COLUMN - 1, COLUMN, COLUMN + 1]), np.array([ROW] * 3)).tolist()
+NAMES = [keys.chunks(region, grid.REGION_ZOOM) for region in REGIONS]
+WEST, SOUTH, EAST, NORTH = (float(side) for side in grid.bounds(MIDDLE, grid.REGION_ZOOM))
+LATITUDE = (SOUTH + NORTH) / 2
+ROUTE = "|".join(f"{longitude:.6f},{LATITUDE:.6f}" for longitude in (EAST + 0.03, EAST - 0.03, WEST - 0.03))
+LONGITUDES = (WEST - 0.02, WEST - 0.01, WEST + 0.01, WEST + 0.02, EAST - 0.02, EAST - 0.01, EAST + 0.01, EAST + 0.02)
+CARS = 3
+
+
+def visits(vehicle: str) -> list[Batch]:
+    """A batch for each place of the street, of a car for each: one could not be in all at once."""
+    now, out = time.time_ns() - 2 * SECOND, list[Batch]()
+    for number, longitude in enumerate(LONGITUDES):
+        cell = int(grid.cell_of(LATITUDE, longitude))
+        region = int(grid.region_of(cell))
+        place: dict[str, Any] = {"cell": [cell], "latitude": [LATITUDE], "longitude": [longitude]}
+        made = batch(f"{vehicle}-{number}", 1, now, [0.7], **place, sector=[2], yaw=[np.pi])
+        out.append(replace(made, region=region))
+    return out
+
+
+@contextmanager
+def three(router: ZenohSettings, folder: Path) -> Iterator[list[Running]]:
+    with ExitStack() as stack:
+        yield [
+            stack.enter_context(running(router, folder / f"shard-{i}", name=f"shard-{i}", regions=[name]))
+            for i, name in enumerate(NAMES)
+        ]
+
+
+def drive(session: zenoh.Session, services: list[Running]) -> None:
+    for car in range(CARS):
+        for made in visits(f"sim-{car:03}"):
+            session.put(keys.observation_key(made.region, made.vehicle), wire.encode(made),
+                        encoding=wire.ENCODING[made.kind])  # fmt: skip
+    wanted = CARS * len(LONGITUDES)
+    until(lambda: sum(run.service.engine.counts[Kind.OBSERVATION] for run in services) == wanted)
+
+
+def ask(router: ZenohSettings, **parameters: str) -> map_client.Answer:
+    return map_client.ask(router, parameters)
+
+
+def test_answers_over_three_services_are_whole_in_order_and_say_what_is_missing(
+    router: ZenohSettings, session: zenoh.Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    box = f"{WEST - 0.05},{SOUTH},{EAST + 0.05},{NORTH}"
+    dead = f"{WEST + 0.001},{SOUTH + 0.001},{EAST - 0.001},{NORTH - 0.001}"
+    lines: list[str] = []
+    stop = threading.Event()
+    wishes = watching.Wishes(box, as_json=True)
+    watcher = threading.Thread(target=watching.watch, args=(router, wishes, stop, lines.append))
+    try:
+        with three(router, tmp_path) as services:
+            drive(session, services)
+            along = ask(router, route=ROUTE)
+            assert along.missing == ()
+            assert along.table is not None
+            passed = np.asarray(along.table["longitude"].to_numpy())
+            assert (np.diff(passed) < 0).all()
+            assert along.table.num_rows == len(LONGITUDES)
+            for form in ("json", "geojson"):
+                document = ask(router, route=ROUTE, format=form).document
+                assert document is not None
+                cells = [cell for tile in document.get("tiles", []) for cell in tile["cells"]]  # type: ignore[attr-defined]
+                cells += [one["properties"] for one in document.get("features", [])]  # type: ignore[attr-defined]
+                assert [cell["longitude"] for cell in cells] == passed.tolist()
+            assert ask(router, bbox=box).gap is None
+            watcher.start()
+            until(lambda: any(json.loads(line)["event"] == "watching" for line in lines))
+            services[1].end()
+            silent = 0
+            asked = [{"bbox": box}, {"bbox": dead}, {"route": ROUTE}, {"bbox": dead, "format": "json"}]
+            for parameters in asked:
+                answer = ask(router, **parameters)
+                silent += answer.missing != (NAMES[1],)
+            assert silent == 0  # cluster.silent_regions
+            part = ask(router, route=ROUTE).table
+            assert part is not None
+            assert 0 < part.num_rows < along.table.num_rows
+            with pytest.raises(InputError, match=NAMES[1]):
+                map_client.served_table(ask(router, bbox=dead))
+            assert map_client.served_table(ask(router, bbox=box)).schema.metadata == {b"missing": NAMES[1].encode()}
+            assert main(["query", "--connect", router.connect[0], "--bbox", dead]) == 1
+            assert f"nobody serves {NAMES[1]}" in capsys.readouterr().err
+            until(lambda: {"event": "away", "regions": [NAMES[1]]} in map(json.loads, lines))
+            with running(router, tmp_path / "shard-1", name="shard-1", regions=[NAMES[1]]):
+                assert ask(router, bbox=box).gap is None
+                until(lambda: {"event": "back", "regions": [NAMES[1]]} in map(json.loads, lines))
+    finally:
+        stop.set()
+        if watcher.is_alive():
+            watcher.join(10.0)
+
+
+def test_a_second_service_of_a_region_refuses_to_start(router: ZenohSettings, tmp_path: Path) -> None:
+    wide = NAMES[1].rpartition("/")[0] + "/*"
+    with running(router, tmp_path / "one", name="first", regions=[wide]):
+        for name in ("first", "second"):  # also one of the same name, on another machine
+            with (
+                pytest.raises(InputError, match=f"{NAMES[1].rpartition('/')[0]}.* is served by first already"),
+                zenoh_session(router) as other,
+                serving(other, name, NAMES[1:2], threading.Event()),
+            ):
+                pass
+    with zenoh_session(router) as other, serving(other, "second", NAMES[1:2], threading.Event()) as mine:
+        assert tokens.standing(other) == set(mine)
+        assert rivals(mine, tokens.standing(other)) == []
+
+
+@contextmanager
+def zenoh_session(router: ZenohSettings) -> Iterator[zenoh.Session]:
+    with map_client.joined(router) as opened:
+        yield opened
+
+
+def test_what_nobody_serves_is_said_in_as_few_regions_as_there_are() -> None:
+    box = query.parse({"bbox": f"{WEST + 0.01},{SOUTH + 0.01},{EAST + 0.02},{NORTH - 0.01}"})
+    first = NAMES[1].split("/")
+    assert regions.unserved(box, ["*/*/*"]) == []
+    assert regions.unserved(box, NAMES) == []
+    assert regions.unserved(box, NAMES[:2]) == [NAMES[2]] or regions.unserved(box, NAMES[:2])[0].endswith("*")
+    assert set(regions.unserved(box, [])) == {f"{name.split('/')[0]}/*/*" for name in NAMES[1:]}
+    assert regions.unserved(query.parse({}), [f"{first[0]}/*/*"]) == [
+        f"{grid.quadkey(one, 4)}/*/*" for one in range(256) if grid.quadkey(one, 4) != first[0]
+    ]
+    assert regions.unserved(query.parse({"route": ROUTE}), [NAMES[2]]) == [NAMES[1], NAMES[0]]
+
+
+def test_a_token_says_its_region_and_a_stranger_says_none() -> None:
+    for region in ("*/*/*", NAMES[0], "1202/*/*"):
+        told = keys.Served(region, "shard-0", "1f")
+        assert keys.parse_served(told.key) == told
+    for key in ("gripmap/v1/shard/shard-0", f"{keys.SERVES}/1202/all/x/a/b", f"{keys.SERVES}/1/2/3", keys.SERVES):
+        with pytest.raises(InputError):
+            keys.parse_served(key)
