@@ -8,13 +8,13 @@ PAPERS := .venv/.papers
 TESTS := $(BIN)/python -m pytest -q --numprocesses $$(( $$(getconf _NPROCESSORS_ONLN) + 1 )) --dist loadfile
 export PYTHONDONTWRITEBYTECODE :=  # what was parsed once is kept: tests start hundreds of processes
 
-.PHONY: setup demo test test-all test-shuffled check package docs lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test usability figures roads-bench page-bench browser-test
+.PHONY: setup demo test test-all test-shuffled check package docs lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test usability figures roads-bench page-bench browser-test batch-bench
 
 setup: $(STAMP)  ## make .venv and install everything, pinned
 
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[analytics,certs,demo,dev,inputs,metrics,objects,page]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[analytics,certs,demo,dev,iceberg,inputs,metrics,objects,page]'
 	$(BIN)/python -m deploy.precompile
 	touch $@
 
@@ -81,6 +81,9 @@ bench: setup  ## cost of each part, side by side; writes .bench/figures.json
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[bench]'
 	$(BIN)/python -m tests.benchmarks
 
+batch-bench: setup  ## rows of the Iceberg tables beside those of the archive; writes .batch/figures.json
+	$(BIN)/python -m tests.benchmarks.batch
+
 analytics-bench: setup  ## archive and analytics on ten million rows, Spark beside; writes .analytics/figures.json
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[spark]'
 	$(BIN)/python -m tests.benchmarks.analytics
@@ -100,4 +103,4 @@ lock: setup  ## write the installed versions to constraints.txt
 	$(BIN)/python -m pip freeze --exclude-editable --exclude gripmap > constraints.txt
 
 clean:
-	rm -rf .venv .demo .docs dist .bench .analytics .evaluation .faults .usability .roads .page build *.egg-info
+	rm -rf .venv .demo .docs dist .bench .analytics .evaluation .faults .usability .roads .page .batch build *.egg-info

@@ -16,13 +16,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_service.archive import layout, reading, rollup, snapshots, witnesses
+from fleet_service.archive import iceberg, layout, reading, rollup, snapshots, witnesses
 from fleet_service.archive.between import Between
 from fleet_service.archive.compaction import compact, compacting
 from fleet_service.archive.files import COMPACTED, MAP, lock, put_in_place
 from fleet_service.archive.layout import TABLES
-from fleet_service.archive.load import BAD, content
+from fleet_service.archive.load import BAD, content, load
 from fleet_service.archive.pseudonyms import Pseudonyms, number
+from fleet_service.archive.segments import SCHEMAS
 from fleet_service.archive.version import KEY
 from schemas.errors import InputError
 from schemas.runtime.durable import sync_directory
@@ -52,6 +53,7 @@ def retire(root: Path, raw_days: int, today: date) -> Retired:
     with compacting(root):
         rollup.complete(root, until_day=_last_to_go(raw_days, today))
         folders = due(root, raw_days, today)
+        iceberg.let_go(root, [path for folder in folders for path in folder.glob("*/*")])
         for folder in folders:
             for path in sorted(folder.glob("*/*"), reverse=True):
                 path.unlink()
@@ -144,7 +146,9 @@ def erased(root: Path, vehicle: str, month: str) -> Iterator[Forgotten]:
             damaged.unlink()
         for kind in Kind:
             # a batch has the pseudonym of its first record and may end a day later
-            for path in layout.compacted(root, kind, begin, end):
+            theirs = [path for path in layout.compacted(root, kind, begin, end) if _names(kind, path, pseudonym)]
+            iceberg.let_go(root, theirs)
+            for path in theirs:
                 if len(gone := _without(root, kind, path, pseudonym)):
                     rows, cells = rows + len(gone), cells.union(gone)
                     files += [path, rollup.part_of(path)] if kind is Kind.OBSERVATION else [path]
@@ -204,6 +208,12 @@ def drop_checkpoints(root: Path) -> None:
     if (root / layout.CHECKPOINTS).exists():
         shutil.rmtree(root / layout.CHECKPOINTS)
         sync_directory(root)
+
+
+def _names(kind: Kind, path: Path, pseudonym: str) -> bool:
+    """Whether a file may hold rows of a vehicle."""
+    found = load(path, SCHEMAS[kind], ["vehicle"], damaged=_unread)
+    return found is not None and pseudonym in pc.unique(found["vehicle"]).to_pylist()
 
 
 def _without(root: Path, kind: Kind, path: Path, pseudonym: str) -> list[int]:

@@ -1,6 +1,7 @@
 """`fleet-service export`: a part of the archive as a file for other programs; the map as it stands now, or stood.
 
 `export datex` asks the running services instead, and writes the slippery stretches as road authorities read them.
+`export iceberg` writes no file: it names the compacted ones in Iceberg tables.
 """
 
 from __future__ import annotations
@@ -27,15 +28,27 @@ from schemas.thresholds import NS
 ENDINGS: Final = (".parquet", ".geojson", ".csv")
 WHAT: Final = ("map", "observations", "rollup")
 DATEX: Final = "datex"
+ICEBERG: Final = "iceberg"
+_LIVE: Final = ("country", "supplier", "follow", "connect", "config")
+_PART: Final = ("bbox", "since", "until")
+_TABLE: Final = ("catalog", "namespace", "at")
+_NOT: Final = {  # options of another kind of export
+    **dict.fromkeys(WHAT, (*_LIVE, *_TABLE)),
+    DATEX: ("archive", *_PART, *_TABLE),
+    ICEBERG: (*_LIVE, *_PART, "out", "snapshot"),
+}
+_NEEDS: Final = {
+    **dict.fromkeys(WHAT, ("archive", "out")),
+    DATEX: ("country", "supplier", "out"),
+    ICEBERG: ("archive", "catalog"),
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_archive(parser, required=False)
-    parser.add_argument("what", choices=(*WHAT, DATEX), metavar="|".join((*WHAT, DATEX)))
-    parser.add_argument(
-        "--out", metavar="FILE", type=Path, required=True, help=f"ends in {', '.join(ENDINGS)}; datex: in .xml"
-    )
+    parser.add_argument("what", choices=(*WHAT, DATEX, ICEBERG), metavar="|".join((*WHAT, DATEX, ICEBERG)))
+    parser.add_argument("--out", metavar="FILE", type=Path, help=f"ends in {', '.join(ENDINGS)}; datex: in .xml")
     add_part(parser)
     parser.add_argument(
         "--min-vehicles", metavar="K", type=int, default=1, help="map: only cells of K vehicles or more"
@@ -44,6 +57,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_connection(parser)
     add_supplier(parser)
     parser.add_argument("--follow", action="store_true", help="datex: keep the file up until a signal")
+    parser.add_argument(
+        "--catalog", metavar="NAME|URI", help="iceberg: of pyiceberg's configuration, or sqlite:///FILE, postgresql+…"
+    )
+    parser.add_argument("--namespace", metavar="NAME", help="iceberg: of the tables observations, states; or gripmap")
+    parser.add_argument("--at", metavar="URL", help="iceberg: where readers find the archive's files; default: there")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -52,16 +70,26 @@ def run(arguments: argparse.Namespace) -> int:
     Raises:
         InputError: an option is missing, or of the other kind of export.
     """
-    live, archived = ("country", "supplier", "follow", "connect", "config"), ("archive", "bbox", "since", "until")
-    wrong = archived if arguments.what == DATEX else live
-    for name in wrong:
+    for name in _NOT[arguments.what]:
         if getattr(arguments, name):
             option = {"since": "from", "until": "to"}.get(name, name)
             raise InputError(option, f"says nothing to export {arguments.what}", "leave it out")
-    for name in ("country", "supplier") if arguments.what == DATEX else ("archive",):
+    for name in _NEEDS[arguments.what]:
         if getattr(arguments, name) is None:
             raise InputError(name, f"is missing for export {arguments.what}", f"give --{name}")
-    return _datex(arguments) if arguments.what == DATEX else on_archive(arguments, _export)
+    if arguments.what == DATEX:
+        return _datex(arguments)
+    return on_archive(arguments, _iceberg if arguments.what == ICEBERG else _export)
+
+
+def _iceberg(arguments: argparse.Namespace) -> ArchiveReport:
+    from fleet_service.archive.iceberg import NAMESPACE, Place, register
+
+    root = arguments.archive.resolve()
+    place = Place(arguments.catalog, arguments.namespace or NAMESPACE, arguments.at or root.as_uri())
+    done = register(root, place)
+    line = f"{done.added} files registered, {done.dropped} dropped: {done.rows} rows in {place.catalog}"
+    return ArchiveReport(line, dict(done._asdict()))
 
 
 def _datex(arguments: argparse.Namespace) -> int:

@@ -91,7 +91,10 @@ SHOWN_BELOW: Final = {
     "completion": {"shell"},
     "certs": {"--renew-days", "--revoke", "--dry-run"},  # enrolment/test_certificates.py
     "run": {"--config", "--archive", "--weather"},
-    "export": {"--country", "--supplier", "--status", "--follow", "--connect", "--config"},  # client/test_datex.py
+    "export": {  # client/test_datex.py, archive/test_iceberg.py
+        *("--country", "--supplier", "--status", "--follow", "--connect", "--config"),
+        *("--catalog", "--namespace", "--at"),
+    },
     "roads": {"extract", "--out", "--id", "--name"},  # analytics/roads/test_join.py
     "analyze": {"--roads", "--level", "--within"},  # analytics/roads/test_contract.py
     "query": {"--bbox", "--route", "--min-vehicles", "--at", "--basis", "--format", "--out", "--connect", "--config"},

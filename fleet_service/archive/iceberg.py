@@ -1,0 +1,208 @@
+"""The compacted files as Iceberg tables: registered where they lie, nothing is copied; the inbox is never registered.
+
+One registrar per table. What retention and forgetting remove or rewrite leaves the tables first (`let_go`), for a
+table that names a file that is gone can no longer be read.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final, NamedTuple, TypeAlias
+
+import pyarrow as pa
+
+from fleet_service.archive import layout
+from fleet_service.archive.compaction import compacting
+from fleet_service.archive.segments import SCHEMAS
+from schemas.errors import InputError
+from schemas.runtime.durable import written
+from schemas.wire import Kind
+
+Catalog: TypeAlias = Any  # of pyiceberg, which an archive without tables does not need
+Table: TypeAlias = Any
+
+RECORD: Final = "iceberg.json"  # in the archive: where its files are registered
+NAMESPACE: Final = "gripmap"
+PROPERTIES: Final = {
+    "write.metadata.metrics.column.vehicle": "counts",  # no pseudonym stays in the table's own files
+    "write.metadata.delete-after-commit.enabled": "true",
+    "write.metadata.previous-versions-max": "20",
+    "commit.retry.num-retries": "10",  # of several registrars, each of an archive of its own
+}
+
+
+class Place(NamedTuple):
+    """Where an archive is registered.
+
+    Attributes:
+        catalog: a name of pyiceberg's configuration, or the URI of an SQL catalogue (`sqlite:////var/lib/tables.db`).
+        namespace: of the tables `observations` and `states`.
+        at: URL under which the tables' readers find the archive's folder; its mirror or copy, or itself.
+    """
+
+    catalog: str
+    namespace: str
+    at: str
+
+
+class Registered(NamedTuple):
+    """Files that came into the tables, files that left them, and rows that the tables have of the archive now."""
+
+    added: int
+    dropped: int
+    rows: int
+
+
+def register(root: Path, place: Place) -> Registered:
+    """Make the tables name the compacted files of an archive as they are; again, it changes nothing.
+
+    Files of other archives in the same tables stay.
+
+    Raises:
+        InputError: pyiceberg is not installed, the catalogue refuses, or a file cannot be read at `place.at`.
+        OSError: the archive cannot be read or written.
+    """
+    total = Registered(0, 0, 0)
+    with compacting(root):  # nobody removes or rewrites files meanwhile
+        _remember(root, place)
+        with _said(place):
+            catalog = _catalog(place)
+            catalog.create_namespace_if_not_exists(place.namespace)
+            for kind in Kind:
+                done = _brought_up(_table(catalog, place, kind), root, place, kind)
+                total = Registered(*map(sum, zip(total, done, strict=True)))
+    return total
+
+
+def let_go(root: Path, paths: Sequence[Path]) -> None:
+    """Take files out of the tables that name them, before they are removed or rewritten.
+
+    Raises:
+        InputError: the archive is registered and pyiceberg is not installed, or the catalogue refuses.
+    """
+    place = place_of(root)
+    if place is None or not paths:
+        return
+    names = {_name(root, place, path) for path in paths}
+    with _said(place):
+        catalog = _catalog(place)
+        for kind in Kind:
+            if catalog.table_exists((place.namespace, layout.TABLES[kind])):
+                table = catalog.load_table((place.namespace, layout.TABLES[kind]))
+                _commit(table, [file for name, file in _held(table).items() if name in names], [])
+
+
+def place_of(root: Path) -> Place | None:
+    """Where an archive is registered, if it is.
+
+    Raises:
+        InputError: what says so cannot be read: a file that a table names must not go unseen.
+    """
+    path = root / RECORD
+    try:
+        return Place(**json.loads(path.read_bytes()))
+    except FileNotFoundError:
+        return None
+    except (ValueError, TypeError) as error:
+        raise InputError("archive", f"{path} is damaged ({error})", "run export iceberg again") from error
+
+
+def _remember(root: Path, place: Place) -> None:
+    """Note where the archive is registered before it is, so that no file goes that a table names."""
+    path = root / RECORD
+    try:
+        before = place_of(root)
+    except InputError:  # a damaged one is written anew
+        before = None
+    if before is not None and before != place:
+        problem = f"this archive is registered at {before.catalog}, namespace {before.namespace}, files at {before.at}"
+        raise InputError("catalog", problem, f"give these; or drop those tables, then remove {path}")
+    if before is None:
+        with written(path) as file:
+            file.write(json.dumps(place._asdict()).encode())
+
+
+def _catalog(place: Place) -> Catalog:
+    try:
+        from pyiceberg.catalog import load_catalog
+    except ImportError as error:
+        raise InputError("catalog", "pyiceberg is not installed", "pip install 'gripmap[iceberg]'") from error
+    if not place.catalog.startswith(("sqlite://", "postgresql")):
+        return load_catalog(place.catalog)
+    told = {"type": "sql", "uri": place.catalog}
+    if place.catalog.startswith("sqlite:///"):  # the tables' own files beside the catalogue
+        told["warehouse"] = Path(place.catalog.removeprefix("sqlite:///")).absolute().with_suffix("").as_uri()
+    return load_catalog("gripmap", **told)  # by this name others find the tables
+
+
+def _table(catalog: Catalog, place: Place, kind: Kind) -> Table:
+    """The table of a kind, with every column that is known today."""
+    from pyiceberg.transforms import DayTransform
+
+    name, schema = (place.namespace, layout.TABLES[kind]), SCHEMAS[kind]
+    if not catalog.table_exists(name):
+        new = catalog.create_table_transaction(name, schema=_plain(schema), properties=PROPERTIES)
+        with new, new.update_spec() as spec:  # a compacted file holds one date
+            spec.add_field(layout.TIME[kind], DayTransform(), "date")
+    table = catalog.load_table(name)
+    if set(schema.names) - {field.name for field in table.schema().fields}:
+        with table.update_schema() as update:
+            update.union_by_name(_plain(schema))
+    return table
+
+
+def _plain(schema: pa.Schema) -> pa.Schema:
+    return pa.schema([field.with_nullable(True).remove_metadata() for field in schema])
+
+
+def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> Registered:
+    """Drop what is gone or no longer the same, add what is missing, in one commit."""
+    there = {_name(root, place, path): path for path in layout.compacted(root, kind)}
+    mine = {name: file for name, file in _held(table).items() if name.startswith(_folder(place))}
+    # one that was rewritten elsewhere is known by its size
+    stale = [n for n, file in mine.items() if n not in there or there[n].stat().st_size != file.file_size_in_bytes]
+    missing = sorted((there.keys() - mine.keys()) | (there.keys() & set(stale)))
+    _commit(table, [mine[name] for name in stale], missing)
+    now = _held(table.refresh())
+    return Registered(len(missing), len(stale), sum(f.record_count for n, f in now.items() if n in there))
+
+
+def _commit(table: Table, gone: list[Any], added: list[str]) -> None:
+    """Change a table at once, or not at all."""
+    if not gone and not added:
+        return
+    with table.transaction() as change:
+        if gone:
+            with change.update_snapshot().overwrite() as without:
+                for file in gone:
+                    without.delete_data_file(file)
+        if added:
+            change.add_files(added, check_duplicate_files=False)  # `_held` has looked
+
+
+def _held(table: Table) -> dict[str, Any]:
+    """Files that a table names, by name."""
+    return {task.file.file_path: task.file for task in table.scan().plan_files()}
+
+
+def _folder(place: Place) -> str:
+    return place.at.rstrip("/") + "/"
+
+
+def _name(root: Path, place: Place, path: Path) -> str:
+    return _folder(place) + str(path.relative_to(root))
+
+
+@contextmanager
+def _said(place: Place) -> Iterator[None]:
+    """Errors of the catalogue as one line."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # every catalogue has errors of its own
+        fix = "see that it is reached, then run it again"
+        raise InputError("catalog", f"{place.catalog}: {type(error).__name__}: {error}", fix) from error

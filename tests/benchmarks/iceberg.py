@@ -1,0 +1,60 @@
+"""Rows of an archive beside those of its Iceberg tables; `make batch-bench` counts how many differ."""
+
+from __future__ import annotations
+
+from collections import Counter
+from datetime import timedelta
+from pathlib import Path
+from typing import Any, Final, TypeAlias
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from fleet_service.archive import iceberg, layout, retention
+from fleet_service.archive.compaction import compact
+from schemas.wire import Kind
+from tests.fleet_service.archive.rows import fill
+
+Table: TypeAlias = Any  # of pyiceberg
+SEEDS: Final = (0, 10, 20, 30)
+
+
+def table_of(uri: str, kind: Kind) -> Table:
+    """The table of a kind, as a reader opens it."""
+    from pyiceberg.catalog import load_catalog
+
+    return load_catalog("gripmap", type="sql", uri=uri).load_table((iceberg.NAMESPACE, layout.TABLES[kind]))
+
+
+def rows_different(root: Path, uri: str) -> int:
+    """Rows, with all their columns, that are in the compacted files or in the tables and not in both as often."""
+    different = 0
+    for kind in Kind:
+        files = [pq.read_table(path, partitioning=None) for path in layout.compacted(root, kind)]
+        there = pa.concat_tables(files)
+        seen = table_of(uri, kind).scan().to_arrow().select(there.column_names)
+        ours, theirs = _counted(there), _counted(seen)
+        different += (ours - theirs).total() + (theirs - ours).total()
+    return different
+
+
+def _counted(table: pa.Table) -> Counter[str]:
+    return Counter(repr(row) for row in zip(*(column.to_pylist() for column in table.columns), strict=True))
+
+
+def measured(folder: Path) -> float:
+    """Rows that differ over four rounds of compaction and registration, and after a day has gone by retention."""
+    root, uri = folder / "archive", f"sqlite:///{folder}/tables.db"
+    place = iceberg.Place(uri, iceberg.NAMESPACE, root.as_uri())
+    different = 0
+    for done, seed in enumerate(SEEDS, 1):
+        fill(root, 5, 500, seed=seed)
+        compact(root)
+        rows = iceberg.register(root, place).rows
+        if rows != done * 5000:
+            raise RuntimeError(f"{rows} rows registered")
+        different += rows_different(root, uri)
+    today = layout.date_of(20_000) + timedelta(days=32)
+    if retention.retire(root, 31, today).files == 0:
+        raise RuntimeError("nothing was retired")
+    return different + rows_different(root, uri)

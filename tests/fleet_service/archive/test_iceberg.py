@@ -1,0 +1,151 @@
+"""Iceberg tables over the archive: every compacted row once, as pyiceberg and DuckDB see it, whatever goes."""
+
+from __future__ import annotations
+
+import json
+from datetime import timedelta
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from fleet_service.archive import iceberg, layout, retention
+from fleet_service.archive.compaction import compact
+from fleet_service.archive.pseudonyms import Pseudonyms
+from fleet_service.archive.segments import Writer
+from fleet_service.cli import main
+from schemas.errors import InputError
+from schemas.wire import Kind
+from tests.benchmarks.iceberg import rows_different, table_of
+from tests.fleet_service.archive.rows import START, fill, rows_of
+
+pytest.importorskip("pyiceberg", reason="pip install 'gripmap[iceberg]'")
+DATE = layout.date_of(20_000)
+MONTH = f"{DATE:%Y-%m}"
+
+
+def exported(root: Path, capsys: pytest.CaptureFixture[str], *more: str) -> dict[str, int]:
+    capsys.readouterr()
+    words = ["export", "iceberg", "--archive", str(root), "--catalog", uri(root), "--json", *more]
+    assert main(words) == 0
+    told = json.loads(capsys.readouterr().out)
+    return {name: told[name] for name in ("added", "dropped", "rows")}
+
+
+def uri(root: Path) -> str:
+    return f"sqlite:///{root.parent}/tables.db"
+
+
+def test_compacted_files_are_registered_once_and_the_log_never(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = tmp_path / "archive"
+    writer = fill(root, 2, 100)
+    compact(root)
+    writer.write(Kind.OBSERVATION, rows_of(Kind.OBSERVATION, 30, 9))  # waits in the inbox
+    assert exported(root, capsys) == {"added": 8, "dropped": 0, "rows": 400}  # two days, two zones, two kinds
+    assert exported(root, capsys) == {"added": 0, "dropped": 0, "rows": 400}
+    assert rows_different(root, uri(root)) == 0
+    compact(root)
+    assert rows_different(root, uri(root)) == 30  # not yet
+    assert exported(root, capsys)["rows"] == 430
+    assert rows_different(root, uri(root)) == 0
+    table = table_of(uri(root), Kind.OBSERVATION)
+    connection = table.scan(selected_fields=("cell", "boot", "mu")).to_duckdb("seen")
+    assert connection.execute("select count(*), count(distinct boot) from seen").fetchone() == (230, 3)
+
+
+def test_what_retention_removes_leaves_the_tables_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = tmp_path / "archive"
+    fill(root, 2, 100)
+    compact(root)
+    exported(root, capsys)
+    assert retention.retire(root, 31, DATE + timedelta(days=32)) == (2, 4)
+    assert rows_different(root, uri(root)) == 0  # read whole: no table names a file that is gone
+    told = exported(root, capsys)
+    assert (told["added"], told["dropped"]) == (0, 0)
+    assert 0 < told["rows"] < 400
+
+
+def test_a_catalogue_that_is_away_holds_retention_up(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = tmp_path / "archive"
+    fill(root, 1, 50)
+    compact(root)
+    exported(root, capsys)
+    files = sorted(root.rglob("zone=*/*.parquet"))
+    (tmp_path / "tables.db").rename(tmp_path / "elsewhere.db")
+    (tmp_path / "tables.db").mkdir()
+    with pytest.raises(InputError, match="^catalog: sqlite://.*OperationalError"):
+        retention.retire(root, 31, DATE + timedelta(days=32))
+    assert set(files) <= set(root.rglob("zone=*/*.parquet"))
+    (tmp_path / "tables.db").rmdir()
+    (tmp_path / "elsewhere.db").rename(tmp_path / "tables.db")
+    assert retention.retire(root, 31, DATE + timedelta(days=32)) == (2, 4)
+    assert rows_different(root, uri(root)) == 0
+
+
+def test_a_forgotten_vehicle_is_in_no_table_and_the_others_come_back(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = tmp_path / "archive"
+    pseudonyms = Pseudonyms(root / "keys")
+    names = np.array([pseudonyms.of(f"sim-{k:03}", START) for k in range(5)])
+    writer = Writer(root, "shard-0")
+    for kind in Kind:
+        rows = rows_of(kind, 100)
+        rows["vehicle"] = names[np.arange(100) % 5]
+        writer.write(kind, rows)
+    compact(root)
+    assert exported(root, capsys)["rows"] == 200
+    assert main(["forget", "--archive", str(root), "--vehicle", "sim-003", "--period", MONTH, "--yes"]) == 0
+    seen = table_of(uri(root), Kind.OBSERVATION).scan().to_arrow()  # rewritten files are out, and it can be read
+    assert names[3] not in seen["vehicle"].to_pylist()
+    assert exported(root, capsys)["rows"] == 160
+    assert exported(root, capsys) == {"added": 0, "dropped": 0, "rows": 160}
+    assert rows_different(root, uri(root)) == 0
+    for path in tmp_path.rglob("*.avro"):
+        assert names[3].encode() not in path.read_bytes()
+
+
+def test_readers_elsewhere_are_told_of_the_mirror(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root, there = tmp_path / "archive", tmp_path / "there"
+    fill(root, 1, 50)
+    assert main(["compact", "--archive", str(root), "--put-to", there.as_uri()]) == 0
+    assert exported(root, capsys, "--at", there.as_uri())["rows"] == 100
+    paths = [task.file.file_path for task in table_of(uri(root), Kind.STATE).scan().plan_files()]
+    assert paths
+    assert all(path.startswith(there.as_uri()) for path in paths)
+    with pytest.raises(InputError, match="^catalog: this archive is registered at "):
+        iceberg.register(root, iceberg.Place(uri(root), "other", root.as_uri()))
+
+
+def test_two_archives_share_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for k in range(2):
+        fill(tmp_path / f"archive-{k}", 1, 50, seed=k)
+        compact(tmp_path / f"archive-{k}")
+        assert exported(tmp_path / f"archive-{k}", capsys)["rows"] == 100
+    assert exported(tmp_path / "archive-0", capsys) == {"added": 0, "dropped": 0, "rows": 100}
+    tables = [table_of(uri(tmp_path / "archive-0"), kind) for kind in Kind]
+    whole = pa.concat_tables([table.scan(selected_fields=("boot",)).to_arrow() for table in tables])
+    assert set(whole["boot"].to_pylist()) == {0, 1}
+    assert whole.num_rows == 200
+
+
+@pytest.mark.parametrize(
+    ("words", "start"),
+    [
+        (["--archive", "{root}"], "error: catalog: is missing for export iceberg"),
+        (
+            ["--archive", "{root}", "--catalog", "sqlite:///x.db", "--out", "x.csv"],
+            "error: out: says nothing to export",
+        ),
+        (["--archive", "{root}", "--catalog", "nobody-knows-it"], "error: catalog: nobody-knows-it: "),
+    ],
+)
+def test_a_wrong_export_is_one_line(
+    tmp_path: Path, words: list[str], start: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "inbox").mkdir()
+    assert main(["export", "iceberg", *(word.format(root=tmp_path) for word in words)]) == 2
+    assert capsys.readouterr().err.startswith(start)
