@@ -1,12 +1,14 @@
 """`make package`: builds sdist and wheel, tries the wheel in a fresh environment, far from here.
 
 The wheel is built from the sdist, so that what is missing in the one is missed in the other. It is tried with each
-Python of VERSIONS that this machine has; for those that it has not, a line says so. `--python` names others.
+Python of VERSIONS that this machine has, on the PATH or among pyenv's; for those that it has not, a line says so.
+`--python` names others.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
 import subprocess
 import sys
@@ -36,19 +38,28 @@ def interpreters() -> list[str]:
     """Commands of the VERSIONS that work here; says which are left out, and why."""
     found = []
     for version in VERSIONS:
-        here = (
-            sys.executable if version == ".".join(map(str, sys.version_info[:2])) else shutil.which(f"python{version}")
-        )
-        if here is None:
-            print(f"python{version} skipped: no such command on this machine", flush=True)
-            continue
-        said = subprocess.run([here, "-c", WORKS], capture_output=True, text=True, check=False, timeout=60)
-        if said.stdout.strip() == version:
-            found.append(here)
+        why = "no such command on this machine"
+        for here in candidates(version):
+            said = subprocess.run([here, "-c", WORKS], capture_output=True, text=True, check=False, timeout=60)
+            if said.stdout.strip() == version:
+                found.append(here)
+                break
+            last = ((said.stderr or said.stdout).strip() or "says nothing").splitlines()[-1]
+            why = f"{here} does not work ({last[:100]})"
         else:
-            why = (said.stderr or said.stdout or "says nothing").strip().splitlines()[-1]
-            print(f"python{version} skipped: {here} does not work ({why[:100]})", flush=True)
+            print(f"python{version} skipped: {why}", flush=True)
     return found
+
+
+def candidates(version: str) -> list[str]:
+    """Where a Python of a version may be: this one, the command of that name, and what pyenv has installed."""
+    this = sys.executable if version == ".".join(map(str, sys.version_info[:2])) else None
+    kept = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
+    return [
+        *([this] if this else []),
+        *([command] if (command := shutil.which(f"python{version}")) else []),
+        *sorted(map(str, kept.glob(f"{version}.*/bin/python"))),
+    ]
 
 
 def main() -> int:

@@ -224,6 +224,19 @@ def test_what_may_be_written_is_known_before_anything_is_computed(tmp_path: Path
     assert commandline.ending("out", Path("a.geo.parquet"), (".parquet", ".geo.parquet")) == ".geo.parquet"
 
 
+@pytest.mark.parametrize("out", ["/proc/none/e.parquet", "file/e.parquet"])
+def test_estimates_for_a_place_that_cannot_be_written_are_refused_in_one_line(
+    out: str, tmp_path: Path, capsys: Capture
+) -> None:
+    log = tmp_path / "x.parquet"
+    drive = ["simulate", "slalom", "--duration", "1", "--out", str(log), "--vehicle-out", str(tmp_path / "x.json")]
+    assert edge_agent.cli.main(drive) == 0
+    (tmp_path / "file").touch()
+    capsys.readouterr()
+    assert edge_agent.cli.main(["replay", str(log), "--out", str(tmp_path / out), "--estimator", "ckf"]) == 2
+    assert capsys.readouterr().err.splitlines()[-1].startswith("error: out: ")
+
+
 def test_every_module_of_a_command_says_what_it_is() -> None:
     for line in LINES.values():
         for command in line.COMMANDS:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 import shlex
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -54,6 +55,23 @@ def test_every_command_of_the_root_readme_is_understood_and_writes_where_git_loo
                 if getattr(arguments, name, None)
             ]
             assert all(path.startswith("try/") for path in written), command
+
+
+def test_git_looks_away_from_what_the_readmes_make_and_from_every_key() -> None:
+    """`git add .` behind the first hour adds nothing, an authority's private key least of all."""
+    made = [
+        "try/certs/ca/key.pem",
+        "certs/ca/key.pem",
+        "any.key",
+        "deploy/any.pem",
+        "archive/x",
+        "drives/x",
+        "spool.sqlite",
+    ]
+    done = subprocess.run(["git", "check-ignore", *made], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.stdout.splitlines() == made
+    done = subprocess.run(["git", "check-ignore", "README.md"], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.stdout == ""
 
 
 @pytest.mark.parametrize("page", ["README.md", "edge_agent/README.md", "fleet_service/README.md", "deploy/README.md"])

@@ -1,0 +1,82 @@
+"""Pictures of answers say what a reader acts on: roads, days, moments, names, and the line that was promised."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+
+from fleet_service.analytics import plots
+from schemas import grid
+from tests.fleet_service.examples import CELL
+
+BENT = grid.interleave(np.array([0, 1, 2, 2, 2]) + 1_118_000, np.array([0, 0, 0, 1, 2]) + 630_000).tolist()
+NOON_US = 1_769_515_200_000_000  # 27 January 2026
+
+
+def drawn(name: str, table: pa.Table) -> Figure:
+    figure = Figure()
+    plots._DRAWN[name](figure, table)
+    return figure
+
+
+def quarters(axes: Axes) -> int:
+    return sum(len(one.get_paths()) for one in axes.collections if isinstance(one, PolyCollection))
+
+
+def named(axes: Axes) -> list[str]:
+    legend = axes.get_legend()
+    return [text.get_text() for text in legend.get_texts()] if legend else []
+
+
+def test_worst_draws_the_cells_of_each_stretch_and_no_line_through_unordered_points() -> None:
+    one = {"sector": 1, "mu": 0.2, "length_m": 50.0, "share_slippery": 0.9, "share_lower": 0.7, "values": 12}
+    figure = drawn("worst", pa.Table.from_pylist([{**one, "members": BENT}, {**one, "members": BENT[:2]}]))
+    first, second = (axes for axes in figure.axes if axes.get_xlabel() == "east [m]")
+    assert [quarters(first), quarters(second)] == [5, 2]
+    assert not first.lines
+    assert first.get_title().startswith("1: 50 m heading ")
+
+
+def test_grip_of_a_day_has_that_day_and_the_cells_that_only_have_a_bound_on_its_axis() -> None:
+    table = pa.table({"day": ["2026-01-27"] * 3, "mu_p50": [0.3, 0.8, None]})
+    (axes,) = drawn("grip", table).axes
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["2026-01-27"]
+    assert np.ptp(axes.get_xlim()) < 2.0
+    assert "2 measured\n1 bounded" in [text.get_text() for text in axes.texts]
+    assert len(named(axes)) == 2
+
+
+def test_replay_has_a_map_a_moment_and_hatches_what_was_not_measured() -> None:
+    frames = pa.array([NOON_US, NOON_US, NOON_US + 10_000_000], pa.timestamp("us", tz="UTC"))
+    table = pa.table({"frame": frames, "cell": [CELL, CELL + 1, CELL], "sector": [0, 0, 0], "mu": [0.3, None, 0.4]})
+    maps = [axes for axes in drawn("replay", table).axes if axes.get_xlabel() == "east [m]"]
+    assert [axes.get_title() for axes in maps] == ["2026-01-27T12:00:00 UTC", "2026-01-27T12:00:10 UTC"]
+    assert [quarters(axes) for axes in maps] == [2, 1]
+    hatched = [one for one in maps[0].collections if isinstance(one, PolyCollection) and one.get_hatch()]
+    assert [len(one.get_paths()) for one in hatched] == [1]
+
+
+def test_calibration_names_its_lines_and_draws_what_was_published() -> None:
+    rows = [("measured", 0, 0.86, 0.97), ("measured", 1, 0.84, 0.96), ("bound", 0, 0.9, 0.98)]
+    table = pa.Table.from_pylist(
+        [dict(zip(("basis", "age_h", "held", "compatible"), row, strict=True)) for row in rows]
+    )
+    (axes,) = drawn("calibration", table).axes
+    assert set(named(axes)) == {
+        "measured: held", "measured: compatible", "bound: held", "bound: compatible", "published: 90%",
+    }  # fmt: skip
+    published = next(line for line in axes.lines if line.get_label() == "published: 90%")
+    assert np.asarray(published.get_ydata()).tolist() == [0.9, 0.9]
+
+
+@pytest.mark.parametrize("lasts", [True, False])
+def test_a_spell_that_lasts_is_told_from_one_that_ended(lasts: bool) -> None:
+    table = pa.table({"onset": [NOON_US * 1e-6], "duration_s": [600.0], "lasts": [lasts]})
+    (axes,) = drawn("spells", table).axes
+    arrows = [line for line in axes.lines if line.get_marker() == ">" and len(np.asarray(line.get_xdata()))]
+    assert len(arrows) == lasts
+    assert named(axes) == ["ended", "lasts at the end of the data"]
