@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-import time
-from contextlib import redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
 from typing import TypeAlias
@@ -61,15 +60,21 @@ def published(system: System, log: Path) -> tuple[Cells, list[str]]:
         held = session.declare_subscriber("gripmap/v1/alert/**", lambda sample: alerts.append(str(sample.key_expr)))
         assert edge_agent(["import", str(BLF), str(NMEA), "--profile", "toyota", *car, "--out", str(log)]) == 0
         assert edge_agent(["check", str(log), *car]) == 0
-        now = time.time()
-        start = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(now - 70.0))  # the service takes no records so old
         for name in VEHICLES:
-            words = ["replay", str(log), *car, "--out", out, "--publish", "--name", name, "--start", start]
+            words = ["replay", str(log), *car, "--out", out, "--publish", "--name", name, "--config", str(system.agent)]
             with redirect_stdout(StringIO()) as told:
-                assert edge_agent([*words, "--config", str(system.agent)]) == 0
+                assert edge_agent([*words, "--start", "now"]) == 0
             said = json.loads(told.getvalue().splitlines()[-1])
             assert said["observations_acknowledged"] > 50
             assert said["rejected"] == 0
+        with redirect_stdout(StringIO()) as told, redirect_stderr(StringIO()) as warned:
+            assert edge_agent(words) == 1, "of 2018, and nobody takes it"
+        refused = json.loads(told.getvalue().splitlines()[-1])["rejected"]
+        assert refused > 50
+        assert (
+            f"error: publish: {refused} records were refused; it is older than a month: --start now"
+            in warned.getvalue()
+        )
         cells = system.ask()
         held.undeclare()
     return cells, alerts
@@ -82,3 +87,4 @@ def test_the_first_drive_of_the_readme_takes_few_commands_and_they_are_those_tha
     commands = block[1].strip().splitlines()
     assert 0 < len(commands) <= MOST_COMMANDS
     assert [command.split()[1] for command in commands] == ["install", "import", "check", "replay"]
+    assert "--publish --start now" in commands[-1]

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from edge_agent.inputs.signal_log import SignalLog
     from schemas.config import AgentConfig
 
+NOW = "now"
+OLD_NS = 29 * 86_400 * NS  # a service takes nothing of more than thirty days ago, unless it is told otherwise
 DRAIN_S = 30.0  # for a busy service; what is not settled by then stays in the outbox
 PROGRESS_S = 1.0
 
@@ -39,12 +41,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, help="agent configuration (JSON), for --publish")
     parser.add_argument("--name", help="name to publish under (default: the vehicle file's)")
     parser.add_argument(
-        "--start", help="time of t = 0, UTC without a zone (default: the log's, else such that it ends now)"
+        "--start",
+        help="time of t = 0, UTC without a zone, or 'now', such that it ends now (default: the log's, else now)",
     )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay; 0 when all was written and acknowledged, 1 when something was left, 3 when it is not plausible."""
+    """Replay; 0 when all was written and acknowledged, 1 when something was left or refused, 3 when not plausible."""
     from edge_agent.app.backfill import backfill, beside, tasks_of
     from edge_agent.app.estimates_file import EstimatesFile
     from edge_agent.app.estimator_factory import bank_of
@@ -135,13 +138,19 @@ def _published(
             publisher.offer(last)
     finally:
         leave(publisher, progress, DRAIN_S)
-    return 1 if publisher.unsettled() else 0
+    if refused := sum(publisher.counts.rejected.values()):
+        old = time.time_ns() - start_ns > OLD_NS
+        fix = "it is older than a month: --start now drives it today" if old else "the reasons stand above"
+        print(f"error: publish: {refused} records were refused; {fix}", file=sys.stderr)
+    return 1 if refused or publisher.unsettled() else 0
 
 
 def _start(given: str | None, log: SignalLog) -> int:
     """The ns UTC of t = 0."""
     from schemas.config import moment
 
-    if given is None:
-        return log.start_ns if log.start_ns is not None else time.time_ns() - round(float(log.t[-1]) * NS)
-    return moment(given, "start")
+    if given is not None and given != NOW:
+        return moment(given, "start")
+    if given is None and log.start_ns is not None:
+        return log.start_ns
+    return time.time_ns() - round(float(log.t[-1]) * NS)
