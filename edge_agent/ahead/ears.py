@@ -20,10 +20,14 @@ from edge_agent.ahead.known import HeardMap
 from edge_agent.ahead.path import Path, Pose
 from schemas import grid, keys
 from schemas.errors import WireError
+from schemas.thresholds import NS
 from schemas.wire.ahead import AHEAD_ENCODING
 
 log = logging.getLogger(__name__)
 ANSWER_S: Final = 5.0  # for an answer; the next look asks again
+# After a session came back a car asks once more if nobody answered yet: the service may come back later: Zenoh looks
+# for a router every 4 s at the latest.
+AGAIN_S: Final = (1.0, 3.0, 9.0)
 _TOPIC: Final = keys.TOPICS["ahead"]
 
 
@@ -46,6 +50,7 @@ class Ears:
         self._map, self._asked, self._tiles = HeardMap(), Asked(), Tiles()
         self._subscribers: dict[int, Any] = {}
         self._routers: frozenset[str] = frozenset()
+        self._again, self._answered = list[int](), False  # [ns] when to ask once more; since the router is there
         self._told = session.declare_publisher(
             keys.ahead_key(vehicle), encoding=AHEAD_ENCODING, priority=getattr(zenoh.Priority, _TOPIC.priority),
             congestion_control=zenoh.CongestionControl.DROP,
@@ -86,6 +91,12 @@ class Ears:
         if not routers:
             return
         if back:
+            self._again = [self._clock() + round(later * NS) for later in AGAIN_S]
+            self._answered = False
+        elif self._again and self._clock() >= self._again[0]:
+            del self._again[0]
+            back = not self._answered
+        if back:
             self._asked.forget()
         for tile in self._tiles.heard if back else fresh:  # after the subscription: none is missed in between
             self._get(keys.alert_key(tile), self._on_standing)
@@ -120,6 +131,7 @@ class Ears:
             if reply.ok is None:
                 self.counts["unanswered"] += 1
                 return
+            self._answered = True
             self._take(take, str(reply.ok.key_expr), reply.ok.payload.to_bytes())
 
         try:

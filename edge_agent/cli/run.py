@@ -101,7 +101,7 @@ def _vss(args: argparse.Namespace, name: str, config: AgentConfig) -> RoadFricti
 
 def _live(args: argparse.Namespace, sources: list[str], config: AgentConfig) -> int:
     from edge_agent.app.trip import Trip, beside
-    from edge_agent.cli.common import checked_name
+    from edge_agent.cli.common import checked_name, left_behind
     from edge_agent.cli.live import drive_live
     from edge_agent.inputs.live.rows import LiveRows
     from edge_agent.inputs.live.sources import open_sources
@@ -122,6 +122,8 @@ def _live(args: argparse.Namespace, sources: list[str], config: AgentConfig) -> 
     finally:
         blocks.close()
         trip.close()
+        if any(feed.listening for feed in feeds):
+            left_behind.set()
 
 
 def _vehicle_file(args: argparse.Namespace) -> Path:

@@ -104,9 +104,14 @@ class Feed(ABC):
         self._thread.start()
 
     def close(self) -> None:
-        """Stop listening; a thread that hangs in a driver is left behind."""
+        """Stop listening; a thread that hangs in a driver is left behind, see `listening`."""
         self.stopping.set()
         self._thread.join(LEAVE_S)
+
+    @property
+    def listening(self) -> bool:
+        """Whether its thread runs: after `close`, one that hangs, beside which the interpreter must not end."""
+        return self._thread.is_alive()
 
     def hear(self, stamp_ns: int, what: object) -> None:
         """Keep a message with the source's own date [ns UTC]."""

@@ -157,6 +157,14 @@ def test_ice_that_came_while_the_router_was_away_is_heard_when_the_session_is_ba
         assert any("alert" in asked for asked in town.asked[before:])
 
 
+def test_a_service_that_comes_after_the_car_is_asked_too(router: Router) -> None:
+    with driving(router) as car:
+        until(lambda: car.lookout.counts.looks > 1)
+        with MadeUpService(router.settings, NOW) as town:
+            town.standing = [alert(int(key), time=NOW) for key in ICE]
+            assert car.next().state == "raised"
+
+
 def test_without_a_link_the_horizon_fades_to_unknown_and_the_car_looks_on(router: Router, town: MadeUpService) -> None:
     town.mu = {int(key): 0.85 for key in keys_on()}
     with driving(router) as car:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
+from edge_agent.inputs.live import feed
 from edge_agent.inputs.live.feed import BELIEVED_S, WHILE_S, Feed, Heard, HostClock, Stamps
 from edge_agent.inputs.live.rows import DELAY_S, LiveRows
 from edge_agent.inputs.profile import Channel, Profile
@@ -196,3 +198,31 @@ def test_a_source_that_is_behind_is_waited_for_and_what_comes_too_late_is_counte
     next(blocks)
     assert rows.late == 1
     blocks.close()
+
+
+class Hanging(Scripted):
+    """A source whose driver comes back only when it likes to."""
+
+    def __init__(self, name: str, clock: Steered) -> None:
+        super().__init__(name, clock)
+        self.entered, self.released = threading.Event(), threading.Event()
+
+    def listen(self) -> None:
+        self.entered.set()
+        self.released.wait()
+
+
+def test_a_source_that_hangs_is_left_behind_and_known_to_be(clock: Steered, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(feed, "LEAVE_S", 0.01)
+    hanging, other = Hanging("hanging", clock), Scripted("other", clock)
+    for source in (hanging, other):
+        source.start()
+    hanging.entered.wait()
+    hanging.close()
+    assert hanging.listening
+    monkeypatch.setattr(feed, "LEAVE_S", 30.0)
+    other.close()
+    assert not other.listening
+    hanging.released.set()
+    hanging.close()
+    assert not hanging.listening
