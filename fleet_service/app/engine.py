@@ -37,7 +37,7 @@ from fleet_service.fusion import observations_of
 from fleet_service.fusion.standing import ERRORS, unknown
 from fleet_service.fusion.weather import Reports
 from fleet_service.ingest.acks import Acks
-from fleet_service.ingest.budgets import NEW_CELLS_AT_ONCE, NEW_CELLS_PER_HOUR, Bucket, Tracks
+from fleet_service.ingest.budgets import NewCells, Tracks
 from fleet_service.ingest.dedup import BatchId
 from fleet_service.ingest.inbox import AcceptedBatches, BatchIntake, Message
 from fleet_service.ingest.validation import Clock
@@ -92,7 +92,7 @@ class Engine:
         """Begin with what the archive holds."""
         self.counts: Counter[str] = Counter()
         self.report_lag_s = 0.0  # between the end of the newest visit and its arrival
-        self._tracks, self._places = Tracks(), Bucket(NEW_CELLS_AT_ONCE, NEW_CELLS_PER_HOUR)
+        self._tracks, self._places = Tracks(), NewCells()
         self._turn = 0  # of the alerts that are told again
         self.failing = False  # the last segment could not be written
         self.copy = copy_for(config, root)  # before anything is read: an empty disk is filled from it
@@ -131,7 +131,7 @@ class Engine:
         before()
         memory = remember(self._root, self._config, set_aside)
         with self._guard:
-            self._tracks, self._places = Tracks(), Bucket(NEW_CELLS_AT_ONCE, NEW_CELLS_PER_HOUR)
+            self._tracks, self._places = Tracks(), NewCells()
             self._know(memory)
             still = {(alert.cell, alert.sector) for alert in self._alerts.standing}
             gone = [alert for alert in stood if (alert.cell, alert.sector) not in still]
@@ -289,12 +289,9 @@ class Engine:
         beyond = self._tracks.impossible(witness, rows["leave_time"], rows["latitude"], rows["longitude"])
         self.counts["implausible_moves"] += int(beyond.sum())
         new = np.flatnonzero((self.fusion.slots_of(rows["cell"], rows["sector"].astype(np.int64)) < 0) & ~beyond)
-        for vehicle in np.unique(witness[new]).tolist():
-            mine = new[witness[new] == vehicle]
-            _, place = np.unique(rows["cell"][mine], return_inverse=True)
-            given = self._places.take(vehicle, int(place.max()) + 1, float(rows["received_at"][0]) / NS)
-            beyond[mine[place >= given]] = True
-            self.counts["too_many_places"] += int((place >= given).sum())
+        over = self._places.beyond(witness[new], rows["cell"][new], float(rows["received_at"][0]) / NS)
+        beyond[new[over]] = True
+        self.counts["too_many_places"] += int(over.sum())
         return beyond
 
     def update_weather(self, now: int) -> None:

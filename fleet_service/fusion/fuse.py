@@ -12,10 +12,10 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.belief import forget, unpack
+from fleet_service.fusion.belief import SLIPPERY_SHARE, forget, unpack
 from fleet_service.fusion.late import LATE_MOST_NS, delayed, fused_at
 from fleet_service.fusion.observations import Observations, SmallArray
-from fleet_service.fusion.shared import ALARM_KERNELS, KERNELS, read_road, shared_parts
+from fleet_service.fusion.shared import ALARM_KERNELS, KERNELS, kernel_of, read_road, shared_parts
 from fleet_service.fusion.standing import ERRORS, UNKNOWN, Standing, classes, first_standing, unknown
 from fleet_service.fusion.store.cells import Cells
 from fleet_service.fusion.store.records import AGED, ICE, NOBODY, NONE, USED, Rows
@@ -30,6 +30,8 @@ from schemas.runtime.jit import compiled
 from schemas.thresholds import NS
 
 _ANY: Final = 1 << 62
+# What each bin of a belief adds to P(slippery) of the road, and to all of the road: (kernels, 2, 32).
+SLIPPERY_WEIGHTS: Final = np.stack([KERNELS @ SLIPPERY_SHARE, KERNELS.sum(axis=2, dtype=float)], axis=1)
 
 
 class Updated(NamedTuple):
@@ -189,6 +191,10 @@ class Fusion:
         """Belief of each slot about its road, (k, 32), at its last observation."""
         return _believed(self.store.state.live, KERNELS, slots)
 
+    def slippery(self, slots: IntArray) -> FloatArray:
+        """P(slippery) of each slot's road at its last observation, (k,), as of `believed`."""
+        return _slippery(self.store.state.live, SLIPPERY_WEIGHTS, slots)
+
     def alarming(self, slots: IntArray) -> FloatArray:
         """As `believed`, with the doubt about gentle values that an alarm has to bear, see `shared`.
 
@@ -327,4 +333,19 @@ def _believed(live: Rows, kernels: Float32Array, slots: IntArray) -> FloatArray:
     for k in range(len(slots)):
         unpack(live.belief, slots[k], p)
         read_road(kernels, live.cells, slots[k], p, out[k])
+    return out
+
+
+@compiled
+def _slippery(live: Rows, weights: FloatArray, slots: IntArray) -> FloatArray:
+    p = np.empty(live.belief.shape[1])
+    out = np.empty(len(slots))
+    for k in range(len(slots)):
+        unpack(live.belief, slots[k], p)
+        weight = weights[kernel_of(live.cells, slots[k])]
+        slippery, whole = 0.0, 0.0
+        for i in range(len(p)):
+            slippery += weight[0, i] * p[i]
+            whole += weight[1, i] * p[i]
+        out[k] = slippery / whole
     return out

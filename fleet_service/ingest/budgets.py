@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from schemas.numeric import BoolArray, FloatArray, IntArray
+from schemas.runtime.jit import compiled
 from schemas.thresholds import METRES_PER_DEGREE, NS
 
 # A car on roads that are all new passes 3 cells of 10 m a second; of such a cell 1 kB is kept.
@@ -22,6 +23,7 @@ STREAMS_AT_ONCE: Final = 120.0
 FASTEST: Final = 70.0  # m/s; no road vehicle, and no error of a clock
 LEAP_M: Final = 2_000.0  # of a position that comes back after a tunnel or a ferry's hold
 VEHICLES: Final = 200_000  # that are remembered
+NEVER: Final = np.iinfo(np.int64).min  # was a vehicle heard that is not known
 HOUR: Final = 3600.0
 
 
@@ -43,52 +45,80 @@ class Bucket:
         return given
 
 
+class NewCells:
+    """Budgets of cells that nobody was in before."""
+
+    def __init__(self, at_once: float = NEW_CELLS_AT_ONCE) -> None:
+        self._budgets = Bucket(at_once, NEW_CELLS_PER_HOUR)
+
+    def beyond(self, vehicle: IntArray, cell: IntArray, now: float) -> BoolArray:
+        """Rows (n,) in new cells that are beyond what their vehicle may bring; the others are taken. now [s]."""
+        out = np.zeros(len(vehicle), bool)
+        order = np.lexsort((cell, vehicle))
+        who, where = vehicle[order], cell[order]
+        starts = np.flatnonzero(np.diff(who, prepend=who[:1] - 1))
+        counts = np.diff(starts, append=len(who))
+        place = np.cumsum(np.diff(where, prepend=where[:1]) != 0)
+        place -= np.repeat(place[starts], counts)  # number of a row's cell among its vehicle's
+        wanted = place[starts + counts - 1] + 1
+        for name, start, count, cells in np.column_stack([who[starts], starts, counts, wanted]).tolist():
+            given = self._budgets.take(name, cells, now)
+            if given < cells:
+                out[order[start : start + count]] = place[start : start + count] >= given
+        return out
+
+
 class Tracks:
     """Where each vehicle was last, and whether it can be where it says next."""
 
     def __init__(self) -> None:
-        self._last: dict[int, tuple[int, float, float]] = {}
+        self._places: dict[int, int] = {}  # place in the arrays, by vehicle
+        self._last_time = np.full(64, NEVER)
+        self._last_place = np.zeros((64, 2))
 
     def impossible(self, vehicle: IntArray, time: IntArray, latitude: FloatArray, longitude: FloatArray) -> BoolArray:
         """Rows (n,) too far from where their vehicle was by the row before, in the order of the rows; time [ns]."""
-        out = np.zeros(len(vehicle), bool)
-        if not len(vehicle):
-            return out
-        starts = np.flatnonzero(np.r_[True, np.diff(vehicle) != 0])
-        before = np.arange(len(vehicle)) - 1
-        far = _too_far(time, latitude, longitude, before)
-        for start, stop in zip(starts.tolist(), [*starts[1:].tolist(), len(vehicle)], strict=True):
-            name = int(vehicle[start])
-            last = self._last.get(name)
-            if not far[start + 1 : stop].any():  # as most often: one run, held against the row before it
-                wrong = last is not None and _leap(last, time[start], latitude[start], longitude[start])
-                out[start:stop] = wrong
-            else:
-                for row in range(start, stop):
-                    here = (int(time[row]), float(latitude[row]), float(longitude[row]))
-                    out[row] = last is not None and _leap(last, *here)
-                    last = last if out[row] else here
-            good = start + np.flatnonzero(~out[start:stop])
-            if len(good):
-                row = int(good[np.argmax(time[good])])
-                if last is None or time[row] >= last[0] or name not in self._last:
-                    if len(self._last) >= VEHICLES:
-                        self._last.clear()
-                    self._last[name] = (int(time[row]), float(latitude[row]), float(longitude[row]))
-        return out
+        names, inverse = np.unique(vehicle, return_inverse=True)
+        if len(self._places) + len(names) > max(VEHICLES, len(names)):
+            self._places.clear()
+            self._last_time[:] = NEVER
+        at = np.array([self._places.setdefault(name, len(self._places)) for name in names.tolist()], np.int64)
+        while len(self._places) > len(self._last_time):
+            self._last_time = np.r_[self._last_time, np.full(len(self._last_time), NEVER)]
+            self._last_place = np.concatenate([self._last_place, np.zeros_like(self._last_place)])
+        place = np.column_stack([latitude, longitude]).astype(float)
+        return _impossible(at[inverse], np.asarray(time, np.int64), place, self._last_time, self._last_place)
 
 
-def _too_far(time: IntArray, latitude: FloatArray, longitude: FloatArray, before: IntArray) -> BoolArray:
-    metres = _metres(latitude - latitude[before], longitude - longitude[before], latitude)
-    return np.asarray(metres > LEAP_M + FASTEST * np.abs(time - time[before]) / NS)
+@compiled
+def _impossible(
+    vehicle: IntArray, time: IntArray, place: FloatArray, last_time: IntArray, last_place: FloatArray
+) -> BoolArray:
+    """As `Tracks.impossible`; rows' places (n, 2), and the vehicles' (k,) and (k, 2), which are written."""
+    out = np.zeros(len(vehicle), np.bool_)
+    stop = 0
+    while stop < len(vehicle):
+        start, stop = stop, stop + 1  # a run of one vehicle's rows
+        while stop < len(vehicle) and vehicle[stop] == vehicle[start]:
+            stop += 1
+        v = vehicle[start]
+        then, there = last_time[v], last_place[v].copy()
+        newest = -1
+        for row in range(start, stop):
+            out[row] = then != NEVER and _leap(time[row] - then, there, place[row])
+            if not out[row]:
+                then, there = time[row], place[row]
+                if newest < 0 or time[row] > time[newest]:
+                    newest = row
+        if newest >= 0 and time[newest] >= last_time[v]:
+            last_time[v] = time[newest]
+            last_place[v] = place[newest]
+    return out
 
 
-def _leap(last: tuple[int, float, float], time: int, latitude: float, longitude: float) -> bool:
-    metres = _metres(np.asarray(latitude - last[1]), np.asarray(longitude - last[2]), np.asarray(latitude))
-    return bool(metres > LEAP_M + FASTEST * abs(int(time) - last[0]) / NS)
-
-
-def _metres(north: FloatArray, east: FloatArray, latitude: FloatArray) -> FloatArray:
-    """Distance of two places by their differences in degrees [m]; around the date line the short way."""
-    east = np.mod(east + 180.0, 360.0) - 180.0
-    return np.asarray(np.hypot(north, east * np.cos(np.radians(latitude))) * METRES_PER_DEGREE)
+@compiled
+def _leap(apart: int, there: FloatArray, here: FloatArray) -> bool:
+    """Whether two places (2,) [deg] are further from each other than a vehicle gets in the time between them [ns]."""
+    north, east = here[0] - there[0], (here[1] - there[1] + 180.0) % 360.0 - 180.0  # around the date line the short way
+    metres = np.hypot(north, east * np.cos(np.radians(here[0]))) * METRES_PER_DEGREE
+    return bool(metres > LEAP_M + FASTEST * abs(apart) / NS)

@@ -12,7 +12,7 @@ from fleet_service.fusion.belief import SLIPPERY_SHARE, quantiles
 from fleet_service.fusion.store.records import GRIP, ICE, SOURCES
 from fleet_service.serve.view import LOWER, UPPER
 from schemas import grid
-from schemas.numeric import FloatArray, IntArray
+from schemas.numeric import IntArray
 from schemas.thresholds import NS, SLIPPERY_MU
 from schemas.wire import Alert
 
@@ -59,9 +59,10 @@ class Alerts:
 
     def updated(self, slots: IntArray) -> list[Alert]:
         """Alerts that the cells just updated raise or clear."""
-        time, slippery = self._fusion.live.time[slots], self._slippery(slots)
+        time, slippery = self._fusion.live.time[slots], self._fusion.slippery(slots)
         standing = np.isin(slots, np.fromiter(self._standing, np.int64, len(self._standing)))
         out, likely = [], np.flatnonzero((slippery > RAISE_ABOVE) & ~standing)
+        likely = likely[self._fusion.sources(slots[likely], ICE, time[likely] - SOURCE_NS)[0] >= LEAST_SOURCES]
         alarming = self._fusion.alarming(slots[likely]) @ SLIPPERY_SHARE > RAISE_ABOVE
         for k in likely[alarming].tolist():
             slot, when = int(slots[k]), int(time[k])
@@ -76,10 +77,6 @@ class Alerts:
             for k in gripping
             if self._corroborated(int(slots[k]), GRIP, int(time[k]))
         ]
-
-    def _slippery(self, slots: IntArray) -> FloatArray:
-        """P(slippery) of each slot's road at its last observation, without the rest of what is believed of it."""
-        return np.asarray(self._fusion.believed(slots) @ SLIPPERY_SHARE)
 
     def _corroborated(self, slot: int, side: int, time: int) -> bool:
         """Whether one side has enough corroborating sources: as many as the other within the hour, within limits.

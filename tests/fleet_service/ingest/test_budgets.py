@@ -19,7 +19,7 @@ from fleet_service.archive import reading
 from fleet_service.archive.pseudonyms import Pseudonyms, number
 from fleet_service.archive.retention import drop_checkpoints, forget_period
 from fleet_service.archive.witnesses import Witnesses, read
-from fleet_service.ingest.budgets import FASTEST, NEW_CELLS_PER_HOUR, STREAMS_AT_ONCE, Bucket, Tracks
+from fleet_service.ingest.budgets import FASTEST, STREAMS_AT_ONCE, Bucket, NewCells, Tracks
 from fleet_service.ingest.inbox import Message
 from schemas import grid, keys, wire
 from schemas.config import ServiceConfig
@@ -172,7 +172,7 @@ def everywhere(seq: int, count: int, now: int) -> Batch:
 
 def test_a_car_fills_no_memory_with_places_and_all_it_says_is_archived(engine: Engine) -> None:
     now, sent, at_once = time.time_ns(), 0, 3_000
-    engine._places = Bucket(at_once, NEW_CELLS_PER_HOUR)
+    engine._places = NewCells(at_once)
     for seq in range(200):
         at = now - (200 - seq) * 200 * SECOND
         one = everywhere(seq, 50, at)
@@ -214,6 +214,23 @@ def test_within_a_batch_a_leap_is_seen_too() -> None:
     tracks, time_ns = Tracks(), np.arange(4) * SECOND
     longitude = np.array([0.0, 1e-4, 50.0, 2e-4])
     assert tracks.impossible(np.full(4, 7), time_ns, np.zeros(4), longitude).tolist() == [False, False, True, False]
+
+
+def test_of_many_cars_each_is_held_against_itself() -> None:
+    tracks, cars, far = Tracks(), np.arange(1000, 0, -1), 10.0
+    longitude = cars / 1000.0
+    for step in range(3):
+        time_ns = np.full(1000, (step + 1) * SECOND)
+        wrong = tracks.impossible(cars, time_ns, np.zeros(1000), longitude + far * ((cars == 500 + step) & (step > 0)))
+        assert cars[wrong].tolist() == ([500 + step] if step else [])
+
+
+def test_new_cells_are_counted_once_and_by_vehicle() -> None:
+    budgets = NewCells(3)
+    vehicle, cell = np.array([2, 1, 1, 2, 1, 1, 1]), np.array([5, 1, 2, 5, 1, 3, 4])
+    assert budgets.beyond(vehicle, cell, 0.0).tolist() == [False, False, False, False, False, False, True]
+    assert budgets.beyond(np.array([1, 2, 2, 2]), np.array([9, 6, 7, 8]), 0.0).tolist() == [True, False, False, True]
+    assert not len(budgets.beyond(vehicle[:0], cell[:0], 0.0))
 
 
 def test_a_budget_fills_again() -> None:

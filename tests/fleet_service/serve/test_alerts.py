@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.belief import SLIPPERY_SHARE
@@ -38,6 +39,7 @@ def test_an_alert_is_judged_by_what_is_believed_of_the_road() -> None:
         )
     alerts, slots = Alerts(fusion), np.arange(fusion.size)
     believed = fusion.believed(slots) @ SLIPPERY_SHARE
+    assert fusion.slippery(slots) == pytest.approx(believed, abs=1e-9)
     told = {alert.cell: float(alert.reason.split()[4]) for alert in alerts.updated(slots)}
     assert told == {int(c): round(float(p), 2) for c, p in zip(fusion.cell, believed, strict=True) if p > RAISE_ABOVE}
     assert 0 < len(told) < fusion.size
