@@ -55,7 +55,7 @@ class Observations:
     other: IntArray
     other_share: Float32Array
 
-    def take(self, rows: IntArray | BoolArray) -> Observations:
+    def take(self, rows: IntArray | BoolArray | slice) -> Observations:
         """Some of the rows."""
         return Observations(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 

@@ -33,8 +33,8 @@ from fleet_service.fusion import constants as c
 from fleet_service.fusion.standing import Standing
 from fleet_service.fusion.store.records import NOBODY, USED
 from schemas import mugrid
-from schemas.numeric import BoolArray, Float32Array, FloatArray
-from schemas.runtime.jit import refcount_free
+from schemas.numeric import Float32Array
+from schemas.runtime.jit import compiled, refcount_free
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS
 
@@ -171,66 +171,87 @@ def judged(peers: RecordArray, before: Standing, epoch: int) -> Standing:
     In an established service, who has met few that are trusted is a newcomer.
     """
     vehicles = len(before.weight)
-    other = peers["other"][:vehicles]
-    heard_of, index = other != NOBODY, np.maximum(other, 0)
-    met = peers["met"][:vehicles].astype(np.float64)
-    theirs = np.maximum(np.minimum(before.weight.astype(np.float64), 1.0), c.TRUST_HEARD_LEAST)[index]
-    weight = np.where(heard_of, theirs, 0.0) * np.minimum(met, 1.0)
-    agreement = peers["agreed"][:vehicles] / np.maximum(met, 1.0)
-    heard = weight.sum(axis=1)
-    mean = (c.TRUST_PRIOR * c.TRUST_PRIOR_PEERS + (weight * agreement).sum(axis=1)) / (c.TRUST_PRIOR_PEERS + heard)
-    trust = _scaled(mean)
-    known: BoolArray = heard >= c.ESTABLISHED_PEERS
-    established = int((known & (trust >= c.SOURCE_TRUST)).sum()) >= c.ESTABLISHED_VEHICLES
-    proven = np.clip(np.minimum(mean, 1.0 - c.CONTAMINATION_LEAST) / (1.0 - c.CONTAMINATION), 1.0, None)
-    trust = trust * np.where(known, proven, 1.0)
-    if established:
-        trust = np.where(known, trust, np.minimum(trust, c.NEWCOMER))
-    error, fleet = _errors(peers[:vehicles], before, np.where(heard_of, np.minimum(before.weight[index], 1.0), 0.0))
-    return Standing(epoch, trust.astype(np.float32), error, newcomer(established), fleet)
+    weight, error = np.empty(vehicles, np.float32), np.empty((vehicles, 4), np.float32)
+    established = _weigh(peers, before.weight, weight)
+    square, slope = _fleet(peers, before.weight)
+    _find_errors(peers, before.weight, before.error, (square, slope), error)
+    fleet = np.array([0.0, c.BIAS_RELATIVE, _spread(square, 0.0, 0.0), slope], np.float32)
+    return Standing(epoch, weight, error, newcomer(established), fleet)
 
 
-def _errors(peers: RecordArray, before: Standing, trust: FloatArray) -> tuple[Float32Array, Float32Array]:
-    """Bias, how well it is known, spread, slope, (V, 4), and those of a newcomer, (4,); `trust`: of the peers."""
-    index = np.maximum(peers["other"], 0)
-    weight = peers["weight"].astype(np.float64)
-    theirs = before.error[index].astype(np.float64)
-    precision = trust * np.where(
-        weight > 0.0, 1.0 / (1.0 / np.maximum(weight, 1e-9) + c.BIAS_PAIR**2 + theirs[..., 1] ** 2), 0.0
-    )
-    told = peers["difference"] / np.maximum(weight, 1e-9) + theirs[..., 0]
-    whole = precision.sum(axis=1) + 1.0 / c.FLEET_BIAS**2
-    bias = (precision * told).sum(axis=1) / whole
-    std = np.maximum(np.sqrt(1.0 / whole), c.BIAS_KNOWN_LEAST)
-    known = (precision.sum(axis=1) > 0.0) & (std < c.BIAS_RELATIVE)
-    own = np.minimum(before.weight.astype(np.float64), 1.0)
-    spread, slope = _spread(peers, own, peers), _slope(peers, own)
-    error = np.stack(
-        [
-            np.where(known, np.clip(bias, -c.BIAS_MOST, c.BIAS_MOST), 0.0), np.where(known, std, c.BIAS_RELATIVE),
-            spread, np.full(len(bias), slope),
-        ],
-        axis=1,
-    )  # fmt: skip
-    fleet = np.array([0.0, c.BIAS_RELATIVE, _spread(peers, own, None)[0], slope])
-    return error.astype(np.float32), fleet.astype(np.float32)
+@compiled
+def _weigh(peers: RecordArray, before: Float32Array, out: Float32Array) -> bool:
+    """Fill the weights of vehicles (V,), from those `before`; returns whether the service is established."""
+    known, trusted = np.empty(len(out), np.bool_), 0
+    for v in range(len(out)):
+        this, heard, agreed = peers[v], 0.0, 0.0
+        for k in range(c.PEERS):
+            if this.other[k] != NOBODY:
+                theirs, met = float(before[this.other[k]]), float(this.met[k])
+                weight = max(min(theirs, 1.0), c.TRUST_HEARD_LEAST) * min(met, 1.0)
+                heard += weight
+                agreed += weight * float(this.agreed[k]) / max(met, 1.0)
+        mean = (c.TRUST_PRIOR * c.TRUST_PRIOR_PEERS + agreed) / (c.TRUST_PRIOR_PEERS + heard)
+        known[v], trust = heard >= c.ESTABLISHED_PEERS, _scaled(mean)
+        if known[v]:
+            trusted += trust >= c.SOURCE_TRUST
+            trust *= max(min(mean, 1.0 - c.CONTAMINATION_LEAST) / (1.0 - c.CONTAMINATION), 1.0)
+        out[v] = trust
+    if trusted < c.ESTABLISHED_VEHICLES:
+        return False
+    for v in range(len(out)):
+        if not known[v]:
+            out[v] = min(float(out[v]), c.NEWCOMER)
+    return True
 
 
-def _spread(peers: RecordArray, trust: FloatArray, of: RecordArray | None) -> FloatArray:
-    """κ of vehicles (V,), or of a newcomer (1,): the fleet's until they are known, and that SPREAD_FIRST at first."""
-    prior = c.SPREAD_PRIOR
-    fleet = (c.SPREAD_FIRST**2 * prior + (trust * peers["found"]).sum()) / (prior + (trust * peers["stated"]).sum())
-    found, stated = (0.0, 0.0) if of is None else (of["found"].astype(np.float64), of["stated"].astype(np.float64))
-    squared = (max(fleet, c.SPREAD_FLOOR**2) * prior + found) / (prior + stated)
-    return np.atleast_1d(np.sqrt(np.clip(squared, c.SPREAD_FLOOR**2, c.SPREAD_CEILING**2)))
+@compiled
+def _fleet(peers: RecordArray, before: Float32Array) -> tuple[float, float]:
+    """κ² and λ of the fleet; each vehicle counts in the measure of its weight `before` (V,).
+
+    λ says how much too low the fleet's values are for each μ that was left: regression of the differences of values
+    upon those of the grip used, in the same places.
+    """
+    found, stated = c.SPREAD_FIRST**2 * c.SPREAD_PRIOR, float(c.SPREAD_PRIOR)
+    squares, products = 0.0, c.SLOPE_PRIOR / c.SLOPE_STD**2
+    for v in range(len(before)):
+        own = min(float(before[v]), 1.0)
+        found += own * float(peers[v].found)
+        stated += own * float(peers[v].stated)
+        squares += own * float(peers[v].used_squares)
+        products += own * float(peers[v].used_products)
+    slope = products / (max(squares, 0.0) + 1.0 / c.SLOPE_STD**2)
+    return found / stated, min(max(slope, 0.0), c.SLOPE_MOST)
 
 
-def _slope(peers: RecordArray, trust: FloatArray) -> float:
-    """How much too low the fleet's values are for each μ that was left: regression of the differences of values upon
-    those of the grip used, in the same places; each vehicle counts in the measure of its trust."""
-    squares = np.maximum((trust * peers["used_squares"]).sum(), 0.0) + 1.0 / c.SLOPE_STD**2
-    products = (trust * peers["used_products"]).sum() + c.SLOPE_PRIOR / c.SLOPE_STD**2
-    return float(np.clip(products / squares, 0.0, c.SLOPE_MOST))
+@compiled
+def _find_errors(
+    peers: RecordArray, before: Float32Array, error: Float32Array, fleet: tuple[float, float], out: Float32Array
+) -> None:
+    """Fill bias, how well it is known, spread, slope, (V, 4), from weights (V,) and errors (V, 4) before."""
+    for v in range(len(out)):
+        this, precisions, differences = peers[v], 0.0, 0.0
+        for k in range(c.PEERS):
+            other, weight = this.other[k], float(this.weight[k])
+            if other != NOBODY and weight > 0.0:
+                precision = 1.0 / max(weight, 1e-9) + c.BIAS_PAIR**2 + float(error[other, 1]) ** 2
+                precision = min(float(before[other]), 1.0) / precision
+                precisions += precision
+                differences += precision * (float(this.difference[k]) / max(weight, 1e-9) + float(error[other, 0]))
+        whole = precisions + 1.0 / c.FLEET_BIAS**2
+        std = max(math.sqrt(1.0 / whole), c.BIAS_KNOWN_LEAST)
+        known = precisions > 0.0 and std < c.BIAS_RELATIVE
+        out[v, 0] = min(max(differences / whole, -c.BIAS_MOST), c.BIAS_MOST) if known else 0.0
+        out[v, 1] = std if known else c.BIAS_RELATIVE
+        out[v, 2] = _spread(fleet[0], float(this.found), float(this.stated))
+        out[v, 3] = fleet[1]
+
+
+@compiled
+def _spread(fleet: float, found: float, stated: float) -> float:
+    """κ of a vehicle from the κ² of the fleet: the fleet's until it is known."""
+    squared = (max(fleet, c.SPREAD_FLOOR**2) * c.SPREAD_PRIOR + found) / (c.SPREAD_PRIOR + stated)
+    return math.sqrt(min(max(squared, c.SPREAD_FLOOR**2), c.SPREAD_CEILING**2))
 
 
 def slope_std(peers: RecordArray, standing: Standing) -> float:
@@ -243,9 +264,10 @@ def slope_std(peers: RecordArray, standing: Standing) -> float:
 
 def newcomer(established: bool) -> float:
     """Weight of a vehicle that was compared with nobody yet."""
-    weight = float(_scaled(np.array([c.TRUST_PRIOR]))[0])
+    weight = _scaled(c.TRUST_PRIOR)
     return min(weight, c.NEWCOMER) if established else weight
 
 
-def _scaled(mean: FloatArray) -> FloatArray:
-    return np.clip((mean - c.TRUST_NONE) / (c.TRUST_FULL - c.TRUST_NONE), 0.0, 1.0)
+@compiled
+def _scaled(mean: float) -> float:
+    return min(max((mean - c.TRUST_NONE) / (c.TRUST_FULL - c.TRUST_NONE), 0.0), 1.0)

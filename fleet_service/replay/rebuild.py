@@ -211,7 +211,7 @@ def _joined(parts: list[tuple[Observations, Before]]) -> tuple[Observations, Bef
     )  # fmt: skip
 
 
-def _taken(o: Observations, before: Before, rows: BoolArray | IntArray) -> tuple[Observations, Before]:
+def _taken(o: Observations, before: Before, rows: BoolArray | IntArray | slice) -> tuple[Observations, Before]:
     """Some of the rows."""
     return o.take(rows), Before(before.late[rows], before.late_by[rows], before.weight[rows], before.error[rows])
 
@@ -220,9 +220,11 @@ def _fused(fusion: Fusion, o: Observations, before: Before, heard: Heard) -> Ite
     """Fuse rows epoch by epoch of when they were fused."""
     time = o.time + before.late_by
     order = np.argsort(time, kind="stable")
-    for part in np.split(order, np.flatnonzero(np.diff(time[order] // EPOCH_NS)) + 1):
-        if len(part):
-            taken, used = _taken(o, before, part)
+    o, before = _taken(o, before, order)
+    borders = np.flatnonzero(np.diff(time[order] // EPOCH_NS)) + 1
+    for start, stop in pairwise([0, *borders.tolist(), len(order)]):
+        if start < stop:
+            taken, used = _taken(o, before, slice(start, stop))
             updated = fusion.update(taken, used)
             heard(taken)
             yield updated
