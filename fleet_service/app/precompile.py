@@ -53,7 +53,7 @@ def live() -> None:
     column.flags.writeable = False
     group, _ = grouped(np.zeros(1, np.int64), column, column)
     largest_of(column, group, 1)
-    Tracks().impossible(column, column, np.zeros(1), np.zeros(1))
+    Tracks().impossible(column, np.zeros(1, np.int64), np.zeros(1), np.zeros(1))
     shares(np.ones(1), np.ones(1))
     cell_table(fusion, np.arange(2), 10 * EPOCH_NS)
 
