@@ -77,7 +77,7 @@ SANS_IO = (
     "edge_agent/ahead/hearing.py",
     *(f"fleet_service/ingest/{name}.py" for name in ("acks", "validation")),
     *(f"fleet_service/serve/{name}.py" for name in ("encode", "query", "tile_cache")),
-    *(f"fleet_service/page/{name}.py" for name in ("colours", "features", "records", "route")),
+    *(f"fleet_service/page/{name}.py" for name in ("colours", "features", "joined", "records", "route")),
 )
 IMPURE = {
     "asyncio", "datetime", "duckdb", "http", "logging", "multiprocessing", "os", "pathlib", "pyarrow", "random",

@@ -1,4 +1,4 @@
-"""The page's own files, read and packed once: a first picture waits for two dozen of them."""
+"""The page's own files, read and packed once; its modules as one script beside them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from typing import Final, NamedTuple
 from starlette.requests import Request
 from starlette.responses import Response
 
+from fleet_service.page.joined import joined
+
 LEVEL: Final = 9
+SCRIPT: Final = "page.js"  # all modules, from main.js on
 
 
 class _File(NamedTuple):
@@ -29,7 +32,10 @@ class Files:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._files = {path.name: _read(path) for path in folder.iterdir() if path.is_file()}
+        plain = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+        modules = {name.removesuffix(".js"): text.decode() for name, text in plain.items() if name.endswith(".js")}
+        plain[SCRIPT] = joined(modules, "main").encode()
+        self._files = {name: _packed(name, text) for name, text in plain.items()}
 
     def answer(self, name: str, request: Request, vary: str = "Accept-Encoding") -> Response | None:
         """A file as the browser takes it, or that it has it already; None: there is none of that name."""
@@ -44,8 +50,7 @@ class Files:
         return Response(file.packed, media_type=file.kind, headers={**headers, "Content-Encoding": "gzip"})
 
 
-def _read(path: Path) -> _File:
-    plain = path.read_bytes()
-    kind = mimetypes.guess_type(path.name)[0] or "application/octet-stream"
+def _packed(name: str, plain: bytes) -> _File:
+    kind = mimetypes.guess_type(name)[0] or "application/octet-stream"
     tag = f'"{hashlib.sha256(plain).hexdigest()[:16]}"'
     return _File(plain, gzip.compress(plain, LEVEL, mtime=0), kind, tag)

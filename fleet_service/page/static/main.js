@@ -33,7 +33,7 @@ class App {
     this.now.changed = () => this.draw();
     this.frame = 0;
     this.looking = 0;
-    this.started = this.missed = false;
+    this.started = this.asked = this.missed = false;
   }
 
   // What is shown in the large map: a moment, or now.
@@ -116,11 +116,14 @@ class App {
     const ratio = devicePixelRatio || 1;
     byId("view").classList.toggle("two", this.comparing);
     byId("beside").hidden = !this.comparing;
+    let changed = false;
     for (const canvas of [byId("map"), byId("beside")]) {
-      canvas.width = Math.round(canvas.clientWidth * ratio);
-      canvas.height = Math.round(canvas.clientHeight * ratio);
-      canvas.getContext("2d").setTransform(ratio, 0, 0, ratio, 0, 0);
+      const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
+      if (canvas.width === width && canvas.height === height) continue;
+      changed = true;
+      Object.assign(canvas, { width, height }).getContext("2d").setTransform(ratio, 0, 0, ratio, 0, 0);
     }
+    if (!changed) return;
     this.view.width = byId("map").clientWidth;
     this.view.height = byId("map").clientHeight;
     this.moved();
@@ -129,7 +132,7 @@ class App {
   moved() {
     this.draw();
     clearTimeout(this.looking);
-    this.looking = setTimeout(() => this.look(), LOOK_MS);
+    if (this.asked) this.looking = setTimeout(() => this.look(), LOOK_MS);  // at the start it is looked anyway
   }
 
   async look() {
@@ -137,6 +140,7 @@ class App {
     if (this.live.look(this.view)) this.draw();
     const level = this.view.level, box = this.view.box, stores = this.comparing ? [this.cells, this.pinned] : [this.cells];
     try { await Promise.all(stores.map(store => store.show(box, level))); } catch { this.note(say("error.asked")); }
+    this.asked = true;
     if (this.chosen && this.chosen.level !== level) this.choose(this.chosen.tile, this.chosen.local);
     this.remember();
     this.draw();
@@ -202,8 +206,9 @@ class App {
 
   note(words) { byId("said").textContent = words; }
 
+  // Not before the first cells were asked for: an empty picture is painted as slowly as a full one.
   draw() {
-    if (this.frame) return;
+    if (this.frame || !this.asked) return;
     this.frame = requestAnimationFrame(() => { this.frame = 0; this.drawNow(); });
   }
 

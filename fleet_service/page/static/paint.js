@@ -124,6 +124,7 @@ function truthDots(pen, view, truth) {
 export function scaleBar(element, view, text) {
   const metre = view.scale / metresPerWorld(view.y), tens = 10 ** Math.floor(Math.log10(120 / metre));
   const metres = [5, 2, 1].map(k => k * tens).find(m => m * metre <= 120);
+  const words = metres >= 1000 ? text("scale.kilometres", { n: metres / 1000 }) : text("scale.metres", { n: metres });
   element.style.width = `${metres * metre}px`;
-  element.textContent = metres >= 1000 ? text("scale.kilometres", { n: metres / 1000 }) : text("scale.metres", { n: metres });
+  if (element.textContent !== words) element.textContent = words;
 }

@@ -115,6 +115,23 @@ _COLOURED: Final = """() => {
 }"""
 
 
+def test_the_first_picture_that_is_painted_has_cells(page: RunningPage, drive: Drive) -> None:
+    drive("ice")
+    with shown(page) as seen:
+        seen.page.add_init_script(_PAINTED)
+        seen.page.reload()
+        seen.page.wait_for_selector(READY, state="attached")
+        waits(seen, "painted.length > 0")
+        assert int(seen.page.evaluate("painted[0]")) > 0
+
+
+_PAINTED: Final = """
+  globalThis.painted = [];
+  document.addEventListener("DOMContentLoaded", () => new MutationObserver(
+    () => painted.push(document.body.dataset.drawn)).observe(document.body, { attributeFilter: ["data-drawn"] }));
+"""
+
+
 def test_far_away_the_ice_is_still_what_is_seen(page: RunningPage, drive: Drive) -> None:
     drive()
     with shown(page) as seen:
@@ -130,8 +147,8 @@ def test_the_rule_of_colours_is_the_same_here_and_there(page: RunningPage) -> No
     triples = [(mu, max(mu - a, 0), mu + b) for mu in steps for a in (3, 30, 90) for b in (3, 30, 90)]
     with shown(page) as seen:
         there: list[int] = seen.page.evaluate(
-            "async triples => { const { kindOf } = await import('/static/colours.js'); "
-            "return triples.map(([m, l, u]) => kindOf(1, m, l, u)) }",
+            "async triples => { const { kindOf, setColours } = await import('/static/colours.js'); "
+            "setColours(gripmap.settings); return triples.map(([m, l, u]) => kindOf(1, m, l, u)) }",
             triples,
         )
         hollow = seen.page.evaluate(

@@ -1,13 +1,16 @@
-"""The page's own files, as text: words in one table, modules that are short, asked for together, from nowhere else."""
+"""The page's own files, as text: words in one table, modules that are short, sent as one, from nowhere else."""
 
 from __future__ import annotations
 
 import json
 import re
+from graphlib import CycleError
 from pathlib import Path
 
 import pytest
 
+from fleet_service.page.files import SCRIPT
+from fleet_service.page.joined import joined
 from tests.house import ROOT
 
 
@@ -31,10 +34,41 @@ def test_every_word_stands_in_the_table_and_every_entry_is_used() -> None:
     assert all(f'"{key}"' not in source or key in table for key in table)
 
 
-def test_all_modules_are_asked_for_at_once_and_not_one_after_the_other() -> None:
+def test_modules_joined_do_what_they_do_apart_each_with_names_of_its_own() -> None:
+    """Imports become what a module gave; a name that two modules have for themselves is two things."""
+    modules = {
+        "main": 'import { add as sum, ONE } from "./a.js";\nimport { two } from "./b.js";\nsay(sum(two(), ONE));\n',
+        "a": "const own = 1;\nexport const ONE = own;\nexport function add(x, y) { return x + y; }\n"
+        "export class Not {}\n",
+        "b": 'import { ONE } from "./a.js";\nconst own = 41;\nexport const two = () => own + ONE;\n',
+    }
+    assert joined(modules, "main") == (
+        "const from_a = (() => {\nconst own = 1;\nconst ONE = own;\nfunction add(x, y) { return x + y; }\n"
+        "class Not {}\nreturn { ONE, add };\n})();\n"
+        "const from_b = (() => {\nconst { ONE } = from_a;\nconst own = 41;\nconst two = () => own + ONE;\n"
+        "return { two };\n})();\n"
+        "const { add: sum, ONE } = from_a;\nconst { two } = from_b;\nsay(sum(two(), ONE));\n"
+    )
+
+
+@pytest.mark.parametrize(
+    "text", ['import main from "./main.js";\n', 'import "./main.js";\n', "export default 1;\n", "export { a };\n"]
+)
+def test_what_cannot_be_joined_is_said(text: str) -> None:
+    with pytest.raises(ValueError, match="cannot be joined"):
+        joined({"main": text}, "main")
+    with pytest.raises(CycleError):
+        joined({"main": 'import { a } from "./main.js";\n'}, "main")
+
+
+def test_every_module_is_in_the_one_script_that_the_page_asks_for() -> None:
     static = ROOT / "fleet_service/page/static"
-    named = re.findall(r'<link rel="modulepreload" href="/static/(.*?)">', (static / "index.html").read_text())
-    assert named == sorted(path.name for path in static.glob("*.js") if path.name != "main.js")
+    modules = {path.stem: path.read_text() for path in static.glob("*.js")}
+    script = joined(modules, "main")
+    assert all(f"const from_{name} = " in script for name in modules if name != "main")
+    assert re.findall(r"<script[^>]*>", (static / "index.html").read_text()) == [
+        f'<script type="module" src="/static/{SCRIPT}">'
+    ]
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "fleet_service/page/static").glob("*.js")), ids=lambda path: path.name)

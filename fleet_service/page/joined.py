@@ -1,0 +1,59 @@
+"""The page's modules as one script. Pure.
+
+A browser asks for six files of a server at a time, and the first picture waits for the last of two dozen. So what is
+written as modules is sent as one: each module is a function that is called once, after those that it imports from,
+and gives what others import from it. There is no build step: the server joins them when it starts.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Mapping
+from graphlib import TopologicalSorter
+from typing import Final
+
+_IMPORT: Final = re.compile(r'^import \{ (.+) \} from "\./(\w+)\.js";$', re.MULTILINE)
+_EXPORT: Final = re.compile(r"^export (?=(?:async )?function |class |const )", re.MULTILINE)
+_OTHER: Final = re.compile(r"^(?:import|export)\b.*$", re.MULTILINE)
+
+
+def joined(modules: Mapping[str, str], main: str) -> str:
+    """One script of modules that does what `main` does.
+
+    Args:
+        modules: their text by name; `./NAME.js` is what the others import.
+        main: the module that is run, and that nobody imports.
+
+    Raises:
+        ValueError: an import or export of another form than `import { a, b } from "./name.js";`, or a circle of them.
+        KeyError: a module that is not there.
+    """
+    wanted: defaultdict[str, set[str]] = defaultdict(set)
+    needs: dict[str, list[str]] = {}
+    waiting = [main]
+    while waiting:
+        name = waiting.pop()
+        if name in needs:
+            continue
+        found = _IMPORT.findall(modules[name])
+        needs[name] = [module for _, module in found]
+        waiting += needs[name]
+        for names, module in found:
+            wanted[module] |= {one.split(" as ")[0] for one in names.split(", ")}
+    return "".join(
+        _plain(modules[name]) if name == main else _called(name, _plain(modules[name]), sorted(wanted[name]))
+        for name in TopologicalSorter(needs).static_order()
+    )
+
+
+def _called(name: str, body: str, told: list[str]) -> str:
+    return f"const from_{name} = (() => {{\n{body}return {{ {', '.join(told)} }};\n}})();\n"
+
+
+def _plain(text: str) -> str:
+    """A module's text with neither imports nor exports."""
+    text = _IMPORT.sub(lambda m: f"const {{ {m[1].replace(' as ', ': ')} }} = from_{m[2]};", _EXPORT.sub("", text))
+    if other := _OTHER.search(text):
+        raise ValueError(f"{other[0]!r} cannot be joined")
+    return text
