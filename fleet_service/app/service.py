@@ -162,9 +162,13 @@ class Service:
                 asked.reply(keys.alert_key(tile), alerts, encoding=wire.STANDING_ENCODING)
 
     def _weather(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.PUT and len(sample.payload) <= wire.MAX_BYTES:
-            message = WeatherMessage(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding))
-            self.engine.weather.enqueue(message)
+        if sample.kind != zenoh.SampleKind.PUT:
+            return
+        if len(sample.payload) > wire.MAX_BYTES:
+            self.engine.counts["refused.weather"] += 1
+            return
+        message = WeatherMessage(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding))
+        self.engine.weather.enqueue(message)
 
     def _step(self, session: zenoh.Session, stop: threading.Event) -> None:
         if self.engine.full:

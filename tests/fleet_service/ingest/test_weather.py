@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections import Counter
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -18,8 +19,18 @@ import zenoh
 from fleet_service.app.engine import Engine
 from fleet_service.archive.layout import DAY_NS
 from fleet_service.archive.retention import drop_checkpoints
+from fleet_service.fusion import Fusion
 from fleet_service.ingest.inbox import Message
-from fleet_service.ingest.weather import WeatherMessage, archived, files, gather, read_file, retire
+from fleet_service.ingest.weather import (
+    WAITING,
+    WeatherInbox,
+    WeatherMessage,
+    archived,
+    files,
+    gather,
+    read_file,
+    retire,
+)
 from fleet_service.replay import checkpoints
 from schemas import grid, keys, mugrid, tables, weather, wire
 from schemas.config import ServiceConfig
@@ -152,8 +163,23 @@ def test_a_running_service_takes_weather_over_its_key(
 ) -> None:
     publisher = session.declare_publisher(keys.weather_key(REGION))
     matched(publisher)
+    publisher.put(bytes(wire.MAX_BYTES + 1), encoding=wire.WEATHER_ENCODING)
     publisher.put(weather.encode(Report(time.time_ns(), precipitation=2.0)), encoding=wire.WEATHER_ENCODING)
     publisher.put(weather.encode(Report(5, precipitation=2.0)), encoding=wire.WEATHER_ENCODING)
     counts = service.service.engine.counts
-    until(lambda: counts["weather"] == 1 and counts["refused.weather"] == 1)
+    until(lambda: counts["weather"] == 1 and counts["refused.weather"] == 2)
     publisher.undeclare()
+
+
+def test_of_reports_that_nobody_takes_so_many_wait_and_the_newest_stay(tmp_path: Path) -> None:
+    counts: Counter[str] = Counter()
+    inbox, now = WeatherInbox(tmp_path, "fleet", Fusion(120.0), counts), 10**18
+    many, key = WAITING + 50, keys.weather_key(REGION)
+    for k in range(many):
+        payload = weather.encode(Report(now + k * 1000, precipitation=2.0))
+        inbox.enqueue(WeatherMessage(key, payload, wire.WEATHER_ENCODING))
+    taken = inbox.take(now)
+    assert taken is not None
+    assert len(taken.time) == WAITING
+    assert int(taken.time.max()) == now + (many - 1) * 1000
+    assert inbox.take(now) is None

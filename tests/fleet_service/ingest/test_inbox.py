@@ -1,0 +1,78 @@
+"""The queue behind the subscribers: bounded by what it holds, and taken in steps."""
+
+from __future__ import annotations
+
+from collections import Counter
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+
+from fleet_service.app.engine import Engine
+from fleet_service.ingest.inbox import QUEUE_BYTES, STEP_BYTES, STEP_MESSAGES, Inbox, Message
+from fleet_service.ingest.rate_limit import RateLimiter
+from schemas import keys, wire
+from schemas.config import ServiceConfig
+from schemas.wire import Kind
+from tests.fleet_service.examples import SECOND, batch
+
+NOW = 1_750_000_000 * SECOND
+
+
+def inbox(capacity: int) -> tuple[Inbox, Counter[str]]:
+    counts: Counter[str] = Counter()
+    return Inbox(capacity, counts, RateLimiter(1.0, 1.0, None, counts)), counts
+
+
+def of_bytes(size: int) -> Message:
+    return Message(Kind.STATE, "", bytes(size), "")
+
+
+def test_what_waits_is_bounded_in_bytes_and_not_in_messages_only() -> None:
+    queue, counts = inbox(20_000)
+    large = of_bytes(wire.MAX_BYTES)
+    fits = QUEUE_BYTES // len(large.payload)
+    for _ in range(2 * fits):
+        queue.put(large)
+    assert fits <= len(queue) <= fits + 1
+    assert counts["overload"] == 2 * fits - len(queue), "each that found no room is counted; its sender keeps it"
+    waiting = len(queue)
+    taken = queue.drain(0.0)
+    assert STEP_BYTES <= sum(len(message.payload) for message in taken) < STEP_BYTES + len(large.payload)
+    for _ in range(2 * fits):
+        queue.put(large)
+    assert len(queue) in (waiting, waiting - 1), "what was taken made room"
+
+
+def test_what_waits_is_bounded_in_messages_too_and_a_step_takes_so_many() -> None:
+    queue, counts = inbox(3 * STEP_MESSAGES)
+    for _ in range(4 * STEP_MESSAGES):
+        queue.put(of_bytes(1))
+    assert (len(queue), counts["overload"]) == (3 * STEP_MESSAGES, STEP_MESSAGES)
+    assert [len(queue.drain(0.0)) for _ in range(4)] == [STEP_MESSAGES] * 3 + [0]
+
+
+def test_a_start_opens_each_segment_that_waits_for_compaction_twice_however_many_there_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    segments = 60
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        for seq in range(1, segments + 1):
+            sent = batch("car-001", seq, NOW, [0.8])
+            key = keys.observation_key(sent.region, sent.vehicle)
+            engine.ingest([Message(sent.kind, key, wire.encode(sent), wire.ENCODING[sent.kind])], NOW)
+            engine.flush()
+    opened: Counter[str] = Counter()
+    begin = pq.ParquetFile.__init__
+
+    def counted(self: pq.ParquetFile, path: Path, **options: Any) -> None:  # noqa: ANN401
+        opened[Path(path).name] += 1
+        begin(self, path, **options)
+
+    monkeypatch.setattr(pq.ParquetFile, "__init__", counted)
+    with closing(Engine(ServiceConfig(), tmp_path)) as again:
+        assert again.fusion.size == 1
+    assert len(opened) >= segments
+    assert max(opened.values()) <= 2, "once for its rows, once for who sent them"
