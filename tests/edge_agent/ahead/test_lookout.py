@@ -87,7 +87,7 @@ def driving(router: Router) -> Iterator[Driving]:
 @pytest.fixture
 def town(router: Router) -> Iterator[MadeUpService]:
     """A service's side without any ice yet."""
-    with MadeUpService(router.settings, NOW) as town:
+    with MadeUpService(router.settings, time.time_ns()) as town:
         yield town
 
 
@@ -160,7 +160,7 @@ def test_ice_that_came_while_the_router_was_away_is_heard_when_the_session_is_ba
 def test_a_service_that_comes_after_the_car_is_asked_too(router: Router) -> None:
     with driving(router) as car:
         until(lambda: car.lookout.counts.looks > 1)
-        with MadeUpService(router.settings, NOW) as town:
+        with MadeUpService(router.settings, time.time_ns()) as town:
             town.standing = [alert(int(key), time=NOW) for key in ICE]
             assert car.next().state == "raised"
 
@@ -184,7 +184,7 @@ def test_without_a_link_the_horizon_fades_to_unknown_and_the_car_looks_on(router
 
 def test_a_map_of_yesterday_says_how_old_it_is(router: Router) -> None:
     day = 86_400 * NS
-    with MadeUpService(router.settings, NOW - day) as town:
+    with MadeUpService(router.settings, time.time_ns() - day) as town:
         town.mu = {int(key): 0.85 for key in keys_on()}
         with driving(router) as car:
             seen = car.until(lambda seen: (seen.runs.basis == known.MEASURED).any())
