@@ -198,8 +198,12 @@ def test_where_it_is_the_car_believes_its_filter_and_the_map(router: Router, tow
         car.lookout.believe(np.array([-1]), flat)
         car.until(lambda seen: (seen.runs.basis == known.MEASURED).sum() > 10)
         assert car.lookout.outlook(CAR).here[0] == pytest.approx(0.625, abs=0.02)  # type: ignore[union-attr]
-        car.lookout.believe(here, flat)
-        seen = car.until(lambda seen: seen.here[0] < 0.3)
+
+        def informed(seen: Outlook) -> bool:
+            car.lookout.believe(here, flat)  # block after block: while the car looks ahead, it does not wait for that
+            return bool(seen.here[0] < 0.3)
+
+        seen = car.until(informed)
         assert seen.here[2] > 0.7, "a map may be wrong"
 
 
