@@ -24,7 +24,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--metrics", metavar="URL", action="append", default=[], help="metrics of a service, for the health view"
     )
     parser.add_argument("--overlay", metavar="FILE", type=Path, help="Parquet of cell, sector, mu to lay over the map")
-    parser.add_argument("--base-map", metavar="URL", help="raster tiles below the cells, with {z}, {x} and {y}")
+    parser.add_argument(
+        "--base-map", metavar="URL|FILE", help="raster tiles below the cells: URL with {z}, {x} and {y}, or .mbtiles"
+    )
     parser.add_argument("--datex", metavar="FILE", type=Path, help="keep a DATEX II publication up in it, and serve it")
     add_supplier(parser)
     add_connection(parser)
@@ -36,6 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     try:
         from fleet_service.page import server
+        from fleet_service.page.basemap import base_map
     except ImportError as error:
         fix = "pip install 'gripmap[page]'"
         raise InputError("page", f"the package {error.name} is missing", fix) from error
@@ -43,11 +46,10 @@ def run(arguments: argparse.Namespace) -> int:
         from fleet_service.archive.layout import insist_on_archive
 
         insist_on_archive(arguments.archive)
-    _insist_on_base_map(arguments.base_map)
     settings = server.PageSettings(
         connection=map_client.settings(arguments.connect, arguments.config), host=arguments.host, port=arguments.port,
         names=arguments.name, archive=arguments.archive, metrics=arguments.metrics, overlay=arguments.overlay,
-        base_map=arguments.base_map, datex=_publication(arguments),
+        base_map=None if arguments.base_map is None else base_map(arguments.base_map), datex=_publication(arguments),
     )  # fmt: skip
     server.run(settings, stop_on_signals(), lambda line: print(line, flush=True))
     return 0
@@ -63,11 +65,3 @@ def _publication(arguments: argparse.Namespace) -> DatexFile | None:
 
     commandline.ending("datex", commandline.out_folder("datex", arguments.datex), (".xml",))
     return DatexFile(supplier_of(arguments), arguments.datex, lambda line: print(line, flush=True))
-
-
-def _insist_on_base_map(address: str | None) -> None:
-    if address is None:
-        return
-    whole = all(f"{{{name}}}" in address for name in "zxy") and not any(mark in address for mark in " ;,'\"")
-    if not whole or not address.startswith(("http://", "https://", "/")):
-        raise InputError("base_map", f"{address[:60]!r} is no address of tiles", "write https://HOST/{z}/{x}/{y}.png")

@@ -19,6 +19,7 @@ from starlette.types import ASGIApp
 from fleet_service.client.datex_feed import DatexFile
 from fleet_service.client.watching import GATHER_S
 from fleet_service.page import web
+from fleet_service.page.basemap import BaseMap
 from fleet_service.page.health import ServiceHealth
 from fleet_service.page.moments import Moments
 from fleet_service.page.reader import Reader
@@ -44,7 +45,7 @@ class PageSettings:
         archive: of the service, for the past; None: there is none.
         metrics: addresses of services' metrics, for the health view.
         overlay: Parquet of cell, sector, mu to lay over the map.
-        base_map: address of raster tiles with {z}, {x}, {y}.
+        base_map: raster tiles below the cells; None: there are none.
         datex: a DATEX II publication to keep up and to serve; None: there is none.
         most: watchers at once.
     """
@@ -56,7 +57,7 @@ class PageSettings:
     archive: Path | None = None
     metrics: list[str] = field(default_factory=list)
     overlay: Path | None = None
-    base_map: str | None = None
+    base_map: BaseMap | None = None
     datex: DatexFile | None = None
     most: int = MOST
 

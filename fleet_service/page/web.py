@@ -21,6 +21,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from fleet_service.client.datex_feed import DatexFile
 from fleet_service.page import asked, colours, ogc, overlay, records, route
+from fleet_service.page.basemap import BaseMap
 from fleet_service.page.files import Files
 from fleet_service.page.health import ServiceHealth
 from fleet_service.page.moments import Moments
@@ -37,7 +38,7 @@ BLOCKS: Final = "application/vnd.gripmap.blocks"
 
 
 class Sources(NamedTuple):
-    """What the routes answer from; `base_map`: address of raster tiles with {z}, {x}, {y}, or none."""
+    """What the routes answer from."""
 
     world: HeldWorld
     reader: Reader
@@ -45,7 +46,7 @@ class Sources(NamedTuple):
     health: ServiceHealth
     watchers: Watchers
     overlay: Path | None = None
-    base_map: str | None = None
+    base_map: BaseMap | None = None
     datex: DatexFile | None = None
 
 
@@ -57,19 +58,21 @@ def application(sources: Sources, hosts: Iterable[str], lifespan: Callable[[Star
         hosts: names under which the page is asked for; none: any.
         lifespan: what runs beside it.
     """
-    routes = Routes(sources)
+    routes, base = Routes(sources), sources.base_map
     paths: dict[str, Callable[[Request], Awaitable[Response]]] = {
         "/": routes.index, "/static/{name}": routes.file, "/settings": routes.settings, "/tiles": routes.tiles,
         "/blocks": routes.blocks, "/events": routes.events, "/cell/{cell}/{sector}": routes.cell,
         "/history/{cell}/{sector}": routes.history, "/moments": routes.times, "/route": routes.route,
         "/health": routes.health, "/overlay": routes.overlay, "/datex2/situation.xml": routes.situations,
-        **routes.features.paths(),
+        "/base/{z:int}/{x:int}/{y:int}": routes.picture, **routes.features.paths(),
     }  # fmt: skip
     app = Starlette(
         routes=[Route(path, told(answer)) for path, answer in paths.items()],
         lifespan=lifespan,
     )
-    return Guarded(GZipMiddleware(app, minimum_size=2000, compresslevel=3), frozenset(hosts), sources.base_map)
+    return Guarded(
+        GZipMiddleware(app, minimum_size=2000, compresslevel=3), frozenset(hosts), base.address if base else None
+    )
 
 
 class Routes:
@@ -94,11 +97,21 @@ class Routes:
 
     async def settings(self, _: Request) -> Response:
         """Numbers and colours that the page computes with."""
+        base = self._of.base_map
         return JSONResponse({
             "colours": colours.told(), "reaction_s": REACTION_S, "sights_m": route.SIGHTS_M,
-            "mu_steps": records.MU_STEPS, "share_steps": records.SHARE_STEPS, "base_map": self._of.base_map,
-            "overlay": self._of.overlay is not None,
+            "mu_steps": records.MU_STEPS, "share_steps": records.SHARE_STEPS, "overlay": self._of.overlay is not None,
+            "base_map": base and {"address": base.address, "zooms": base.zooms},
         })  # fmt: skip
+
+    async def picture(self, request: Request) -> Response:
+        """A tile of the operator's own file; nothing where it has none."""
+        file = self._of.base_map and self._of.base_map.file
+        if not file:
+            return PlainTextResponse("this page has no tiles of its own; see --base-map\n", 404)
+        found = await run_in_threadpool(file.picture, *(request.path_params[name] for name in "zxy"))
+        headers = {"Cache-Control": "max-age=3600"}
+        return Response(found, 200 if found else 204, headers, media_type=file.kind if found else None)
 
     async def tiles(self, request: Request) -> Response:
         """Which tiles have cells, now or `at` a moment."""
@@ -211,7 +224,7 @@ class Guarded:
 
     def __init__(self, app: ASGIApp, hosts: frozenset[str], base_map: str | None) -> None:
         self._app, self._hosts = app, hosts
-        pictures = "'self' data:" + (f" {origin(base_map)}" if base_map else "")
+        pictures = f"'self' data: {origin(base_map or '')}".rstrip()
         policy = (
             f"default-src 'none'; script-src 'self'; style-src 'self'; img-src {pictures}; connect-src 'self'; "
             "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -247,7 +260,7 @@ def _host(scope: Scope) -> str:
 def origin(address: str) -> str:
     """Scheme, host and port of an address; what lies on this host itself has none."""
     parts = urlsplit(address)
-    return f"{parts.scheme}://{parts.netloc}" if parts.netloc else "'self'"
+    return f"{parts.scheme}://{parts.netloc}" if parts.netloc else ""
 
 
 @contextlib.asynccontextmanager

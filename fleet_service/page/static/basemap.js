@@ -1,13 +1,14 @@
 // The operator's own raster tiles below the cells; none unless the server was started with --base-map.
-const MOST = 300;
+const MOST = 300, LEAST_PX = 128;
 
 export class BaseMap {
-  constructor(address, changed) {
-    Object.assign(this, { address, changed, pictures: new Map() });
+  constructor({ address, zooms }, changed) {
+    Object.assign(this, { address, zooms, changed, pictures: new Map() });
   }
 
   paint(pen, view) {
-    const z = Math.max(0, Math.min(19, Math.round(view.zoom))), n = 2 ** z, px = view.scale / n, { west, east, north, south } = view.box;
+    const [least, most] = this.zooms, z = Math.max(least, Math.min(most, Math.round(view.zoom))), n = 2 ** z, px = view.scale / n, { west, east, north, south } = view.box;
+    if (px < LEAST_PX) return;  // of a file that begins nearer: hundreds of tiles
     pen.globalAlpha = .55;  // the cells' colours are what is read
     for (let x = Math.max(0, Math.floor(west * n)); x < Math.min(n, east * n); x++)
       for (let y = Math.max(0, Math.floor(north * n)); y < Math.min(n, south * n); y++) {

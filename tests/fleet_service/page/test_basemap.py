@@ -1,0 +1,120 @@
+"""Tiles below the cells from a file of the operator's own: what is read, what is refused, what a person sees."""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+import zlib
+from collections.abc import Mapping
+from contextlib import closing
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from fleet_service.page.basemap import OWN, ZOOMS, base_map
+from schemas import grid
+from schemas.config import ZenohSettings
+from schemas.errors import InputError
+from tests.browser import opened
+from tests.fleet_service.page.conftest import page_of
+from tests.fleet_service.page.test_page import READY, waits
+from tests.fleet_service.page.test_server import ask
+
+BLUE: Final = (20, 60, 200)
+ZOOM: Final = 12
+AT: Final = (57.7, 11.97)
+
+
+def png(colour: tuple[int, int, int], side: int = 256) -> bytes:
+    """A picture of one colour."""
+
+    def part(name: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+
+    rows = zlib.compress((b"\0" + bytes(colour) * side) * side)
+    head = struct.pack(">2I5B", side, side, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + part(b"IHDR", head) + part(b"IDAT", rows) + part(b"IEND", b"")
+
+
+def tiles_in(path: Path, tiles: Mapping[tuple[int, int, int], bytes], form: str = "png") -> Path:
+    """MBTiles of tiles by zoom, column and row from the north."""
+    with closing(sqlite3.connect(path)) as table, table:
+        table.execute("create table metadata (name text, value text)")
+        table.execute("create table tiles (zoom_level int, tile_column int, tile_row int, tile_data blob)")
+        table.execute("insert into metadata values ('format', ?)", (form,))
+        rows = [(z, x, 2**z - 1 - y, data) for (z, x, y), data in tiles.items()]
+        table.executemany("insert into tiles values (?, ?, ?, ?)", rows)
+    return path
+
+
+def town(path: Path) -> Path:
+    """One blue tile with AT in it."""
+    x, y = (int(v) for v in grid.deinterleave(grid.parent(int(grid.cell_of(*AT)), ZOOM)))
+    return tiles_in(path, {(ZOOM, x, y): png(BLUE)})
+
+
+def test_rows_are_counted_from_the_south_in_the_file_and_from_the_north_by_who_asks(tmp_path: Path) -> None:
+    of = base_map(str(tiles_in(tmp_path / "a.mbtiles", {(2, 1, 0): b"north", (2, 1, 3): b"south"})))
+    assert of.file is not None
+    assert (of.address, of.zooms, of.file.kind) == (OWN, (2, 2), "image/png")
+    assert [of.file.picture(2, 1, y) for y in range(4)] == [b"north", None, None, b"south"]
+    assert [of.file.picture(*place) for place in ((1, 1, 0), (2, 4, 0), (2, -1, 0), (-1, 0, 0), (99, 0, 0))] == [
+        None
+    ] * 5
+    assert base_map("https://t.example/{z}/{x}/{y}.png") == ("https://t.example/{z}/{x}/{y}.png", ZOOMS, None)
+
+
+def test_what_is_no_file_of_pictures_is_refused_with_its_fix(tmp_path: Path) -> None:
+    (tmp_path / "text.mbtiles").write_text("no table")
+    names = {
+        "missing.mbtiles": "is not there", "text.mbtiles": "cannot be read",
+        tiles_in(tmp_path / "vector.mbtiles", {(0, 0, 0): b"x"}, "pbf").name: "holds pbf tiles",
+        tiles_in(tmp_path / "empty.mbtiles", {}).name: "holds no tile",
+    }  # fmt: skip
+    for name, problem in names.items():
+        with pytest.raises(InputError, match=problem):
+            base_map(str(tmp_path / name))
+    for text in ("https://t.example/{z}/{x}.png", "ftp://t.example/{z}/{x}/{y}", "https://t.example/{z}/{x}/{y};a"):
+        with pytest.raises(InputError, match="no address"):
+            base_map(text)
+
+
+def test_tiles_of_a_file_are_served_and_one_that_is_not_there_is_no_error(
+    router: ZenohSettings, tmp_path: Path
+) -> None:
+    with page_of(router, base_map=base_map(str(town(tmp_path / "town.mbtiles")))) as address:
+        x, y = (int(v) for v in grid.deinterleave(grid.parent(int(grid.cell_of(*AT)), ZOOM)))
+        status, headers, body = ask(address, f"/base/{ZOOM}/{x}/{y}")
+        assert (status, headers["content-type"], body) == (200, "image/png", png(BLUE))
+        assert "img-src 'self' data:;" in headers["content-security-policy"]
+        assert ask(address, f"/base/{ZOOM}/{x + 1}/{y}")[0] == 204
+        assert ask(address, "/base/x/y/z")[0] == 404
+
+
+def test_a_person_sees_the_file_below_the_map_without_any_network(router: ZenohSettings, tmp_path: Path) -> None:
+    """Further in than the file goes its deepest tiles are drawn larger; far out none is asked for."""
+    with (
+        page_of(router, base_map=base_map(str(town(tmp_path / "town.mbtiles")))) as address,
+        opened(address) as seen,
+    ):
+        seen.page.wait_for_selector(READY, state="attached")
+        go = "([x, y, zoom]) => gripmap.view.go(gripmap.view.x = x, gripmap.view.y = y, zoom)"
+        x, y = seen.page.evaluate(
+            "([la, lo]) => [(lo + 180) / 360, (1 - Math.asinh(Math.tan(la * Math.PI / 180)) / Math.PI) / 2]", AT
+        )
+        for zoom in (12.0, 18.0):
+            seen.page.evaluate(go, [x, y, zoom])
+            waits(seen, _BLUE)
+        seen.page.evaluate(go, [x, y, 5.0])
+        waits(seen, f"!({_BLUE})")
+        assert seen.errors == []
+        assert all(url.startswith(address) for url in seen.requests)
+        assert sum("/base/" in url for url in seen.requests) < 30
+
+
+_BLUE: Final = """(() => {
+  const map = document.getElementById("map"), { width, height } = map;
+  const [r, g, b] = map.getContext("2d").getImageData(width / 2, height / 2, 1, 1).data;
+  return b - r > 60 && b > g;
+})()"""
