@@ -93,7 +93,7 @@ def test_the_first_drive(tmp_path: Path, router: Router, service: Service, capsy
     assert main(["import", str(BLF), str(NMEA), "--profile", "toyota", *car, "--out", log]) == 0
     assert main(["check", log, *car, "--out", page]) == 0
     publish = ["--publish", "--name", "car-one", "--config", str(tmp_path / "agent.json")]
-    assert main(["replay", log, *car, "--out", out, *publish]) == 0
+    assert main(["replay", log, *car, "--start", "now", "--out", out, *publish]) == 0
     said = capsys.readouterr()
     assert "passed" in said.out
     assert "NOT PLAUSIBLE" not in said.err

@@ -104,6 +104,7 @@ def test_silence_of_a_service_that_went_ends_nothing(
     with page_of(router, datex=file) as address:
         pulled = pull(address)
         with made_up_service(session):
+            until(lambda: pulled() != NOTHING)  # it was asked what stands: nothing, so far
             put(session, CELLS, raised=True)
             until(lambda: records(pulled()))
         until(lambda: not json.loads(ask(address, "/health")[2])["regions"][0]["served"])
