@@ -14,6 +14,7 @@ from starlette.responses import Response
 from fleet_service.page.joined import joined
 
 LEVEL: Final = 9
+ENGLISH: Final = "texts.en.json"
 SCRIPT: Final = "page.js"  # all modules, from main.js on
 
 
@@ -36,6 +37,16 @@ class Files:
         modules = {name.removesuffix(".js"): text.decode() for name, text in plain.items() if name.endswith(".js")}
         plain[SCRIPT] = joined(modules, "main").encode()
         self._files = {name: _packed(name, text) for name, text in plain.items()}
+
+    def texts(self, accepted: str) -> str:
+        """Name of the table of words in the first language that a browser takes and that there is; English else.
+
+        Args:
+            accepted: the header `Accept-Language`, the best language first.
+        """
+        wanted = [one.partition(";")[0].strip().lower() for one in accepted.split(",")]
+        names = [f"texts.{tag}.json" for one in wanted for tag in (one, one.partition("-")[0])]
+        return next((name for name in names if name in self._files), ENGLISH)
 
     def answer(self, name: str, request: Request, vary: str = "Accept-Encoding") -> Response | None:
         """A file as the browser takes it, or that it has it already; None: there is none of that name."""

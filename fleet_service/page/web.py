@@ -60,8 +60,9 @@ def application(sources: Sources, hosts: Iterable[str], lifespan: Callable[[Star
     """
     routes, base = Routes(sources), sources.base_map
     paths: dict[str, Callable[[Request], Awaitable[Response]]] = {
-        "/": routes.index, "/static/{name}": routes.file, "/settings": routes.settings, "/tiles": routes.tiles,
-        "/blocks": routes.blocks, "/events": routes.events, "/cell/{cell}/{sector}": routes.cell,
+        "/": routes.index, "/static/{name}": routes.file, "/settings": routes.settings, "/texts": routes.texts,
+        "/tiles": routes.tiles, "/blocks": routes.blocks, "/events": routes.events,
+        "/cell/{cell}/{sector}": routes.cell,
         "/history/{cell}/{sector}": routes.history, "/moments": routes.times, "/route": routes.route,
         "/health": routes.health, "/overlay": routes.overlay, "/datex2/situation.xml": routes.situations,
         "/base/{z:int}/{x:int}/{y:int}": routes.picture, **routes.features.paths(),
@@ -94,6 +95,13 @@ class Routes:
         """One of its files, none else."""
         found = self._files.answer(request.path_params["name"], request)
         return PlainTextResponse("no such file\n", 404) if found is None else found
+
+    async def texts(self, request: Request) -> Response:
+        """Every word of the page, in the language that the browser asks for, where there is a file of it."""
+        name = self._files.texts(request.headers.get("accept-language", ""))
+        found = self._files.answer(name, request, "Accept-Encoding, Accept-Language")
+        assert found is not None
+        return found
 
     async def settings(self, _: Request) -> Response:
         """Numbers and colours that the page computes with."""

@@ -54,7 +54,7 @@ export function history(rows, shown) {
 }
 
 export function profile(found, limit, pointed) {
-  const W = 640, H = 170, x = m => 30 + m / found.length_m * (W - 40), y = mu => H - 26 - (mu - LEAST) / (MOST - LEAST) * (H - 36);
+  const W = 400, H = 150, x = m => 30 + m / found.length_m * (W - 40), y = mu => H - 26 - (mu - LEAST) / (MOST - LEAST) * (H - 36);
   const picture = draw("svg", { viewBox: `0 0 ${W} ${H}`, role: "img", class: "chart wide", "aria-label": say("route.label") });
   picture.append(draw("rect", { x: 30, y: y(limit), width: W - 40, height: y(LEAST) - y(limit), class: "slippery" }));
   for (const one of found.stretches) {
@@ -64,6 +64,6 @@ export function profile(found, limit, pointed) {
     if (measured) picture.append(draw("line", { x1: left, x2: left + width, y1: y(one.mu), y2: y(one.mu), class: "middle" }));
   }
   for (const mu of [.2, .4, .6, .8, 1]) picture.append(draw("text", { x: 26, y: y(mu) + 3, class: "tick end" }, String(mu)));
-  picture.append(draw("text", { x: 30, y: H - 8, class: "tick start" }, "0 km"), draw("text", { x: W - 10, y: H - 8, class: "tick end" }, `${(found.length_m / 1000).toFixed(2)} km`));
+  picture.append(draw("text", { x: 30, y: H - 8, class: "tick start" }, say("scale.kilometres", { n: 0 })), draw("text", { x: W - 10, y: H - 8, class: "tick end" }, say("scale.kilometres", { n: (found.length_m / 1000).toFixed(2) })));
   return picture;
 }

@@ -1,6 +1,7 @@
 // Where on earth: the Web Mercator square as [0, 1] × [0, 1], cells at zoom 21, tiles at zoom 14, as schemas/grid.py.
 export const CELL_LEVEL = 21, TILE_LEVEL = 14, SECTORS = 4;
 export const CELLS = 2 ** CELL_LEVEL, TILES = 2 ** TILE_LEVEL;
+export const HEADINGS = ["east", "north", "west", "south"];  // of a sector, as files and alerts name it
 const EARTH_M = 2 * Math.PI * 6378137;
 
 export const worldX = longitude => (longitude + 180) / 360;

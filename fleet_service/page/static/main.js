@@ -18,6 +18,7 @@ import { View } from "./view.js";
 
 const TABS = ["legend", "cell", "alerts", "route", "health", "share"];
 const LOOK_MS = 120, CLOCK_MS = 500, HEALTH_MS = 3000, LIST_MS = 15000;
+const WORLD = [-180, -85, 180, 85];
 
 class App {
   constructor(settings, now) {
@@ -190,7 +191,7 @@ class App {
   }
 
   beat(state) {
-    this.away = state.away;
+    this.away = state.away.length || state.served ? state.away : [{ box: WORLD }];  // nobody ever answered: no emptiness
     const words = byId("away"), since = Math.min(...state.away.map(one => one.since));
     words.hidden = !state.away.length;
     if (state.away.length) words.textContent = say("away", { count: state.away.length, ago: ago(state.now - since) });

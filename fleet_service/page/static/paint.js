@@ -23,11 +23,12 @@ export function paint(pen, view, cells, extra) {
   const drawn = new Array(8).fill(0), box = view.box, near = view.scale / CELLS >= NEAR_PX, passes = passing(extra);
   const seen = [...cells.tiles.values()].filter(({ west, north }) =>
     west <= box.east && north <= box.south && west + 1 / TILES >= box.west && north + 1 / TILES >= box.north);
-  const parted = tile => near && tile.block.level === CELL_LEVEL, below = extra.base || extra.away.length;
+  const parted = tile => near && tile.block.level === CELL_LEVEL, below = extra.base || extra.away.length || extra.route.length;
   if (below) {
     pen.fillStyle = groundColour();
     pen.fillRect(0, 0, view.width, view.height);
     extra.base?.paint(pen, view);
+    if (extra.route.length) corridor(pen, view, extra.route);
     for (const region of extra.away) regionAway(pen, view, region.box);
   }
   pixels.begin(pen.canvas.width, pen.canvas.height, pen.canvas.width / view.width, !below);
@@ -36,7 +37,7 @@ export function paint(pen, view, cells, extra) {
   for (const tile of seen) if (parted(tile)) headings(pen, view, tile.parts, passes, drawn);
   if (extra.truth) truthDots(pen, view, extra.truth);
   for (const alert of extra.alerts) ring(pen, view, alert);
-  if (extra.route.length) line(pen, view, extra.route);
+  if (extra.route.length) stops(pen, view, extra.route);
   if (extra.chosen) mark(pen, view, extra.chosen);
   return drawn;
 }
@@ -65,7 +66,7 @@ function headings(pen, view, { rows, x, y, kind, side }, passes, drawn) {
     }
     pen.fillStyle = colours[kind[k]];
     pen.fill();
-    if (rows.basis[k] === BORROWED) { pen.strokeStyle = TRUTH_INK; pen.setLineDash([2, 2]); pen.stroke(); pen.setLineDash([]); }
+    if (rows.basis[k] === BORROWED) { pen.strokeStyle = TRUTH_INK; pen.lineWidth = 1; pen.setLineDash([2, 2]); pen.stroke(); pen.setLineDash([]); }
   }
 }
 
@@ -86,13 +87,17 @@ function ring(pen, view, { bbox: [west, south, east, north] }) {
   for (const [width, ink] of [[6, "#ffffff"], [3, alertColour()]]) { pen.lineWidth = width; pen.strokeStyle = ink; pen.stroke(); }
 }
 
-function line(pen, view, points) {
-  pen.lineJoin = "round";
-  for (const [width, ink] of [[7, "#ffffff"], [3, ROUTE_INK]]) {
-    pen.beginPath();
-    for (const [longitude, latitude] of points) pen.lineTo(view.left(worldX(longitude)), view.top(worldY(latitude)));
-    pen.lineWidth = width; pen.strokeStyle = ink; pen.stroke();
-  }
+// Along a route, below the cells: as broad as they are, so that none is hidden.
+function corridor(pen, view, points) {
+  const px = Math.max(8, 1.3 * view.scale / CELLS);
+  pen.lineJoin = pen.lineCap = "round";
+  pen.beginPath();
+  for (const [longitude, latitude] of points) pen.lineTo(view.left(worldX(longitude)), view.top(worldY(latitude)));
+  for (const [width, ink] of [[px + 5, ROUTE_INK], [px, groundColour()]]) { pen.lineWidth = width; pen.strokeStyle = ink; pen.stroke(); }
+  pen.lineCap = "butt";
+}
+
+function stops(pen, view, points) {
   pen.fillStyle = ROUTE_INK;
   for (const [longitude, latitude] of points.length <= 60 ? points : [points[0], points.at(-1)]) {
     pen.beginPath();

@@ -3,7 +3,8 @@
 import { BORROWED } from "./blocks.js";
 import { HOLLOW, fills, groundColour } from "./colours.js";
 
-const BOUND_INK = "#7d7d7d", DASH_INK = "#000000", LEAST_PX = 3, NOTCH_PX = 6, DASH_PX = 2;
+const BOUND_INK = "#7d7d7d", DASH_INK = "#000000", LEAST_PX = 3, DASH_PX = 2;
+const TIE = 1e-4;  // of a point: neighbours, of two tiles too, round their common edge to the same side
 
 const word = colour => {  // "#rrggbb" as the four bytes of a point
   const [r, g, b] = [1, 3, 5].map(k => parseInt(colour.slice(k, k + 2), 16));
@@ -36,12 +37,12 @@ export class Pixels {
 
   // A tile's squares; those that are hollow lie below the coloured ones. Counts what is in view, by kind.
   squares(view, { rows, column, row, kind, side, west, north, steps }, passes, drawn) {
-    const px = side * view.scale * this.ratio, least = LEAST_PX * this.ratio, notched = px >= NOTCH_PX * this.ratio;
+    const px = side * view.scale * this.ratio, least = Math.round(LEAST_PX * this.ratio);
     const edges = first => {  // where the columns, or rows, begin and end; neighbours meet without a gap
       const from = new Int32Array(steps), to = new Int32Array(steps);
       for (let k = 0; k < steps; k++) {
-        from[k] = Math.round(first + k * px);
-        to[k] = Math.round(first + k * px + Math.max(px, least));
+        from[k] = Math.round(first + k * px + TIE);
+        to[k] = Math.max(Math.round(first + (k + 1) * px + TIE), from[k] + least);
       }
       return [from, to];
     };
@@ -56,12 +57,16 @@ export class Pixels {
         this.fill(left, top, right, bottom, hollow ? this.bound : this.inks[what]);
         if (hollow) this.fill(left + this.line, top + this.line, right - this.line, bottom - this.line, this.ground);
         else if (rows.basis[k] === BORROWED) this.dashed(left, top, right, bottom);
-        else if (notched && rows.unknown[k]) {
-          const notch = px * Math.sqrt(rows.unknown[k] / 254) * .8, x = Math.round(left + (px - notch) / 2), y = Math.round(top + (px - notch) / 2);
-          this.fill(x, y, Math.round(x + notch), Math.round(y + notch), this.ground);
-        }
+        else if (rows.unknown[k]) this.notch(left, top, right, bottom, rows.unknown[k] / 254);
       }
     }
+  }
+
+  // A hole in the middle, as large as the share that is unknown: of the smallest square a point, and never all of it.
+  notch(left, top, right, bottom, share) {
+    const size = length => Math.max(1, Math.min(length - 2, Math.round(length * Math.sqrt(share) * .8)));
+    const width = size(right - left), height = size(bottom - top), x = left + (right - left - width >> 1), y = top + (bottom - top - height >> 1);
+    this.fill(x, y, x + width, y + height, this.ground);
   }
 
   // What is beyond the picture's edges is left out.

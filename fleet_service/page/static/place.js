@@ -2,7 +2,7 @@
 import { BORROWED, MEASURED, NO_NUMBER } from "./blocks.js";
 import { density, history } from "./charts.js";
 import { make } from "./elements.js";
-import { cellOf } from "./grid.js";
+import { HEADINGS, cellOf } from "./grid.js";
 import { ago, clock, say } from "./texts.js";
 
 const BASES = { [MEASURED]: "measured", [BORROWED]: "borrowed" };
@@ -25,7 +25,7 @@ export function numbers(record, settings) {
 const two = value => value.toFixed(2);
 // Never a higher grip than the number, never a lower risk.
 const down = value => (Math.floor(value * 100 + 1e-6) / 100).toFixed(2);
-const percent = value => value > .995 ? "over 99" : value < .005 ? "under 1" : String(Math.ceil(value * 100 - 1e-6));
+const percent = value => value > .995 ? say("percent.over", { n: 99 }) : value < .005 ? say("percent.under", { n: 1 }) : String(Math.ceil(value * 100 - 1e-6));
 
 export function placePanel(app, chosen) {
   if (!chosen) return [make("p", {}, say("cell.none"))];
@@ -43,7 +43,7 @@ function one(app, chosen, cell) {
   line(say("cell.speed"), speeds.join("; "), "speed");
   line(say("cell.vehicles"), cell.vehicles === 255 ? "255+" : String(cell.vehicles), "vehicles");
   line(say("cell.age"), say("cell.age.value", { ago: ago(now - cell.last), time: clock(cell.last) }), "age");
-  for (const alert of alertsAt(app, chosen)) line(say("cell.alert"), say("cell.alert.value", { count: alert.vehicles, reason: alert.reason }), "alert");
+  for (const alert of alertsAt(app, chosen, whole ? HEADINGS[cell.sector] : null)) line(say("cell.alert"), say("cell.alert.value", { count: alert.vehicles, reason: alert.reason }), "alert");
   const past = make("div", { class: "history" });
   const section = make("section", { class: "heading", "data-sector": cell.sector },
     make("h2", {}, whole ? say("cell.heading", { heading: say(`heading.${cell.sector}`) }) : say("cell.square")), list,
@@ -53,7 +53,9 @@ function one(app, chosen, cell) {
   return section;
 }
 
-const alertsAt = (app, { x, y }) => app.cells.at !== null ? [] : app.alerts.filter(alert => {
+// Alerts of a place, and of a heading where one is named: what one direction found is not said of the other.
+const alertsAt = (app, { x, y }, heading) => app.cells.at !== null ? [] : app.alerts.filter(alert => {
+  if (heading !== null && !alert.headings.includes(heading)) return false;
   const [west, south, east, north] = alert.bbox, at = app.degreesOf(x, y);
   return west <= at[0] && at[0] <= east && south <= at[1] && at[1] <= north;
 });

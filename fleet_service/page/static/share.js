@@ -1,7 +1,7 @@
 // The whole state as a link, and what is seen as a file.
 import { numbers } from "./place.js";
 import { byId, make } from "./elements.js";
-import { latitudeOf, longitudeOf } from "./grid.js";
+import { HEADINGS, latitudeOf, longitudeOf } from "./grid.js";
 import { say } from "./texts.js";
 
 export function toHash(state) {
@@ -36,7 +36,7 @@ function seen(app) {
       const cell = numbers(raw, app.settings), level = tile.block.level;
       rows.push({
         west: longitudeOf(x[k]), south: latitudeOf(y[k] + side), east: longitudeOf(x[k] + side), north: latitudeOf(y[k]), zoom: level,
-        heading: level === 21 ? ["east", "north", "west", "south"][records.place[k] & 3] : "all", basis: cell.basis, mu: cell.mu, mu_lower: cell.lower, mu_upper: cell.upper,
+        heading: level === 21 ? HEADINGS[records.place[k] & 3] : "all", basis: cell.basis, mu: cell.mu, mu_lower: cell.lower, mu_upper: cell.upper,
         p_slippery: cell.slippery, unknown_share: cell.unknown, vehicles: cell.vehicles, last_time: new Date(cell.last * 1000).toISOString(),
       });
     }

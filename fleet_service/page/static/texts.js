@@ -1,8 +1,9 @@
-// Every word that a person reads: one table a language, texts.en.json.
+// Every word that a person reads: one table a language, texts.en.json; the server gives that of the browser's language.
 let table = {};
 
-export async function loadTexts(language = "en") {
-  table = await (await fetch(`/static/texts.${language}.json`)).json();
+export async function loadTexts() {
+  table = await (await fetch("/texts")).json();
+  document.documentElement.lang = table["language"];
 }
 
 // "{count} {count|region|regions}": a value, and a word that goes with one or with several.

@@ -23,6 +23,7 @@ import zenoh
 
 from fleet_service.archive import snapshots
 from fleet_service.fusion import Fusion
+from fleet_service.page.files import Files
 from fleet_service.page.health import values
 from fleet_service.page.records import HEAD
 from fleet_service.page.watchers import WAITING, TooManyWatchersError, View, Watchers
@@ -115,6 +116,20 @@ def test_a_file_comes_packed_where_the_browser_takes_it_and_not_again_where_it_h
     assert (status, nothing) == (304, b"")
     assert again["etag"] == packed["etag"] == plain["etag"]
     assert "javascript" in plain["content-type"]
+
+
+def test_another_language_is_one_file(tmp_path: Path) -> None:
+    for name in ("texts.en.json", "texts.de.json", "texts.pt-br.json", "main.js"):
+        (tmp_path / name).write_text("{}")
+    files = Files(tmp_path)
+    asked = {"de-CH, en;q=.5": "de", "fr, de;q=.5": "de", "pt-BR": "pt-br", "pt": "en", "en, de": "en", "": "en"}
+    assert {one: files.texts(one) for one in asked} == {one: f"texts.{tag}.json" for one, tag in asked.items()}
+
+
+def test_the_words_are_given_in_a_language_that_there_is(bare: str) -> None:
+    status, headers, body = ask(bare, "/texts", **{"Accept-Language": "../../x, xx"})
+    assert (status, json.loads(body)["language"]) == (200, "en")
+    assert "Accept-Language" in headers["vary"]
 
 
 def test_who_connects_is_told_what_stands_and_then_what_changes(page: RunningPage, drive: Drive) -> None:
