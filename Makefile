@@ -88,9 +88,9 @@ analytics-bench: setup  ## archive and analytics on ten million rows, Spark besi
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[spark]'
 	$(BIN)/python -m tests.benchmarks.analytics
 
-spark-test: setup  ## Spark beside DuckDB; installs it, wants a Java
+spark-test: setup  ## Spark beside DuckDB and beside this machine; installs it, wants a Java
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[spark]'
-	$(BIN)/python -m pytest -q -m long tests/fleet_service/analytics/test_spark.py
+	$(BIN)/python -m pytest -q -m long tests/fleet_service/analytics/test_spark.py tests/fleet_service/analytics/test_spark_rebuild.py
 
 tune: setup  ## the ant colony over the memberships; writes the shipped file anew
 	$(BIN)/edge-agent tune --out edge_agent/app/tuned/aco-fckf.json

@@ -20,6 +20,9 @@ class InputError(ValueError):
         super().__init__(f"{field}: {problem}; {fix}")
         self.field, self.problem, self.fix = field, problem, fix
 
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
+        return type(self), (self.field, self.problem, self.fix)
+
 
 class WireError(InputError):
     """A payload that cannot be read as the message that its key or encoding claims."""

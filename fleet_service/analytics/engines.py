@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 from fleet_service.archive import layout, snapshots
 from fleet_service.archive.export import Extract
 from schemas.errors import InputError
+from schemas.runtime import spark
 from schemas.thresholds import EXCITED_SHARE, NS
 from schemas.wire import Kind
 
@@ -52,7 +53,7 @@ class QueryEngine:
     def __post_init__(self) -> None:
         self._spark: Any = None
         if self.name == "spark":
-            self._spark = _spark(self.progress)
+            self._spark = spark.session(progress=self.progress)
             self.connection = ibis.pyspark.connect(self._spark)
         else:
             self.connection = ibis.duckdb.connect()
@@ -125,23 +126,6 @@ class QueryEngine:
             )
             found.selectExpr(*columns.split(", "), f"unix_seconds({moment}) AS {seconds}").createOrReplaceTempView(name)
         return self.connection.table(name)
-
-
-def _spark(progress: bool) -> Any:  # noqa: ANN401 a Spark session
-    try:
-        from pyspark.sql import SparkSession
-    except ImportError as error:
-        raise InputError("engine", "Spark is not installed", "pip install 'gripmap[spark]'") from error
-    builder = SparkSession.builder.appName("gripmap").config("spark.sql.session.timeZone", "UTC")
-    settings = {
-        "spark.ui.enabled": "false",
-        "spark.ui.showConsoleProgress": str(progress).lower(),
-        "spark.sql.execution.arrow.pyspark.enabled": "true",
-        "spark.sql.ansi.enabled": "false",  # Ibis writes 0/0 where there is nothing
-    }
-    for key, value in settings.items():
-        builder = builder.config(key, value)
-    return builder.getOrCreate()
 
 
 def value(t: Table) -> Any:  # noqa: ANN401 an Ibis boolean

@@ -27,7 +27,11 @@ def visited_cells(fusion: Fusion, at: int, box: Box | None) -> pa.Table:
 
 def map_at(root: Path, part: Extract, lateness_s: float = LATENESS_S) -> pa.Table:
     """The map at the end of a part: everything replayed that had been received by then, as a GeoParquet table."""
-    table = visited_cells(past(root, lateness_s, part.until, part.bbox), part.until, part.bbox)
-    time = pa.array(np.full(table.num_rows, part.until // tables.US_STEP)).cast(tables.US)
+    return kept(visited_cells(past(root, lateness_s, part.until, part.bbox), part.until, part.bbox), part.until)
+
+
+def kept(table: pa.Table, at: int) -> pa.Table:
+    """Cells as they were believed at a moment [ns], as the GeoParquet table of a snapshot."""
+    time = pa.array(np.full(table.num_rows, at // tables.US_STEP)).cast(tables.US)
     table = table.append_column("snapshot_time", time).sort_by([("cell", "ascending"), ("sector", "ascending")])
     return geo.with_cells(table.cast(tables.MAP_ARCHIVE, safe=False))

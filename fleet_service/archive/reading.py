@@ -21,6 +21,7 @@ from fleet_service.archive.between import Where
 from fleet_service.archive.layout import Partition
 from fleet_service.archive.load import Damaged, load, load_groups, pass_over
 from fleet_service.archive.version import DamagedError, entries_of, judge
+from schemas import grid
 from schemas.numeric import BoolArray
 from schemas.wire import Kind
 
@@ -32,13 +33,14 @@ _TURNS: Final = 100  # a reader that is overtaken by so many compactions has ano
 class Wanted(NamedTuple):
     """Which rows: with these columns (all, if None), where a filter holds, measured within these days (both count),
     and written after a place in the log. May yield more than was written after it: the rest of a compacted file. Of the
-    inbox nothing that was written after `until`."""
+    inbox nothing that was written after `until`; of compacted files those of zones that touch a box [deg]."""
 
     columns: Sequence[str] | None = None
     where: Where | None = None
     days: tuple[int | None, int | None] = (None, None)
     after: layout.Cut | None = None
     until: layout.Cut | None = None
+    box: tuple[float, float, float, float] | None = None
 
     def newer(self, path: Path) -> bool:
         """Whether a segment, or a file that is named by its newest one, was written after the place."""
@@ -95,7 +97,7 @@ class Listing:
         self._fresh = _inbox(root, kind, wanted._replace(columns=needed), damaged)
         files = list(layout.compacted(root, kind, *wanted.days))
         self._done = compacted(files, {path.name for path, _ in self._fresh})
-        self.files = [path for path in files if wanted.newer(path)]
+        self.files = [path for path in near(files, wanted.box) if wanted.newer(path)]
 
     def inbox(self) -> Iterator[pa.Table]:
         """Rows that no compacted file holds; once."""
@@ -118,6 +120,15 @@ class Listing:
             return load(path, self._schema, self._names, both or None, damaged=self._damaged)
         except FileNotFoundError:
             return None
+
+
+def near(files: Sequence[Path], box: tuple[float, float, float, float] | None) -> list[Path]:
+    """Compacted files of zones that touch a box [deg], or all."""
+    if box is None or not files:
+        return list(files)
+    zone = np.array([layout.partition_of(path).zone for path in files])
+    touching = grid.touches(box, grid.bounds(zone, grid.ZONE_ZOOM))
+    return [path for path, taken in zip(files, touching.tolist(), strict=True) if taken]
 
 
 def _inbox(root: Path, kind: Kind, wanted: Wanted, damaged: Damaged) -> list[tuple[Path, pa.Table]]:

@@ -22,7 +22,7 @@ import pyarrow as pa
 
 from fleet_service.archive import layout, segments
 from fleet_service.archive.files import ROLLUP, put_in_place
-from fleet_service.archive.load import load, set_aside
+from fleet_service.archive.load import Damaged, load, set_aside
 from schemas import mugrid, tables
 from schemas.numeric import IntArray
 from schemas.wire import Kind
@@ -33,9 +33,9 @@ _COLUMNS: Final = ["cell", "sector", "leave_time", "vehicle", "mu", "mu_utilised
 _BITS: Final = 64
 
 
-def part_of(path: Path) -> Path:
-    """Where the part of a compacted file of observations lies."""
-    root = path.parents[3]
+def part_of(path: Path, below: Path | None = None) -> Path:
+    """Where the part of a compacted file of observations lies; below another folder than the archive on request."""
+    root = path.parents[3] if below is None else below
     return root / TABLE / path.parents[1].name / path.parent.name / path.name
 
 
@@ -59,9 +59,19 @@ def make(root: Path, path: Path) -> None:
     Raises:
         OSError: it cannot be read or written.
     """
-    table = load(path, tables.OBSERVATION_ARCHIVE, _COLUMNS, damaged=set_aside)
+    table = computed(path, set_aside)
     if table is not None:
-        put_in_place(root, rolled_up(table), part_of(path), ROLLUP)
+        put_in_place(root, table, part_of(path), ROLLUP)
+
+
+def computed(path: Path, damaged: Damaged) -> pa.Table | None:
+    """The part of one compacted file; None if it is damaged, of which `damaged` is told.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    table = load(path, tables.OBSERVATION_ARCHIVE, _COLUMNS, damaged=damaged)
+    return None if table is None else rolled_up(table)
 
 
 def rolled_up(table: pa.Table) -> pa.Table:

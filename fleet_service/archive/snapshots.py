@@ -27,14 +27,18 @@ def write(root: Path, table: pa.Table, now: int) -> Path:
     Raises:
         OSError: it could not be written; nothing is left of it.
     """
-    moment = datetime.fromtimestamp(now // NS, UTC)
-    folder = root / TABLE / f"date={moment:%Y-%m-%d}"
-    path = folder / f"{moment:{_NAME}}.parquet"
+    path = path_of(root, now)
     time = pa.array(np.full(table.num_rows, now // tables.US_STEP)).cast(tables.US)
     table = table.append_column("snapshot_time", time).sort_by([("cell", "ascending"), ("sector", "ascending")])
     kept = table.cast(tables.MAP_ARCHIVE, safe=False)
     put_in_place(root, geo.with_cells(kept), path, MAP)
     return path
+
+
+def path_of(root: Path, now: int) -> Path:
+    """Where the map of a moment [ns] lies."""
+    moment = datetime.fromtimestamp(now // NS, UTC)
+    return root / TABLE / f"date={moment:%Y-%m-%d}" / f"{moment:{_NAME}}.parquet"
 
 
 def time_of(path: Path) -> int:

@@ -1,5 +1,5 @@
-"""`fleet-service`: run, query, watch, page, compact, retention, forget, export, roads, analyze, certs,
-evaluate, completion.
+"""`fleet-service`: run, query, watch, page, compact, retention, forget, export, roads, analyze, rebuild,
+certs, evaluate, completion.
 
 Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. What a command needs is imported when
 it is chosen, so that help comes at once.
@@ -45,6 +45,8 @@ COMMANDS: Final = (
         "contract, replay",
         "fleet-service analyze worst --archive archive --from 2026-01-01 --out worst.html",
     ),
+    Command("rebuild", "fleet_service.cli.rebuild", "map and roll-ups anew from raw observations, here or on Spark",
+            "fleet-service rebuild --archive archive --out rebuilt --engine spark"),
     Command("certs", "fleet_service.cli.certs", "certificates and router configurations for everyone on a list",
             "fleet-service certs --fleet fleet.json --out certs"),
     Command("evaluate", "fleet_service.cli.evaluate", "simulated fleets, beside truth and simple rules",

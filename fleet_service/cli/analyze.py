@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 import re
-import sys
 from pathlib import Path
 from typing import Final
 
 from fleet_service.analytics.options import Options
 from fleet_service.analytics.questions import Question, known, question_of
-from fleet_service.cli.common import add_part, span
+from fleet_service.cli.common import add_part, compacted_first, span
 from schemas import mugrid
 from schemas.config import moment
 from schemas.errors import InputError
@@ -60,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
     part = Extract(*span(arguments), bbox)
     if not arguments.as_it_lies:
-        _compact(arguments.archive)
+        compacted_first(arguments.archive)
     engine = engines.QueryEngine(arguments.engine, arguments.archive, part, progress=False)
     at = None if arguments.at is None else moment(arguments.at, "at")
     vehicles = USUAL_VEHICLES if arguments.min_vehicles is None else arguments.min_vehicles
@@ -104,24 +103,6 @@ def _checked(arguments: argparse.Namespace) -> Question:
     if arguments.min_vehicles is not None and arguments.min_vehicles < 1:
         raise InputError("min-vehicles", f"{arguments.min_vehicles} is below 1", "give a whole number from 1")
     return question
-
-
-def _compact(root: Path) -> None:
-    """Count what waits in the log too; where that cannot be done, say how much is left out."""
-    from fleet_service.archive import layout, segments
-    from fleet_service.archive.compaction import compact
-    from schemas.wire import Kind
-
-    layout.insist_on_archive(root)
-    waiting = len(segments.paths(root, Kind.OBSERVATION))
-    if not waiting:
-        return
-    talk.doing(f"compacting {waiting} segments of the log")
-    try:
-        done = compact(root)
-        _report(f"compacted first: {done.rows:,} rows of {done.segments} segments")
-    except (OSError, InputError) as error:
-        print(f"warning: {waiting} segments of the log are not counted: {error}", file=sys.stderr)
 
 
 def _report(line: str) -> None:

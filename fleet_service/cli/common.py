@@ -120,3 +120,25 @@ def on_archive(arguments: argparse.Namespace, command: Callable[[argparse.Namesp
     except OSError as error:
         raise InputError("archive", f"cannot use {error.filename} ({error.strerror})", "nothing is lost") from error
     return 0
+
+
+def compacted_first(root: Path) -> None:
+    """Count what waits in the log too; where that cannot be done, say how much is left out.
+
+    Raises:
+        InputError: it is no archive.
+    """
+    from fleet_service.archive import layout, segments
+    from fleet_service.archive.compaction import compact
+    from schemas.wire import Kind
+
+    layout.insist_on_archive(root)
+    waiting = len(segments.paths(root, Kind.OBSERVATION))
+    if not waiting:
+        return
+    talk.doing(f"compacting {waiting} segments of the log")
+    try:
+        done = compact(root)
+        talk.say(f"compacted first: {done.rows:,} rows of {done.segments} segments")
+    except (OSError, InputError) as error:
+        print(f"warning: {waiting} segments of the log are not counted: {error}", file=sys.stderr)

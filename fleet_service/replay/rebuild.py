@@ -100,6 +100,13 @@ class Since(NamedTuple):
     box: Box | None = None
     most: int | None = None
 
+    def near(self) -> Box | None:
+        """The box with twice the margin, in which the zones lie whose files hold the rows."""
+        if self.box is None:
+            return None
+        west, south, east, north = self.box
+        return west - 2 * MARGIN_DEG, south - 2 * MARGIN_DEG, east + 2 * MARGIN_DEG, north + 2 * MARGIN_DEG
+
     def where(self) -> list[Between] | None:
         """The rows as ranges, or None for all."""
         found = [] if self.until is None else [Between("received_at", most=self.until // US_STEP)]
@@ -172,7 +179,8 @@ def replay(
     last = None if since.until is None else since.until // layout.DAY_NS + 1
     where = since.where()
     columns = COLUMNS if where is None else [*COLUMNS, *FILTERED]
-    wanted = reading.Wanted(columns, where, (since.begin.day, last), since.begin.after, since.begin.until)
+    days = (since.begin.day, last)
+    wanted = reading.Wanted(columns, where, days, since.begin.after, since.begin.until, since.near())
     waiting: list[tuple[Observations, Before]] = []  # late rows that were fused after the end of their table
     known = witnesses.read(root / "keys")
     for table in in_order(reading.Listing(root, Kind.OBSERVATION, wanted, damaged), since.most):

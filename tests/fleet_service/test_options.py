@@ -60,6 +60,7 @@ USUAL: Final = {
     "export": ["export", "observations", *ARCHIVE, "--out", "{out}/a.csv"],
     "analyze": ANALYZE,
     "certs": CERTS,
+    "rebuild": ["rebuild", *ARCHIVE, "--out", "{out}/r", "--to", "2024-10-04T23:59:50"],
 }
 BOX: Final = "11,57,13,59"  # around one of two towns
 # command -> option -> another value; or the words with which, and those without which, it is to be seen
@@ -79,6 +80,10 @@ CHANGES: Final[dict[str, dict[str, str | tuple[list[str], list[str]]]]] = {
         "--step": ([*REPLAY, "--step", "60"], REPLAY),
         "--json": "", "--as-it-lies": "",
         "--stations": ([*WEATHER, "--stations", "{warm}"], [*WEATHER, "--stations", "{cold}"]),
+    },
+    "rebuild": {
+        "--archive": "{b}", "--out": "{out}/other", "--to": "2024-10-04T23:57", "--engine": "spark", "--as-it-lies": "",
+        "--json": "",
     },
     "certs": {
         "--fleet": "{fleet2}", "--out": "{out}/others", "--days": "100", "--ca-days": "1000",

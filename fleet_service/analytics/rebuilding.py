@@ -1,0 +1,128 @@
+"""The map and the roll-ups of an archive made anew from its raw observations, zone by zone: here, or on Spark.
+
+    OUT/map/date=2026-01-31/zone=q1202310/20260131T070000Z.parquet   the map of a moment, all visited cells
+    OUT/rollup/cell_hour/date=2026-01-31/zone=q1202310/NAME.parquet  a part per compacted file, all days
+
+Once the weights that were used are known no cell depends on others, so that a zone needs its own rows and those of a
+margin around it: what comes out is what a replay of everything at once would give. Either engine runs the same function
+for each zone, and what it writes is the same, byte for byte.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import pyarrow as pa
+
+from fleet_service.analytics.past_map import LATENESS_S, kept, visited_cells
+from fleet_service.archive import layout, rollup, snapshots
+from fleet_service.archive.files import MAP, ROLLUP, Encoding, sync_tree, write_table
+from fleet_service.archive.load import pass_over
+from fleet_service.replay.rebuild import past
+from schemas import grid
+from schemas.errors import InputError
+from schemas.runtime import spark
+from schemas.wire import Kind
+
+ENGINES: Final = ("local", "spark")
+_DRAFTS: Final = ".drafts-"  # the dot hides them from readers
+
+
+class Rebuild(NamedTuple):
+    """What is to be rebuilt: archive, the folder that takes it, the moment of the map [ns], the service's lateness."""
+
+    root: Path
+    out: Path
+    until: int
+    lateness_s: float = LATENESS_S
+
+
+class Rebuilt(NamedTuple):
+    """What came of a zone: cells of the map, parts of the roll-up."""
+
+    zone: int
+    cells: int
+    parts: int
+
+
+def insist_on_empty(out: Path) -> None:
+    """Let only an empty folder pass, or a new one: parts of another archive would add up.
+
+    Raises:
+        InputError: something lies there, or it cannot be made.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        something = next(out.iterdir(), None)
+    except OSError as error:
+        raise InputError("out", f"cannot use {out} ({error.strerror})", "name a folder you may write to") from error
+    if something is not None:
+        raise InputError("out", f"{out} holds {something.name}", "give a new folder, or empty this one")
+
+
+def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[Rebuilt]:
+    """Rebuild all zones; yields what came of each, in their order.
+
+    Raises:
+        InputError: there are no compacted observations, a file is of a newer version, the engine is none or not there.
+        OSError: something cannot be read or written.
+    """
+    if engine not in ENGINES:
+        raise InputError("engine", f"{engine!r} is none", f"use one of {', '.join(ENGINES)}")
+    zones = zones_of(wanted.root)
+    if not zones:
+        raise InputError("archive", f"no compacted observations in {wanted.root}", "run fleet-service compact")
+    work = partial(rebuilt, wanted)
+    yield from map(work, zones) if engine == "local" else spark.spread(spark.session(), zones, work)
+    for draft in wanted.out.glob(f"{_DRAFTS}*"):
+        shutil.rmtree(draft, ignore_errors=True)  # of tries that died
+
+
+def zones_of(root: Path) -> list[int]:
+    """Zones that an archive has compacted observations of."""
+    return sorted({layout.partition_of(path).zone for path in layout.compacted(root, Kind.OBSERVATION)})
+
+
+def rebuilt(wanted: Rebuild, zone: int) -> Rebuilt:
+    """Rebuild one zone; done twice, at once too, its files are there once.
+
+    Raises:
+        InputError: a file is of a newer version.
+        OSError: something cannot be read or written.
+    """
+    west, south, east, north = (float(side) for side in grid.bounds(zone, grid.ZONE_ZOOM))
+    box = (west, south, east, north)
+    cells = visited_cells(past(wanted.root, wanted.lateness_s, wanted.until, box), wanted.until, box)
+    cells = cells.filter(pa.array(grid.zone_of(cells["cell"].to_numpy()) == zone))
+    named = f"zone=q{grid.quadkey(zone, grid.ZONE_ZOOM)}"
+    with tempfile.TemporaryDirectory(prefix=_DRAFTS, dir=wanted.out) as drafts:
+        place = partial(_placed, wanted.out, Path(drafts))
+        if cells.num_rows:
+            path = snapshots.path_of(wanted.out, wanted.until)
+            place(path.parent / named / path.name, kept(cells, wanted.until), MAP)
+        parts = 0
+        for path in layout.compacted(wanted.root, Kind.OBSERVATION):
+            if layout.partition_of(path).zone == zone and (part := _part(path)) is not None:
+                place(rollup.part_of(path, wanted.out), part, ROLLUP)
+                parts += 1
+    return Rebuilt(zone, cells.num_rows, parts)
+
+
+def _part(path: Path) -> pa.Table | None:
+    try:
+        return rollup.computed(path, pass_over)
+    except FileNotFoundError:
+        return None  # its day was retired meanwhile
+
+
+def _placed(out: Path, drafts: Path, path: Path, table: pa.Table, encoding: Encoding) -> None:
+    """Write a file such that it is there whole, whoever else writes the same one."""
+    write_table(table, drafts / path.name, encoding, named=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    (drafts / path.name).rename(path)
+    sync_tree(out, [path.parent])

@@ -1,0 +1,39 @@
+"""`fleet-service rebuild`: the map and the roll-ups of an archive, made anew from its raw observations."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+from fleet_service.cli.common import ArchiveReport, add_archive, compacted_first, on_archive
+from schemas.config import moment
+from schemas.runtime import talk
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    add_archive(parser)
+    parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="a new folder: map/ and rollup/ by zone")
+    parser.add_argument("--to", dest="until", metavar="TIME", help="of the map; default now")
+    parser.add_argument("--engine", default="local", metavar="local|spark", help="default %(default)s")
+    parser.add_argument("--as-it-lies", action="store_true", help="leave the log alone: roll-ups of what is compacted")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the command on its archive."""
+    return on_archive(arguments, _rebuild)
+
+
+def _rebuild(arguments: argparse.Namespace) -> ArchiveReport:
+    from fleet_service.analytics.rebuilding import Rebuild, insist_on_empty, rebuild
+
+    until = time.time_ns() if arguments.until is None else moment(arguments.until, "to")
+    insist_on_empty(arguments.out)
+    if not arguments.as_it_lies:
+        compacted_first(arguments.archive)
+    talk.doing("replaying the archive by zone")
+    done = list(rebuild(Rebuild(arguments.archive.resolve(), arguments.out.resolve(), until), arguments.engine))
+    cells, parts = sum(one.cells for one in done), sum(one.parts for one in done)
+    line = f"{len(done)} zones in {arguments.out}: {cells} cells of the map, {parts} files rolled up"
+    return ArchiveReport(line, {"zones": len(done), "cells": cells, "parts": parts, "out": str(arguments.out)})

@@ -1,0 +1,100 @@
+"""Spark, where it is installed: a session, and tasks that it spreads over the machines of a cluster.
+
+A task is done on its own, whenever and wherever, and again where its machine failed; so it writes each file under a
+name that depends on the task alone, by a rename of a draft that no other try has.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Final, TypeVar
+
+import pyarrow as pa
+
+from schemas.errors import InputError
+
+_Task = TypeVar("_Task")
+_Outcome = TypeVar("_Outcome")
+_TASK: Final = pa.schema([pa.field("task", pa.binary())])
+SETTINGS: Final = {
+    "spark.ui.enabled": "false",
+    "spark.sql.session.timeZone": "UTC",
+    "spark.sql.execution.arrow.pyspark.enabled": "true",
+    "spark.sql.ansi.enabled": "false",  # Ibis writes 0/0 where there is nothing
+}
+
+
+def session(*, progress: bool = False) -> Any:  # noqa: ANN401 a package without types
+    """The session of this process: of the cluster that spark-submit or Spark's own settings name, else of this machine.
+
+    Raises:
+        InputError: Spark or a Java is missing.
+    """
+    try:
+        from pyspark.errors import PySparkRuntimeError
+        from pyspark.sql import SparkSession
+    except ImportError as error:
+        raise InputError("engine", "Spark is not installed", "pip install 'gripmap[spark]'") from error
+    os.environ.setdefault("PYSPARK_PYTHON", sys.executable)  # that of this environment, which has the package
+    builder = SparkSession.builder.appName("gripmap")
+    for key, value in (*SETTINGS.items(), ("spark.ui.showConsoleProgress", str(progress).lower())):
+        builder = builder.config(key, value)
+    try:
+        return builder.getOrCreate()
+    except PySparkRuntimeError as error:
+        raise InputError(
+            "engine", "Spark does not start", "install a Java it knows, 17 or 21, or set JAVA_HOME"
+        ) from error
+
+
+def spread(session: Any, tasks: Sequence[_Task], work: Callable[[_Task], _Outcome]) -> list[_Outcome]:  # noqa: ANN401
+    """Do all tasks, one of Spark's for each; outcomes in the order of the tasks.
+
+    A task that fails, or whose machine does, is tried as often as `spark.task.maxFailures` says. What a try says that
+    failed is not heard: an outcome counts once.
+
+    Args:
+        session: of Spark.
+        tasks: that pickle knows.
+        work: does one; a function of a module that is installed on all machines, or a partial of one.
+
+    Raises:
+        InputError: of a task; such a one is not tried again.
+    """
+    from py4j.protocol import Py4JError
+    from pyspark.errors import PySparkException
+    from pyspark.sql.pandas.types import from_arrow_schema
+
+    if not tasks:
+        return []
+
+    def done(batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
+        for batch in batches:
+            for number, task in _unpacked(batch["task"]):
+                try:
+                    outcome: object = work(task)
+                except InputError as error:
+                    outcome = error
+                yield pa.record_batch([pa.array([pickle.dumps((number, outcome))], pa.binary())], schema=_TASK)
+
+    packed = [pickle.dumps(numbered) for numbered in enumerate(tasks)]
+    frame = session.createDataFrame(pa.table([pa.array(packed, pa.binary())], schema=_TASK))
+    each = frame.coalesce(1).repartition(len(tasks))  # out of one partition they go around: one in each
+    try:
+        told: pa.Table = each.mapInArrow(done, from_arrow_schema(_TASK)).toArrow()
+    except (PySparkException, Py4JError) as error:
+        problem = str(error).strip().partition("\n")[0][:200]
+        raise InputError("engine", f"Spark gave up: {problem}", "its log says why; what is done is done") from error
+    outcomes = dict(_unpacked(told["task"]))
+    for outcome in outcomes.values():
+        if isinstance(outcome, InputError):
+            raise outcome
+    return [outcomes[number] for number in range(len(tasks))]
+
+
+def _unpacked(column: Any) -> Iterator[tuple[int, Any]]:  # noqa: ANN401 an array of Arrow's
+    """Numbers and tasks, or outcomes."""
+    return (pickle.loads(one) for one in column.to_pylist())

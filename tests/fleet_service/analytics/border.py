@@ -1,0 +1,65 @@
+"""An archive whose roads cross the border of two zones, with a third zone far away; for rebuilding by zone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from fleet_service.analytics import synthetic
+from fleet_service.analytics.synthetic import DAY_S, START_NS, SyntheticFleet
+from fleet_service.archive import rollup, segments
+from fleet_service.archive.compaction import compact
+from schemas import grid
+from schemas.thresholds import NS
+from schemas.wire import Kind
+
+BORDER: Final = 11.25  # degrees east; zones are 2.8125 wide
+FAR: Final = 5.0  # degrees further west
+UNTIL: Final = START_NS + DAY_S * NS
+NUMBERS: Final = ("mu", "mu_lower", "mu_upper", "p_slippery", "vehicles", "observations", "age_s")
+
+
+def fill(root: Path, world: SyntheticFleet) -> None:
+    """Make the archive, of one day, compacted and rolled up."""
+    step = 360.0 / (1 << grid.CELL_ZOOM)
+    shift = BORDER - synthetic.LONGITUDE - world.length // 2 * step
+    writer = segments.Writer(root, "shard-0")
+    for number, rows in enumerate(synthetic.chunks(world)):
+        far = np.where(rows["boot"] % 4 == 0, FAR, 0.0)
+        rows["longitude"] = rows["longitude"] + shift - far
+        rows["cell"] = grid.cell_of(rows["latitude"], rows["longitude"])
+        rows["region"] = grid.region_of(rows["cell"])
+        writer.write(Kind.OBSERVATION, segments.stepped(rows))
+        if number % 2:
+            compact(root)
+    rollup.complete(root)
+
+
+def rebuilt_map(out: Path) -> pa.Table:
+    """All zones of a rebuilt map, in the order of a map."""
+    parts = [pq.read_table(path, partitioning=None) for path in sorted((out / "map").glob("*/*/*.parquet"))]
+    whole = pa.concat_tables([part.replace_schema_metadata(None) for part in parts])
+    return whole.sort_by([("cell", "ascending"), ("sector", "ascending")])
+
+
+def difference(ours: pa.Table, theirs: pa.Table) -> float:
+    """The largest difference of a number of two maps; infinite where their cells, or what is null, are not the same."""
+    if not all(ours[name].equals(theirs[name]) for name in ("cell", "sector", "basis", "first_time", "last_time")):
+        return np.inf
+    worst = 0.0
+    for name in NUMBERS:
+        if not pc.is_null(ours[name]).equals(pc.is_null(theirs[name])):
+            return np.inf
+        a, b = (np.nan_to_num(table[name].to_numpy().astype(float)) for table in (ours, theirs))
+        worst = max(worst, float(np.abs(a - b).max(initial=0.0)))
+    return worst
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Every file below a folder."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}

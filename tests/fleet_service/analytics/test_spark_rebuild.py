@@ -1,0 +1,87 @@
+"""`make spark-test`: what is rebuilt on Spark is, byte for byte, what is rebuilt here, whatever dies on the way."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fleet_service.analytics.rebuilding import Rebuild, Rebuilt, rebuild, rebuilt, zones_of
+from fleet_service.analytics.synthetic import SyntheticFleet
+from schemas.errors import InputError
+from schemas.runtime import spark
+from tests.fleet_service.analytics.border import UNTIL, contents, fill
+
+pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("ignore")]
+pytest.importorskip("pyspark", reason="pip install 'gripmap[spark]'")
+
+WORLD = SyntheticFleet(rows=4_000, days=1, vehicles=30, roads=6, length=60, icy=4, seed=8)
+
+
+@pytest.fixture(scope="module")
+def session() -> Iterator[Any]:
+    """Spark on two cores that tries a task three times, as clusters do and a plain local one does not."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYSPARK_SUBMIT_ARGS", "--master local[2,3] pyspark-shell")
+        found = spark.session()
+        yield found
+        found.stop()
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("border") / "archive"
+    fill(root, WORLD)
+    return root
+
+
+def test_both_engines_write_the_same_bytes(session: Any, archive: Path, tmp_path: Path) -> None:  # noqa: ANN401
+    done: dict[str, list[Rebuilt]] = {}
+    for engine in ("local", "spark"):
+        (tmp_path / engine).mkdir()
+        done[engine] = list(rebuild(Rebuild(archive, tmp_path / engine, UNTIL), engine))
+    assert done["spark"] == done["local"]
+    assert contents(tmp_path / "spark") == contents(tmp_path / "local")
+    assert len(contents(tmp_path / "local")) > 3
+
+
+def test_a_task_whose_process_is_killed_after_it_wrote_counts_once(
+    session: Any,  # noqa: ANN401
+    archive: Path,
+    tmp_path: Path,
+) -> None:
+    out, tries = tmp_path / "out", tmp_path / "tries"
+    out.mkdir()
+    tries.mkdir()
+    wanted = Rebuild(archive, out, UNTIL)
+
+    def killed_at_first(zone: int) -> Rebuilt:
+        done = rebuilt(wanted, zone)
+        if not (tries / str(zone)).exists():
+            (tries / str(zone)).touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return done
+
+    zones = zones_of(archive)
+    told = spark.spread(session, zones, killed_at_first)
+    assert {path.name for path in tries.iterdir()} == {str(zone) for zone in zones}, "none was killed"
+    (tmp_path / "local").mkdir()
+    assert told == list(rebuild(wanted._replace(out=tmp_path / "local")))
+    assert contents(out) == contents(tmp_path / "local")
+
+
+def _refused(task: str) -> str:
+    raise InputError("log", f"{task} is no log", "give another")
+
+
+def test_bad_input_comes_as_itself_and_a_task_that_always_fails_as_a_line(session: Any) -> None:  # noqa: ANN401
+    with pytest.raises(InputError, match="log: 1.parquet is no log; give another"):
+        spark.spread(session, ["1.parquet"], _refused)
+    with pytest.raises(InputError, match="engine: Spark gave up: "):
+        spark.spread(session, ["x"], partial(int, base=10))
+    assert spark.spread(session, [], _refused) == []
