@@ -53,12 +53,14 @@ def __dir__() -> list[str]:
 def edge_agent_main() -> int:
     """Run `edge-agent`."""
     from edge_agent.cli import main
+    from schemas.runtime.process import leave
 
-    return main()
+    return leave(main())
 
 
 def fleet_service_main() -> int:
     """Run `fleet-service`."""
     from fleet_service.cli import main
+    from schemas.runtime.process import leave
 
-    return main()
+    return leave(main())

@@ -6,13 +6,16 @@ a line once. A library that is imported says nothing: only the command lines cal
 
 from __future__ import annotations
 
+import importlib
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, Final
 
 PATIENCE_S: Final = 0.8  # after which a person asks whether it still runs
+TICK_S: Final = 1.0
 COMPILING: Final = "compiling kernels, once on this machine: about 40 s for the default estimator"
 
 
@@ -88,8 +91,14 @@ def hush() -> None:
 
 
 def _show() -> None:
-    with suppress(OSError):  # at once: the library that draws takes a second to load beside the command's own
-        print(f"{_voice.words} …", end="\r", file=sys.stderr, flush=True)
+    began = time.monotonic()
+    loading = threading.Thread(target=_load, daemon=True)
+    loading.start()
+    while loading.is_alive():  # seconds, beside a command that computes or loads its own
+        with suppress(OSError):
+            waited = PATIENCE_S + time.monotonic() - began
+            print(f"{_voice.words} … {waited:.0f} s", end="\r", file=sys.stderr, flush=True)
+        loading.join(TICK_S)
     from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
@@ -101,3 +110,8 @@ def _show() -> None:
     shown.start()
     with _voice.lock:
         _voice.shown = shown
+
+
+def _load() -> None:
+    """What draws, before it is needed."""
+    importlib.import_module("rich.progress")

@@ -10,6 +10,34 @@ TALK = "import sys\nfrom schemas.runtime.process import print_line\n"
 TALK += "for _ in range(3): print_line('hello', sys.stderr)\nsys.exit(7)"
 
 
+LEAVE = """
+import atexit, threading
+from schemas.runtime.process import leave
+class Held:
+    def __del__(self):
+        print("taken apart", flush=True)
+held = Held()
+atexit.register(print, "registered")
+print("said", end=" ")
+"""
+
+
+def test_a_command_that_is_done_leaves_without_taking_the_interpreter_apart() -> None:
+    done = subprocess.run([sys.executable, "-c", f"{LEAVE}leave(3)"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (3, "said registered\n")
+
+
+def test_a_thread_that_still_works_is_waited_for() -> None:
+    words = f"""{LEAVE}
+go = threading.Event()
+threading.Thread(target=lambda: (go.wait(), print("worked"))).start()
+code = leave(3)
+go.set()
+raise SystemExit(code)"""
+    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (3, "said worked\nregistered\ntaken apart\n")
+
+
 def test_a_full_disk_behind_the_output_does_not_end_the_process() -> None:
     with Path("/dev/full").open("w") as full:
         assert subprocess.run([sys.executable, "-c", TALK], stderr=full, check=False).returncode == 7

@@ -1,0 +1,49 @@
+"""What a person who waits on a terminal is told."""
+
+from __future__ import annotations
+
+import io
+import sys
+import threading
+
+import pytest
+
+from schemas.runtime import talk
+from tests.waiting import until
+
+
+class Terminal(io.StringIO):
+    """Takes what is said, as a terminal."""
+
+    def isatty(self) -> bool:
+        """It is one."""
+        return True
+
+
+def test_it_is_said_each_second_that_it_runs_while_what_draws_is_still_loading(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal, loaded = Terminal(), threading.Event()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setattr(talk, "PATIENCE_S", 0.01)
+    monkeypatch.setattr(talk, "TICK_S", 0.01)
+    monkeypatch.setattr(talk, "_load", loaded.wait)
+    talk.speak()
+    try:
+        with talk.busy("replay"):
+            until(lambda: terminal.getvalue().count("replay … 0 s\r") >= 3)
+            talk.doing("compiling step")
+            until(lambda: "compiling step … 0 s\r" in terminal.getvalue())
+            loaded.set()
+            until(lambda: "0:00:00" in terminal.getvalue())  # the line that turns
+    finally:
+        loaded.set()
+        talk.speak(quiet=True)
+
+
+def test_nobody_is_told_anything_who_asked_for_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setattr(talk, "PATIENCE_S", 0.0)
+    talk.speak(quiet=True)
+    with talk.busy("replay"):
+        talk.say("a line")
+    assert terminal.getvalue() == ""
