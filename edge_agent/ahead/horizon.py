@@ -84,7 +84,7 @@ def look_ahead(path: Path, known: HeardMap, now: int) -> Horizon:
     return Horizon(
         path, np.where(nothing, NONE, places[row]), mu, lower, upper, p, age, basis,
         np.where(nothing, False, slippery[row]), np.where(nothing, False, found.alerted[row]),
-        safe_speed(path.curvature, np.where(basis == MEASURED, lower, np.nan)),
+        safe_speed(path.curvature, np.where((basis == MEASURED) | (slippery[row] & ~nothing), lower, np.nan)),
     )  # fmt: skip
 
 

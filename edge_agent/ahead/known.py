@@ -23,6 +23,7 @@ HELD_S: Final = 3600.0  # what was not heard again for so long is unknown: by th
 ALERT_HELD_S: Final = 600.0  # alerts that stand are put again every few seconds
 MOST_CELLS: Final = 20_000  # 6 MB: fifty kilometres of road with its side streets
 MOST_ALERTS: Final = 4096
+OTHER_WAY: Final = 2  # bit of a place's number: sectors 0 and 2 are one road driven to and fro, and so are 1 and 3
 SLIPPERY_BINS: Final[FloatArray] = np.clip(
     (SLIPPERY_MU - mugrid.EDGES[:-1]) / np.diff(mugrid.EDGES), 0.0, 1.0
 )  # share of each bin that is slippery
@@ -140,18 +141,25 @@ class HeardMap:
             del self._alerts[key]
 
     def look_up(self, key: IntArray, now: int) -> PlaceBelief:
-        """What is known now of places (n,)."""
+        """What is known now of places (n,).
+
+        An alert for who comes the other way is one for this side too, as long as nobody found better here since: ice
+        and water do not keep to a lane.
+        """
         belief, basis, last, at, vehicles = self._rows(key)
         alerted = np.zeros(len(key), np.bool_)
-        for k in np.flatnonzero(np.isin(key, np.fromiter(self._alerts, np.int64, len(self._alerts)))).tolist():
-            alert, heard = self._alerts[int(key[k])]
+        standing = np.fromiter(self._alerts, np.int64, len(self._alerts))
+        for k in np.flatnonzero(np.isin(key, standing) | np.isin(key ^ OTHER_WAY, standing)).tolist():
+            place = int(key[k])
+            own = place in self._alerts
+            alert, heard = self._alerts[place if own else place ^ OTHER_WAY]
             if now - heard > ALERT_HELD_S * NS:
                 continue
-            alerted[k] = True
-            if alert.time >= last[k]:
+            alerted[k] = own or alert.time > last[k]  # who found grip since, on this side, knows better
+            if alert.time >= last[k] and alerted[k]:
                 said = (np.array([value]) for value in (alert.mu_lower, alert.mu, alert.mu_upper, alert.p_slippery))
-                belief[k], basis[k], last[k], at[k] = belief_of(*said)[0], MEASURED, alert.time, heard
-                vehicles[k] = alert.vehicles
+                belief[k], last[k], at[k], vehicles[k] = belief_of(*said)[0], alert.time, heard, alert.vehicles
+                basis[k] = MEASURED if own else BORROWED
         since = np.maximum(now - at, 0) / NS
         share = -np.expm1(-since / CHANGE_S)[:, None]
         faded = (1.0 - share) * belief + share * mugrid.PRIOR

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from edge_agent.ahead.horizon import MARGIN_M, Horizon, braking_from, worth_a_warning
-from edge_agent.ahead.known import HeardMap
+from edge_agent.ahead.known import MEASURED, HeardMap
 from edge_agent.ahead.path import Pose
 from schemas import grid
 from schemas.numeric import BoolArray
@@ -134,7 +134,9 @@ def _warning(name: str, state: WarningState, stretch: _Stretch, pose: Pose, sure
     horizon, k = stretch.horizon, stretch.worst
     first, last = int(stretch.start), int(stretch.end)
     age = float(np.nanmin(horizon.age_s[first:last]))
-    reason = "an alert stands" if horizon.alerted[first:last].any() else "the map says so"
+    alerted = horizon.alerted[first:last]
+    own = (alerted & (horizon.basis[first:last] == MEASURED)).any()
+    reason = "an alert stands" if own else "an alert stands for the other way" if alerted.any() else "the map says so"
     return GripWarning(
         id=name, state=state, time=pose.time, distance_m=stretch.start, length_m=stretch.end - stretch.start,
         time_s=stretch.start / pose.speed if pose.speed > SLOWEST else math.inf,

@@ -68,7 +68,10 @@ ALARM_S: Final = 0.7  # e-folding of his belief while wheels slide
 SLIDING: Final = 3.5  # normalised slip that he feels as sliding: well past the peak
 LEAST_BELIEF: Final = 0.12
 PREPARED_S: Final = 1.5  # before the stretch he expects its grip: three times WORSE_S
-WARNED_BRAKES: Final = 2.0  # [m/s^2] with which he slows down for a stretch that he was warned of
+WARNED_BRAKES: Final = 1.0  # [m/s^2] with which he slows down for such a stretch: the engine, for it may begin sooner
+# Of his share of the grip, on a stretch of which he was told that it is slippery: he leaves the pedals alone. An axle
+# that brakes alone, or its share of the brakes, meets its limit at half of what the road bears.
+CAREFUL: Final = 0.5
 SLOWEST: Final = 3.0  # [m/s] he creeps on, unless he stops
 LARGEST_STEER: Final = 0.55  # [rad]
 LARGEST_SLIP_ANGLE: Final = 0.09  # [rad] of the front wheels; more steering than that only scrubs
@@ -141,7 +144,8 @@ def ahead(d: FloatArray, g: IntArray, lanes: Lanes, distance: float) -> tuple[in
 @compiled
 def budget(d: FloatArray) -> float:
     """q [m/s^2]: what the driver is ready to ask of the tyres."""
-    return float(min(d[Driver.STYLE] * d[Driver.BELIEF] * GRAVITY, d[Driver.COMFORT]))
+    style = d[Driver.STYLE] * (CAREFUL if heeds(d) and d[Driver.WARNED_START] <= 0.0 else 1.0)
+    return float(min(style * d[Driver.BELIEF] * GRAVITY, d[Driver.COMFORT]))
 
 
 @compiled
@@ -203,7 +207,7 @@ def warned_square(d: FloatArray, g: IntArray, lanes: Lanes) -> float:
     lane = g[Route.LANE]
     stays = lanes[1][lane] <= row < lanes[1][lane] + lanes[2][lane]
     profile = lanes[0][row, LanePoint.PROFILE + (g[Route.WAY] if stays else 0)]
-    q = min(d[Driver.STYLE] * max(d[Driver.WARNED_MU], LEAST_BELIEF) * GRAVITY, d[Driver.COMFORT])
+    q = min(CAREFUL * d[Driver.STYLE] * max(d[Driver.WARNED_MU], LEAST_BELIEF) * GRAVITY, d[Driver.COMFORT])
     return float(max(min(d[Driver.WARNED_SPEED] ** 2, q * profile), SLOWEST**2))
 
 

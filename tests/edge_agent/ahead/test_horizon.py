@@ -17,7 +17,7 @@ from edge_agent.ahead.horizon import (
     look_ahead,
     safe_speed,
 )
-from edge_agent.ahead.known import ALERT_HELD_S, CHANGE_S, HELD_S, HeardMap, belief_of
+from edge_agent.ahead.known import ALERT_HELD_S, BORROWED, CHANGE_S, HELD_S, OTHER_WAY, HeardMap, belief_of
 from edge_agent.ahead.path import NONE, GivenRoute, corridor
 from edge_agent.ahead.roads import ways_on
 from schemas import grid, mugrid
@@ -179,3 +179,23 @@ def test_one_looks_as_far_as_it_takes_to_stop_on_an_unknown_road() -> None:
     assert horizon_length(14.0) > 14.0 * 1.5 + 14.0**2 / (2 * UNKNOWN_LOWER * GRAVITY)
     assert horizon_length(0.0) == 150.0
     assert horizon_length(80.0) == 1000.0
+
+
+def test_an_alert_of_who_comes_the_other_way_warns_until_somebody_finds_grip_on_this_side() -> None:
+    road, path = keys_on(), corridor(HOME, 60.0)
+    other = [int(key) ^ OTHER_WAY for key in road[2:4]]
+    cache = HeardMap()
+    for key in other:
+        assert cache.alert(alert(key), NOW)
+    seen = look_ahead(path, cache, NOW + NS)
+    assert set(seen.key[seen.alerted].tolist()) == set(road[2:4].tolist())
+    assert (seen.basis[seen.alerted] == BORROWED).all(), "nobody has measured this side"
+    assert (seen.mu_upper[seen.alerted] < 0.4).all()
+    assert np.isfinite(seen.safe_speed[seen.alerted]).all()
+    tile = int(grid.tile_of(road[2] // grid.SECTORS))
+    cache.take(tile, cells(road[2:3], 0.8, at=NOW - NS), NOW)
+    assert look_ahead(path, cache, NOW + NS).slippery.sum() == seen.slippery.sum(), "grip that was found before"
+    cache.take(tile, cells(road[2:3], 0.8, at=NOW + NS), NOW)
+    assert set((found := look_ahead(path, cache, NOW + NS)).key[found.alerted].tolist()) == {int(road[3])}
+    across = corridor(HOME._replace(yaw=HOME.yaw + np.pi / 2), 60.0)
+    assert not look_ahead(across, cache, NOW + NS).alerted.any(), "another road"
