@@ -12,17 +12,17 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.belief import SLIPPERY_SHARE, forget, unpack
+from fleet_service.fusion.belief import SLIPPERY_SHARE, unpack
 from fleet_service.fusion.late import LATE_MOST_NS, delayed, fused_at
+from fleet_service.fusion.neighbours import beliefs
 from fleet_service.fusion.observations import Observations, SmallArray
-from fleet_service.fusion.shared import ALARM_KERNELS, KERNELS, kernel_of, read_road, shared_parts
+from fleet_service.fusion.shared import ALARM_KERNELS, KERNELS, kernel_of, shared_parts
 from fleet_service.fusion.standing import ERRORS, UNKNOWN, Standing, classes, first_standing, unknown
 from fleet_service.fusion.store.cells import Cells
-from fleet_service.fusion.store.records import AGED, ICE, NOBODY, NONE, USED, Rows
+from fleet_service.fusion.store.records import ICE, NOBODY, NONE, USED, Rows
 from fleet_service.fusion.store.store import Store, distinct
 from fleet_service.fusion.trust import judged, newcomer, slope_std
-from fleet_service.fusion.votes import PADDED, SCRATCH, P
-from fleet_service.fusion.weather import Reports, Weather, aged, no_reports, weather_of
+from fleet_service.fusion.weather import Reports, Weather, no_reports, weather_of
 from fleet_service.fusion.window import Arrivals, Votes, absorb, commit
 from schemas import grid
 from schemas.numeric import BoolArray, Float32Array, FloatArray, IntArray
@@ -184,15 +184,16 @@ class Fusion:
         self._weather = weather_of(self.reports)
 
     def beliefs(self, slots: IntArray, now: int) -> FloatArray:
-        """Belief of each slot about its road, (k, 32), with what time did to it until `now` [ns]."""
-        return _beliefs(self.store.state.live, self._weather, KERNELS, slots, now)
+        """Belief of each slot about its road, (k, 32), with what time did to it until `now` [ns], and with what
+        slippery neighbours tell of it."""
+        return self._read(KERNELS, slots, np.full(len(slots), now))
 
     def believed(self, slots: IntArray) -> FloatArray:
         """Belief of each slot about its road, (k, 32), at its last observation."""
-        return _believed(self.store.state.live, KERNELS, slots)
+        return self._read(KERNELS, slots, self.live.time[slots])
 
     def slippery(self, slots: IntArray) -> FloatArray:
-        """P(slippery) of each slot's road at its last observation, (k,), as of `believed`."""
+        """P(slippery) of each slot's road at its last observation by its own reports alone, (k,)."""
         return _slippery(self.store.state.live, SLIPPERY_WEIGHTS, slots)
 
     def alarming(self, slots: IntArray) -> FloatArray:
@@ -202,11 +203,14 @@ class Fusion:
         hour, there is no more doubt than the map has.
         """
         if not len(slots) or slope_std(self.store.peers, self.standings[-1]) > c.SLOPE_KNOWN:
-            return _believed(self.store.state.live, ALARM_KERNELS, slots)
+            return self._read(ALARM_KERNELS, slots, self.live.time[slots])
         hour = self.live.time[slots] - int(c.VOTE_RENEWAL_S * NS)
         known = self.sources(slots, ICE, hour, least=c.TELLING_TRUST)[0] >= c.KNOWN_SOURCES
-        doubtful = _believed(self.store.state.live, ALARM_KERNELS, slots)
+        doubtful = self._read(ALARM_KERNELS, slots, self.live.time[slots])
         return np.where(known[:, None], self.believed(slots), doubtful)
+
+    def _read(self, kernels: Float32Array, slots: IntArray, now: IntArray) -> FloatArray:
+        return beliefs(self.store.state.live, self.store.table, self._weather, kernels, slots, now)
 
     def slots_of(self, cell: IntArray, sector: IntArray | SmallArray) -> IntArray:
         """Slot of each cell and sector, -1 where nobody was."""
@@ -308,32 +312,6 @@ def _votes(o: Observations, rows: IntArray) -> tuple[IntArray, IntArray, Float32
 def _recent(reports: Reports, oldest: int) -> Reports:
     """Without those that ended before `oldest` [ns]."""
     return reports.take(reports.time >= oldest - 4 * 3600 * NS)
-
-
-@compiled
-def _beliefs(live: Rows, weather: Weather, kernels: Float32Array, slots: IntArray, now: int) -> FloatArray:
-    belief, cells = live.belief, live.cells
-    scratch = np.empty((3, SCRATCH))
-    p = scratch[P]
-    out = np.empty((len(slots), belief.shape[1]))
-    for k in range(len(slots)):
-        slot = slots[k]
-        unpack(belief, slot, p)
-        seconds = max((now - cells[slot].time) * 1e-9, 0.0) + cells[slot].aged / AGED
-        drift, change, prior = aged(weather, cells[slot].key, now - int(seconds * NS), now)
-        forget(p, drift, change, weather.prior[prior], scratch[PADDED])
-        read_road(kernels, cells, slot, p, out[k])
-    return out
-
-
-@compiled
-def _believed(live: Rows, kernels: Float32Array, slots: IntArray) -> FloatArray:
-    p = np.empty(live.belief.shape[1])
-    out = np.empty((len(slots), live.belief.shape[1]))
-    for k in range(len(slots)):
-        unpack(live.belief, slots[k], p)
-        read_road(kernels, live.cells, slots[k], p, out[k])
-    return out
 
 
 @compiled

@@ -17,6 +17,9 @@ from schemas.thresholds import NS, SLIPPERY_MU
 from schemas.wire import Alert
 
 RAISE_ABOVE: Final = 0.9  # P(slippery)
+# ... and by its own reports alone: neighbours confirm, they do not accuse. Nor do they where as many found grip as ice:
+# there the stretch may end, and fixes err by metres.
+LIKELY: Final = 0.5
 # Grip must be as sure as ice was: clearing too early is the dearer error, and a few liars can lower P for a while.
 CLEAR_BELOW: Final = 0.05
 FADE_BELOW: Final = 0.5  # ... but when nobody confirms it, it ends as soon as it is less likely than not
@@ -61,14 +64,17 @@ class Alerts:
         """Alerts that the cells just updated raise or clear."""
         time, slippery = self._fusion.live.time[slots], self._fusion.slippery(slots)
         standing = np.isin(slots, np.fromiter(self._standing, np.int64, len(self._standing)))
-        out, likely = [], np.flatnonzero((slippery > RAISE_ABOVE) & ~standing)
-        likely = likely[self._fusion.sources(slots[likely], ICE, time[likely] - SOURCE_NS)[0] >= LEAST_SOURCES]
+        out, likely = [], np.flatnonzero((slippery > LIKELY) & ~standing)
+        ice, grip = (self._fusion.sources(slots[likely], side, time[likely] - SOURCE_NS)[0] for side in (ICE, GRIP))
+        likely = likely[(ice >= LEAST_SOURCES) & ((ice > grip) | (slippery[likely] > RAISE_ABOVE))]
         alarming = self._fusion.alarming(slots[likely]) @ SLIPPERY_SHARE > RAISE_ABOVE
-        for k in likely[alarming].tolist():
+        likely = likely[alarming]
+        believed = self._fusion.believed(slots[likely]) @ SLIPPERY_SHARE
+        for k, probability in zip(likely.tolist(), believed.tolist(), strict=True):
             slot, when = int(slots[k]), int(time[k])
-            if self._corroborated(slot, ICE, when):
+            if probability > RAISE_ABOVE and self._corroborated(slot, ICE, when):
                 self._standing[slot] = self._alert(
-                    slot, when, True, f"P(mu < {SLIPPERY_MU}) = {slippery[k]:.2f} > {RAISE_ABOVE}"
+                    slot, when, True, f"P(mu < {SLIPPERY_MU}) = {probability:.2f} > {RAISE_ABOVE}"
                 )
                 out.append(self._standing[slot])
         gripping = np.flatnonzero((slippery < CLEAR_BELOW) & standing).tolist()

@@ -107,6 +107,11 @@ class Store:
         """Slot of each key, NONE where there is none."""
         return rows_of(self._slots, self.state.live.cells, np.asarray(keys, np.int64))
 
+    @property
+    def table(self) -> IntArray:
+        """Where compiled code finds slots by key."""
+        return self._slots
+
     def slots_for(self, keys: IntArray) -> IntArray:
         """Slot of each key; new ones begin with the prior."""
         slots = self.slots_of(keys)

@@ -64,6 +64,12 @@ def locate(table: IntArray, rows: RecordArray, key: int) -> int:
     return place
 
 
+@refcount_free_inlined
+def find(table: IntArray, rows: RecordArray, key: int) -> int:
+    """Row of a key; NONE where it is unknown."""
+    return _row(table[locate(table, rows, key)])
+
+
 @compiled
 def rows_of(table: IntArray, rows: RecordArray, wanted: IntArray) -> IntArray:
     """Row of each key, (n,); NONE where it is unknown."""
@@ -76,7 +82,7 @@ def rows_of(table: IntArray, rows: RecordArray, wanted: IntArray) -> IntArray:
         for i in range(group, end):
             prefetch(rows, _row(table[out[i]]), 0)
         for i in range(group, end):
-            out[i] = _row(table[locate(table, rows, wanted[i])])
+            out[i] = find(table, rows, wanted[i])
     return out
 
 

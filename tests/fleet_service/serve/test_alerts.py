@@ -32,10 +32,10 @@ def test_the_second_vehicle_raises_the_alert_and_it_is_raised_once() -> None:
 
 
 def test_an_alert_is_judged_by_what_is_believed_of_the_road() -> None:
-    fusion, cells = Fusion(120.0), np.arange(40)
+    fusion, cells = Fusion(120.0), 64 * np.arange(40)  # too far from each other to tell
     for vehicle in range(3):
         fusion.update(
-            observations(20.0 * vehicle + cells / 4, cells * 9 + vehicle, value(cells / 40 + 0.1), CELL + cells)
+            observations(20.0 * vehicle + cells / 256, cells * 9 + vehicle, value(cells / 2560 + 0.1), CELL + cells)
         )
     alerts, slots = Alerts(fusion), np.arange(fusion.size)
     believed = fusion.believed(slots) @ SLIPPERY_SHARE

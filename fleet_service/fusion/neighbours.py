@@ -1,0 +1,136 @@
+"""A belief as it is read: what time did to it, what slippery neighbours tell, and what all values share. Compiled.
+
+A surface rarely ends with a cell: snow and ice lie in stretches. So a cell near which others were found slippery is
+more probably slippery than one of which nobody knows anything. Each side of a cell, before, behind, and the other
+direction of the road, sends it one message, of the neighbour there that tells most:
+
+    m_i = 1 - w + w·n_i/p₀_i,    w = SAME_SURFACE^d·max(s - s₀, 0)/(1 - s₀),    s₀ = max(NEIGHBOUR_SURE, s of p₀)
+
+and the cell is read as K·(b·m·m·m) over its sum. Messages come from what a neighbour's own visitors told, never from
+what it was told, so that nothing goes round; and they are made when the map is read, so that no cell's own belief
+depends on another's. What all values share is shared with the neighbours' too: K comes last, once. Only slippery
+neighbours tell: a cell that nobody tested is not dry because others are (a message of grip would say so), and cells
+that know nothing, or read wet road a little low all together, send nothing (s < s₀). The least of m is 1 - w, .2 beside
+ice: a cell whose own visitors found grip keeps it. A neighbour with grip lets nothing past it: there the stretch has
+ended. Where nobody was but perhaps (see `space`), nothing is told.
+
+Source of messages: Pearl, Probabilistic Reasoning in Intelligent Systems (1988), ch. 4; here of one step.
+
+Legend
+    b      what the fleet takes the cell for, by its own reports                          (32,)
+    n      belief about the road of a neighbour, by its own reports                       (32,)
+    s      P(slippery) of n
+    p₀     what is believed of a road of the region that nobody measured                  (32,)
+    K      shared kernel, see `shared`                                                    (32, 32)
+    d      cells from one to the other; 1 to the other direction's
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from fleet_service.fusion import constants as c
+from fleet_service.fusion.belief import SLIPPERY_SHARE, Bins, forget, unpack
+from fleet_service.fusion.shared import read_road
+from fleet_service.fusion.store.records import AGED, NONE, Rows
+from fleet_service.fusion.store.table import find
+from fleet_service.fusion.votes import PADDED, SCRATCH, P
+from fleet_service.fusion.weather import Weather, aged
+from schemas import grid, mugrid
+from schemas.numeric import Float32Array, FloatArray, IntArray
+from schemas.runtime.jit import compiled, refcount_free, refcount_free_inlined
+from schemas.thresholds import NS
+
+_BINS: Final = mugrid.BINS
+_KEPT: Final[FloatArray] = np.power(c.SAME_SURFACE, np.arange(c.NEIGHBOURS + 1))
+_WHOLE: Final = (1 << 2 * grid.CELL_ZOOM) - 1  # all bits of a cell
+_X: Final = 0x5555555555555555 & _WHOLE  # those of its column
+_Y: Final = _WHOLE - _X
+_EAST, _NORTH, _WEST, _SOUTH = range(grid.SECTORS)
+
+
+@refcount_free_inlined
+def stepped(cell: int, heading: int) -> int:
+    """The next cell in a sector's direction; the date line is no border."""
+    x, y = cell & _X, cell & _Y
+    if heading == _EAST:
+        x = ((x | _Y) + 1) & _X
+    elif heading == _WEST:
+        x = (x - 1) & _X
+    elif heading == _SOUTH:
+        y = ((y | _X) + 2) & _Y
+    else:
+        y = (y - 2) & _Y
+    return x | y
+
+
+@compiled
+def beliefs(
+    live: Rows, table: IntArray, weather: Weather, kernels: Float32Array, slots: IntArray, now: IntArray
+) -> FloatArray:  # fmt: skip
+    """Belief of each slot about its road at a time of its own [ns], (k, 32); `table` finds slots by key."""
+    out, scratch = np.empty((len(slots), _BINS)), np.empty((3, SCRATCH))
+    p, message, road = np.empty(_BINS), np.empty(_BINS), np.empty(_BINS)
+    for k in range(len(slots)):
+        prior = _aged(live, weather, slots[k], now[k], scratch)
+        p[:] = scratch[P, :_BINS]
+        read_road(kernels, live.cells, slots[k], p, out[k])
+        slippery = _slippery(out[k])
+        if slippery < c.DECIDED or slippery > 1.0 - c.DECIDED:
+            continue
+        told, unknown = False, max(_slippery(weather.prior[prior]), c.NEIGHBOUR_SURE)
+        key = live.cells[slots[k]].key
+        cell, sector = key // grid.SECTORS, key % grid.SECTORS
+        back = (sector + 2) % grid.SECTORS
+        for side in range(3):
+            most, there = 0.0, cell
+            for step in range(1, c.NEIGHBOURS + 1):
+                if side == 2:  # the other direction: of the same cell, or of the one to the left or right
+                    if step > 3:
+                        break
+                    there = cell if step == 1 else stepped(cell, (sector + 2 * step - 3) % grid.SECTORS)
+                else:
+                    there = stepped(there, sector if side == 0 else back)
+                row = find(table, live.cells, there * grid.SECTORS + (back if side == 2 else sector))
+                if row == NONE or live.cells[row].vehicles == 0:
+                    continue
+                _aged(live, weather, row, now[k], scratch)
+                read_road(kernels, live.cells, row, scratch[P], road)
+                slippery = _slippery(road)
+                weight = _KEPT[1 if side == 2 else step] * (slippery - unknown) / (1.0 - unknown)
+                if weight > most:
+                    most = weight
+                    for i in range(_BINS):
+                        message[i] = 1.0 - weight + weight * road[i] / weather.prior[prior, i]
+                if side < 2 and slippery < c.NEIGHBOUR_GRIP:
+                    break
+            if most > 0.0:
+                told = True
+                for i in range(_BINS):
+                    p[i] *= message[i]
+        if told:
+            read_road(kernels, live.cells, slots[k], p, out[k])
+    return out
+
+
+@refcount_free_inlined
+def _slippery(road: Bins) -> float:
+    whole = 0.0
+    for i in range(_BINS):
+        whole += SLIPPERY_SHARE[i] * road[i]
+    return whole
+
+
+@refcount_free
+def _aged(live: Rows, weather: Weather, slot: int, now: int, scratch: Bins) -> int:
+    """What the fleet takes a slot's road for, with what time did to it until `now` [ns], into the scratch; returns the
+    row of its region's prior."""
+    cells, p = live.cells, scratch[P]
+    unpack(live.belief, slot, p)
+    seconds = max((now - cells[slot].time) * 1e-9, 0.0) + cells[slot].aged / AGED
+    drift, change, prior = aged(weather, cells[slot].key, now - int(seconds * NS), now)
+    if now > cells[slot].time:
+        forget(p, drift, change, weather.prior[prior], scratch[PADDED])
+    return int(prior)

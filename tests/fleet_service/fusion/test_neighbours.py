@@ -1,0 +1,136 @@
+"""What slippery neighbours tell of a cell, and what no neighbour does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fleet_service.fusion import Fusion
+from fleet_service.fusion.constants import NEIGHBOURS
+from fleet_service.fusion.neighbours import stepped
+from fleet_service.fusion.weather import Reports
+from schemas import grid, mugrid
+from schemas.numeric import FloatArray
+from tests.fleet_service.examples import (
+    CELL,
+    REGION,
+    START,
+    at_least,
+    belief,
+    interval,
+    observations,
+    slippery,
+    value,
+)
+
+X, Y = (int(part[0]) for part in grid.deinterleave(np.array([CELL])))
+DIRECTIONS = ((1, 0), (0, -1), (-1, 0), (0, 1))  # of the sectors, in columns and rows
+UNTESTED = at_least([0.3] * 4)  # four gentle drivers
+
+
+def east(steps: int, north: int = 0) -> int:
+    """The cell so far east of CELL."""
+    return int(grid.interleave(np.array([X + steps]), np.array([Y - north]))[0])
+
+
+def road(found: dict[int, FloatArray], sector: int = 0) -> Fusion:
+    """A fusion after the visits (n, 32) to cells so many steps east of CELL, each by vehicles of its own."""
+    fusion = Fusion(120.0)
+    for steps, said in found.items():
+        tell(fusion, east(steps), said, sector)
+    return fusion
+
+
+def tell(fusion: Fusion, cell: int, said: FloatArray, sector: int = 0) -> None:
+    vehicles = cell % 1000 * 100 + np.arange(len(said))
+    o = observations(5.0 * np.arange(len(said)), vehicles, said, cell)
+    o.sector[:] = sector
+    fusion.update(o)
+
+
+def snow(vehicles: int = 4) -> FloatArray:
+    return value([0.3] * vehicles)
+
+
+def dry(vehicles: int = 4) -> FloatArray:
+    return value([0.85] * vehicles)
+
+
+@given(st.integers(0, (1 << 21) - 1), st.integers(1, (1 << 21) - 2), st.integers(0, 3))
+def test_the_next_cell_lies_in_the_sectors_direction(x: int, y: int, sector: int) -> None:
+    dx, dy = DIRECTIONS[sector]
+    expected = grid.interleave(np.array([(x + dx) % (1 << 21)]), np.array([y + dy]))[0]
+    assert stepped(int(grid.interleave(np.array([x]), np.array([y]))[0]), sector) == expected
+
+
+def test_an_untested_cell_between_snow_is_probably_slippery() -> None:
+    alone, one, both = (
+        slippery(belief(road({0: UNTESTED} | {k: snow() for k in sides}))) for sides in ((), (1,), (-1, 1))
+    )
+    assert alone < 0.2
+    assert alone + 0.3 < one < both
+    assert both > 0.9
+
+
+def test_the_further_it_is_the_less_a_neighbour_tells() -> None:
+    told = [slippery(belief(road({0: UNTESTED, steps: snow()}))) for steps in range(1, NEIGHBOURS + 2)]
+    assert np.all(np.diff(told) < 0.0)
+    assert told[-1] == slippery(belief(road({0: UNTESTED})))
+
+
+def test_the_other_direction_of_the_road_tells() -> None:
+    fusion = road({0: UNTESTED})
+    tell(fusion, east(0, north=1), snow(), sector=2)
+    assert slippery(belief(fusion)) > 0.4
+    across = road({0: UNTESTED})
+    tell(across, east(0, north=1), snow(), sector=1)
+    assert slippery(belief(across)) < 0.2
+
+
+@pytest.mark.parametrize("others", [dry(), UNTESTED, at_least([0.02] * 9), np.zeros((3, 32))])
+def test_who_found_no_slippery_road_tells_nothing(others: FloatArray) -> None:
+    alone = belief(road({0: UNTESTED}))
+    among = belief(road({0: UNTESTED} | dict.fromkeys((-2, -1, 1, 2), others)))
+    assert among == pytest.approx(alone, abs=2e-3)
+    assert interval(among)[1] == pytest.approx(interval(alone)[1], abs=2e-3)
+
+
+def test_a_cell_whose_own_visitors_found_grip_keeps_it() -> None:
+    between = belief(road({0: dry(), -1: snow(9), 1: snow(9)}))
+    assert slippery(between) < 0.02
+    assert interval(between)[0] > 0.6
+
+
+def test_grip_ends_a_stretch() -> None:
+    past = slippery(belief(road({0: UNTESTED, 1: dry(), 2: snow()})))
+    assert past == slippery(belief(road({0: UNTESTED})))
+
+
+def test_a_message_is_of_a_neighbours_own_reports() -> None:
+    far = road({0: UNTESTED} | dict.fromkeys(range(1, NEIGHBOURS + 1), UNTESTED) | {NEIGHBOURS + 1: snow(9)})
+    near = [slippery(belief(far, east(k))) for k in range(NEIGHBOURS, -1, -1)]
+    assert near[0] > 0.4
+    assert near[-1] == slippery(belief(road({0: UNTESTED})))
+
+
+def test_reading_leaves_a_cells_own_belief_as_it_is() -> None:
+    fusion = road({0: UNTESTED, 1: snow()})
+    before, alone = fusion.live.belief.copy(), road({0: UNTESTED})
+    assert slippery(belief(fusion)) > 0.4
+    np.testing.assert_array_equal(fusion.live.belief, before)
+    np.testing.assert_array_equal(fusion.live.belief[0], alone.live.belief[0])
+    assert fusion.slippery(np.array([0]))[0] == alone.slippery(np.array([0]))[0]
+
+
+def test_what_the_weather_says_of_a_region_is_not_told_again() -> None:
+    prior = np.where(mugrid.CENTRES < 0.4, 1.0, 0.1)
+    one, nan = np.ones(1, np.int64), np.full(1, np.nan)
+    alone, among = road({}), road({})
+    for fusion, cells in ((alone, [0]), (among, [-1, 0, 1])):
+        fusion.update_weather(Reports(one * REGION, one * START, nan, nan, nan, prior[None]))
+        for steps in cells:
+            tell(fusion, east(steps), at_least([0.1]))
+    assert slippery(belief(alone)) > 0.5
+    assert slippery(belief(among)) == pytest.approx(slippery(belief(alone)), abs=0.02)
