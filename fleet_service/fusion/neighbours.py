@@ -45,6 +45,8 @@ from schemas.thresholds import NS
 
 _BINS: Final = mugrid.BINS
 _KEPT: Final[FloatArray] = np.power(c.SAME_SURFACE, np.arange(c.NEIGHBOURS + 1))
+# A belief at rest that is slippery with less tells nothing, however it is read: time takes it to the prior.
+_ASKED: Final = c.NEIGHBOUR_SURE - 0.1
 _WHOLE: Final = (1 << 2 * grid.CELL_ZOOM) - 1  # all bits of a cell
 _X: Final = 0x5555555555555555 & _WHOLE  # those of its column
 _Y: Final = _WHOLE - _X
@@ -96,6 +98,11 @@ def beliefs(
                 row = find(table, live.cells, there * grid.SECTORS + (back if side == 2 else sector))
                 if row == NONE or live.cells[row].vehicles == 0:
                     continue
+                kept = _kept(live, row)
+                if kept < _ASKED:
+                    if side < 2 and kept < c.NEIGHBOUR_GRIP:
+                        break
+                    continue
                 _aged(live, weather, row, now[k], scratch)
                 read_road(kernels, live.cells, row, scratch[P], road)
                 slippery = _slippery(road)
@@ -104,8 +111,6 @@ def beliefs(
                     most = weight
                     for i in range(_BINS):
                         message[i] = 1.0 - weight + weight * road[i] / weather.prior[prior, i]
-                if side < 2 and slippery < c.NEIGHBOUR_GRIP:
-                    break
             if most > 0.0:
                 told = True
                 for i in range(_BINS):
@@ -121,6 +126,16 @@ def _slippery(road: Bins) -> float:
     for i in range(_BINS):
         whole += SLIPPERY_SHARE[i] * road[i]
     return whole
+
+
+@refcount_free_inlined
+def _kept(live: Rows, row: int) -> float:
+    """P(slippery) of a belief at rest, which costs a tenth of reading it."""
+    whole, slippery = 0.0, 0.0
+    for i in range(_BINS):
+        whole += live.belief[row, i]
+        slippery += SLIPPERY_SHARE[i] * live.belief[row, i]
+    return slippery / whole
 
 
 @refcount_free
