@@ -139,9 +139,10 @@ class Routes:
         return Response(b"".join(made), media_type=BLOCKS, headers={"Cache-Control": "no-store"})
 
     def _borrowed(self, tile: int) -> bytes:
+        version = self._of.world.version(tile)  # a page passes over what is older than what it holds
         found = self._of.reader.ask(keys.map_key(tile), {"basis": "borrowed"})
         return b"".join(
-            records.TileBlock(told, records.CELL_LEVEL, 1, 0, 0.0, records.of_table(table)).encoded()
+            records.TileBlock(told, records.CELL_LEVEL, version, 0, 0.0, records.of_table(table)).encoded()
             for told, table in found
         )
 

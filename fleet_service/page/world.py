@@ -128,6 +128,11 @@ class HeldWorld:
                 held.made[level] = block_at(level, tile, held.cells, held.version, held.heard)
             return held.made[level]
 
+    def version(self, tile: int) -> int:
+        """How often a tile has changed; 0: nothing is known of it."""
+        with self._lock:
+            return self._tiles[tile].version if tile in self._tiles else 0
+
     def rows(self, tiles: Iterable[int]) -> int:
         """How many records tiles have."""
         with self._lock:

@@ -62,10 +62,13 @@ def test_neighbours_meet_without_a_gap_wherever_they_lie(page: RunningPage) -> N
 
 
 def test_a_guess_is_framed_by_a_thin_line_whatever_was_painted_before(page: RunningPage, drive: Drive) -> None:
-    drive("ice", "dry")
+    """Of a tile, too, that has changed since it was first heard of."""
+    drive("dry")
     with shown(page) as seen:
         near(seen, cell_of("ice"))
-        waits(seen, f"document.body.dataset.kinds.split(',')[{ICE}] >= {street.known('ice')}")
+        drive("ice")
+        waits(seen, f"document.body.dataset.kinds?.split(',')[{ICE}] >= {street.known('ice')}")
+        assert seen.page.evaluate("[...gripmap.now.tiles.values()].some(tile => tile.block.version > 1)")
         seen.page.evaluate(
             "() => { globalThis.dashed = []; const real = CanvasRenderingContext2D.prototype.stroke;"
             " CanvasRenderingContext2D.prototype.stroke = function () {"
