@@ -112,6 +112,12 @@ class ServiceConfig(MonitoringSettings):
     archive: ArchiveSettings = Field(
         default=ArchiveSettings(), description="a folder, or where the archive and its copy are"
     )
+    standby: bool = Field(
+        default=False, description="waits until the service whose archive's copy it names is gone, and goes on as it"
+    )
+    lease_s: Positive = Field(
+        default=5.0, ge=1.0, description="after which a service with a copy that is not heard of may be followed"
+    )
     segment_s: Positive = Field(default=0.5, le=1.0, description="longest time an admitted row waits for its segment")
     put_s: Positive = Field(default=1.0, description="shortest time between two puts of one tile")
     lateness_s: Positive = Field(default=120.0, description="later observations are archived, not fused")

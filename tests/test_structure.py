@@ -51,7 +51,7 @@ ROOMS: dict[str, dict[str, set[str]]] = {
         "app": {"fusion", "archive", "ingest", "serve", "replay", "shards", "enrolment"},
         "analytics": {"fusion", "archive", "ingest", "serve", "replay"},
         "lab": {"fusion", "archive", "ingest", "serve", "replay", "app"},
-        "cli": {"archive", "app", "client", "page", "enrolment", "analytics", "lab"},
+        "cli": {"archive", "shards", "app", "client", "page", "enrolment", "analytics", "lab"},
     },
 }
 MOST_ARROWS = {"edge_agent": 30, "fleet_service": 34}

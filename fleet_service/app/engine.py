@@ -6,16 +6,14 @@ so that a lock guards the map.
 
 from __future__ import annotations
 
-import queue
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, wait
 from dataclasses import replace
 from itertools import compress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -24,9 +22,8 @@ from fleet_service.app.clock import TimeNow
 from fleet_service.app.memory import SLOTS, Memory, remember, visited
 from fleet_service.app.past import PastQuery, ask
 from fleet_service.app.precompile import warm_up
+from fleet_service.app.tasks import Tasks
 from fleet_service.archive.bucket import CopyError
-from fleet_service.archive.copies import copy_for
-from fleet_service.archive.files import lock
 from fleet_service.archive.layout import Cut
 from fleet_service.archive.load import count_set_aside, set_aside
 from fleet_service.archive.log import SegmentLog
@@ -49,6 +46,7 @@ from fleet_service.replay.restart import image_of
 from fleet_service.serve.encode import batch_of
 from fleet_service.serve.query import AnswerSize, answer, size_asked
 from fleet_service.serve.tile_cache import TileCache
+from fleet_service.shards.holding import Holding, alone
 from schemas import grid, wire
 from schemas.config import ServiceConfig, nanoseconds
 from schemas.errors import InputError
@@ -61,9 +59,7 @@ from schemas.wire import Alert, Kind
 # Rows that wait for the disk at the most; beyond, nothing is taken from the queue until a segment is written.
 WAITING_ROWS = 1_000_000
 WAITING_BATCHES = 1_000_000  # likewise, of rows that are on disk and not yet in the copy: 100 MB
-CHECKPOINT_WAIT_S = 0.2  # between two looks whether the service stops
 T = TypeVar("T")
-CHECKPOINT_MOST_S = 10.0  # for a good segment; a full disk gives none, and other jobs make room
 ERASED = "what it was raised on was erased"
 
 
@@ -73,19 +69,21 @@ class Engine:
     Args:
         config: settings.
         root: of the archive; it is locked while the engine is open.
+        holding: of the archive, which is closed with the engine; None: it is taken now, without a lease.
 
     Raises:
         InputError: another service holds the archive.
         OSError: the archive cannot be read or written.
     """
 
-    def __init__(self, config: ServiceConfig, root: Path) -> None:
+    def __init__(self, config: ServiceConfig, root: Path, holding: Holding | None = None) -> None:
         self._config, self._root = config, root
-        self._lock_file = lock(root)
+        self.holding = holding or alone(config, root)  # before anything is read: an empty disk is filled from the copy
+        self.copy = self.holding.copy
         try:
             self._open(config, root)
         except BaseException:
-            self._lock_file.close()
+            self.holding.close()
             raise
 
     def _open(self, config: ServiceConfig, root: Path) -> None:
@@ -95,12 +93,11 @@ class Engine:
         self._tracks, self._places = Tracks(), NewCells()
         self._turn = 0  # of the alerts that are told again
         self.failing = False  # the last segment could not be written
-        self.copy = copy_for(config, root)  # before anything is read: an empty disk is filled from it
         self.counts["witnesses_damaged"] += mend(root / "keys")
         self._guard = threading.Lock()
         self._acks, self._now = Acks(), 0
-        self._log: SegmentLog[BatchId] = SegmentLog(root, config.name, self.copy)
-        self._wanted: queue.SimpleQueue[tuple[Future[Any], Callable[[], object]]] = queue.SimpleQueue()
+        self._log: SegmentLog[BatchId] = SegmentLog(root, config.name, self.copy, self.holding.epoch)
+        self._wanted = Tasks()
         self._ended: list[Alert] = []  # alerts that nobody was told the end of yet
         memory = remember(root, config, set_aside)
         self.counts["checkpoints_refused"] += memory.refused
@@ -156,17 +153,7 @@ class Engine:
         Raises:
             OSError: no segment could be written for too long.
         """
-        done: Future[T] = Future()
-        self._wanted.put((done, work))
-        deadline = time.monotonic() + CHECKPOINT_MOST_S
-        while True:
-            wait([done], CHECKPOINT_WAIT_S)
-            if done.done():
-                return done.result()
-            if (stop.is_set() or time.monotonic() > deadline) and done.cancel():
-                if stop.is_set():
-                    return None
-                raise OSError("no segment could be written for so long")
+        return self._wanted.ask(work, stop)
 
     def _image(self) -> Taken:
         with self._guard:
@@ -186,9 +173,7 @@ class Engine:
         """Give the archive free."""
         self.survived()
         self._log.close()
-        if self.copy is not None:
-            self.copy.close()
-        self._lock_file.close()
+        self.holding.close()
 
     @property
     def full(self) -> bool:
@@ -310,13 +295,8 @@ class Engine:
         A full disk is counted and tried again at the next call; nothing of it is acknowledged.
         """
         acks = self._acknowledged(self._log.flush)
-        while not self.failing and not self._wanted.empty():
-            done, work = self._wanted.get()
-            if done.set_running_or_notify_cancel():
-                try:
-                    done.set_result(work())
-                except Exception as error:  # noqa: BLE001 who wanted it is told
-                    done.set_exception(error)
+        if not self.failing:
+            self._wanted.do()
         return acks
 
     def begin_flush(self) -> list[tuple[str, bytes]]:
@@ -324,7 +304,7 @@ class Engine:
 
         If something is wanted in `between`, it is `flush`.
         """
-        if not self._wanted.empty():
+        if self._wanted:
             return self.flush()
         self._log.begin()
         return []
@@ -346,7 +326,7 @@ class Engine:
         else:
             self.failing = False
             self._tiles.acknowledge()
-        return self._acks.messages(self._now)
+        return self._acks.messages(self._now) if self.holding.may_acknowledge else []
 
     def tile(self, tile: int, now: int) -> bytes:
         """The Arrow stream of a tile as far as it is public; empty where nothing of it is."""

@@ -50,6 +50,8 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
     """What keeps an archive in order, as the settings say; `moment` is the service's time."""
 
     def compaction(stop: threading.Event) -> str | None:
+        if engine.copy is not None and engine.failing:  # compacted, its segments would never be put as such
+            return "compaction waits for the copy"
         reserve.keep(root)
         weather.gather(root)
         if not config.put_to and not any(segments.paths(root, kind) for kind in Kind):

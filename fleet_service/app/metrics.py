@@ -85,6 +85,8 @@ def troubles(engine: Engine, pulse: Pulse, config: ServiceConfig) -> list[str]:
         found.append(engine.copy.trouble)
     elif engine.failing:
         found.append("segments cannot be written")
+    if not engine.holding.may_acknowledge:
+        found.append("the lease is not renewed, and nothing is acknowledged")
     if pulse.queued > FULL * config.queue_batches:
         found.append("the queue is full")
     return found

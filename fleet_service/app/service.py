@@ -27,6 +27,7 @@ from fleet_service.ingest.rate_limit import RateLimiter
 from fleet_service.ingest.weather import WeatherMessage
 from fleet_service.serve.queryable import Answering, MapQueryable
 from fleet_service.serve.tile_rounds import SHARE_S, TileRounds
+from fleet_service.shards.holding import Holding
 from fleet_service.shards.serving import serving as serving_regions
 from schemas import grid, keys, wire
 from schemas.config import ServiceConfig, load
@@ -40,6 +41,7 @@ IDLE_S: Final = 0.05  # longest wait for a message; bounds how late a segment or
 REPEAT_S: Final = 2.0  # between two puts of alerts that stand: who comes back waits less than 5 s for them
 REPEATED: Final = 1000  # alerts in such a turn, 150 kB; more go in turn
 HANGS_S: Final = 60.0  # of a segment that is being written: the disk is gone, and systemd is to start anew
+STUCK_S: Final = 10.0  # a worker that does nothing for so long is to be followed by another service
 STATUS_S: Final = 5.0
 LEAVE_S: Final = 1.5  # of the three seconds in which a service is gone
 SURVIVED_S: Final = 20.0  # a service that is still there has not died of its checkpoint
@@ -54,15 +56,18 @@ class Service:
         config: settings.
         root: of the archive.
         log_line: takes the lines for the operator.
+        holding: of the archive; None: it is taken without a lease.
 
     Raises:
         InputError: the archive belongs to another service.
     """
 
-    def __init__(self, config: ServiceConfig, root: Path, log_line: Callable[[str], None]) -> None:
+    def __init__(
+        self, config: ServiceConfig, root: Path, log_line: Callable[[str], None], holding: Holding | None = None
+    ) -> None:
         self._config, self._root, self._log_line = config, root, log_line
         known = None if config.fleet is None else set(load(config.fleet, Enrolment).vehicles)
-        self.engine = Engine(config, root)
+        self.engine = Engine(config, root, holding)
         self._clock = SteadyClock(self.engine.seen)
         limits = RateLimiter(config.vehicle_kb_s * 1e3, config.vehicle_burst_kb * 1e3, known, self.engine.counts)
         self._replies = MapQueryable(Answering(self.engine.size, self._answer), self.engine.counts)
@@ -76,9 +81,12 @@ class Service:
         )
         self._stepped_at = self._flushed_at = self._reported_at = self._repeated_at = time.monotonic()
         self._reported, self._began, self._survived = 0, self._stepped_at, False
+        self._followed = False  # by a service that has the lease now
 
     def run(self, stop: threading.Event) -> None:
         """Serve until `stop` is set; then flush, acknowledge and leave."""
+        if self.engine.holding.lease is not None:
+            self.engine.holding.lease.serves = self._works
         try:
             with self._monitored() as address:
                 session = zenoh_session.open_session(self._config.zenoh, stop, self._config.name)
@@ -89,14 +97,14 @@ class Service:
 
     @property
     def exit_code(self) -> int:
-        """0 where all that was admitted is on disk and nothing failed, else 1."""
-        return 1 if self.failure is not None or self.engine.unsettled else 0
+        """0 where all that was admitted is on disk and nothing failed, else 1: also where another took over."""
+        return 1 if self.failure is not None or self._followed or self.engine.unsettled else 0
 
     def _serve(self, session: zenoh.Session, stop: threading.Event, address: str) -> None:
         config = self._config
         with (
             session,
-            serving_regions(session, config.name, config.regions, stop),
+            serving_regions(session, config.name, config.regions, stop, owns=self.engine.holding.lease is not None),
             self._upkeep,
             self._declared(session),
         ):
@@ -104,13 +112,18 @@ class Service:
             self._log_line(f"ready: {self._config.name}, {self.engine.fusion.size} cells from the archive{address}")
             watchdog.alive()
             try:
-                while not stop.is_set():
+                while not stop.is_set() and not self.engine.holding.lost:
                     self._step(session, stop)
                 self._shut_down(session)
             except BaseException as error:
                 self.failure = error
                 stop.set()
                 raise
+
+    def _works(self) -> bool:
+        """Whether this service does for its regions what a successor could do."""
+        session, turn_age_s = self._session, time.monotonic() - self._stepped_at
+        return session is not None and turn_age_s < STUCK_S and bool(list(session.info.routers_zid()))
 
     def _monitored(self) -> AbstractContextManager[str | None]:
         """Metrics and health, where the settings want them."""
@@ -197,6 +210,10 @@ class Service:
 
     def _shut_down(self, session: zenoh.Session) -> None:
         """Take what is waiting, as far as LEAVE_S allows, and settle it; the rest its senders keep."""
+        if self.engine.holding.lost:
+            self._followed = True
+            self._log_line("followed: another service has the lease; what it did not get its senders keep")
+            return
         deadline = time.monotonic() + LEAVE_S
         while not self.engine.full and time.monotonic() < deadline:
             messages = self.inbox.drain(0.0)

@@ -84,6 +84,28 @@ class ObjectBucket:
                 if self.get(name) != content:
                     raise CopyError(f"{name}: another service has put an object of this name") from None
 
+    def make(self, name: str, content: bytes) -> bool:
+        """Put an object that must be new; whether it is this one that is there then.
+
+        Raises:
+            CopyError: as `put`.
+        """
+        with self._telling(name):
+            try:
+                self._do.put(self._store, name, content, mode="create")
+            except self._known:
+                return self.get(name) == content  # a put that timed out had landed
+        return True
+
+    def names(self, folder: str) -> list[str]:
+        """Names of the objects in a folder, and below.
+
+        Raises:
+            CopyError: they cannot be listed.
+        """
+        with self._telling(f"the list of {folder}"):
+            return [meta["path"] for page in self._do.list(self._store, prefix=folder) for meta in page]
+
     def get(self, name: str) -> bytes | None:
         """An object; None if there is none.
 

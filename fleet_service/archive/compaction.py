@@ -21,7 +21,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.archive import layout, reading, readme, segments
+from fleet_service.archive import layout, reading, readme, segments, terms
 from fleet_service.archive.files import COMPACTED, exclusive, sync_tree, write_table
 from fleet_service.archive.load import conformed, content, set_aside
 from fleet_service.archive.version import KEY, VERSION
@@ -70,13 +70,14 @@ def compact(root: Path, round_rows: int = ROUND_ROWS) -> Compacted:
     total = Compacted(0, 0, 0)
     with compacting(root):
         readme.keep(root)
+        term = terms.of(root)
         for kind in Kind:
             waiting = sorted(segments.paths(root, kind), key=lambda path: layout.age(path.name))
             done = reading.compacted(layout.compacted(root, kind), {path.name for path in waiting})
             # A run that died, or found the disk full, may have left its files in place with their names not yet synced:
             # the segments that they stand for may only be deleted when power loss can no longer forget them.
             sync_tree(root, {part.folder(root, layout.TABLES[kind]) for parts in done.values() for part in parts})
-            rest = _Rest(root, kind, iter(waiting), done)
+            rest = _Rest(root, kind, iter(waiting), done, term)
             while (moved := _round(rest, round_rows)).segments:
                 total = Compacted(*map(sum, zip(total, moved, strict=True)))
     return total
@@ -89,6 +90,7 @@ class _Rest(NamedTuple):
     kind: Kind
     segments: Iterator[Path]
     done: dict[str, set[layout.Partition]]
+    term: int
 
 
 def _round(rest: _Rest, most: int) -> Compacted:
@@ -107,7 +109,7 @@ def _round(rest: _Rest, most: int) -> Compacted:
     table = together(tables, segments.SCHEMAS[rest.kind])
     named = json.dumps(runs(path.name for path in sources))
     footer = {KEY: str(newest), reading.SOURCES.decode(): named}
-    files = _place(rest.root, rest.kind, sources[-1].name, table, footer)
+    files = _place(rest.root, rest.kind, layout.signed(sources[-1].name, rest.term), table, footer)
     for path in sources:
         path.unlink()
     sync_directory(segments.folder(rest.root, rest.kind))

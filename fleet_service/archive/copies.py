@@ -10,18 +10,20 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from threading import Lock
 from typing import Final
 
+from fleet_service.archive import layout
 from fleet_service.archive.bucket import CopyError, ObjectBucket
 from fleet_service.archive.copied import Copied, Stamp, stamp_of
 from fleet_service.archive.files import sync_tree
 from fleet_service.archive.layout import CHECKPOINTS
 from fleet_service.archive.load import BAD
+from fleet_service.archive.terms import Fence, Term, fence_of, newest, put_fence
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
 from schemas.runtime.durable import written
@@ -66,11 +68,23 @@ class Copy:
         self._pool = ThreadPoolExecutor(_AT_ONCE, "copy")
         self.failures, self._in_a_row, self._not_before, self._error = 0, 0, 0.0, ""
         self._since: float | None = None
+        self._may: Callable[[], bool] = lambda: True
+        self._alone: Callable[[], None] | None = None
+        self._term, self._fence, self._turn = Term(0, 0), Fence(0, frozenset()), 0
 
     def close(self) -> None:
         """Leave the copy as it is."""
         self._pool.shutdown(cancel_futures=True)
         self._copied.close()
+
+    def under(self, may: Callable[[], bool], alone: Callable[[], None]) -> None:
+        """Work under a lease from now on.
+
+        Args:
+            may: whether it is held for sure.
+            alone: asks the bucket that nobody has a later one; CopyError if somebody has, or it cannot be asked.
+        """
+        self._may, self._alone = may, alone
 
     @property
     def away_s(self) -> float:
@@ -95,13 +109,77 @@ class Copy:
             OSError: the folder cannot be read or written.
         """
         try:
-            self._claim(service)
-            got = self._fetch(self._slow.sizes())
-            self._follow(with_log=True)
+            return self.join(service)
         except CopyError as error:
             fix = "see that it is reached, and endpoint, region and credentials; start again, nothing is lost"
             raise InputError("archive.copy", f"{self._url} cannot be used ({error})", fix) from error
+
+    def join(self, service: str, term: Term | None = None, *, succeeds: bool = False) -> int:
+        """As `begin`, with a lease's `term`: what a former holder puts from now on does not count.
+
+        Args:
+            service: its name.
+            term: of the lease; None: there is none.
+            succeeds: another machine had the lease before: what only this folder has was never acknowledged, and goes.
+
+        Raises:
+            InputError: the bucket is another service's.
+            CopyError: the bucket cannot be reached; it may be tried again.
+            OSError: the folder cannot be read or written.
+        """
+        self._claim(service)
+        got = self._mirror() if succeeds else self._fetch(self._counting(self._slow.sizes()))
+        self._follow(with_log=True)
+        if term is not None:
+            self._raise_fence(term)
         return got
+
+    def epoch(self) -> int:
+        """The largest epoch of a name here or in the bucket, or 0.
+
+        Raises:
+            CopyError: it cannot be listed.
+        """
+        return max(newest(self._slow.sizes()), newest(self._files(FOLDERS)))
+
+    def get_ahead(self) -> None:
+        """Get what a later `join` would: of a standby, while another has the bucket.
+
+        Raises:
+            CopyError, OSError: not all of it; compaction may take files away meanwhile.
+        """
+        self._fetch(self._counting(self._slow.sizes()))
+
+    def _raise_fence(self, term: Term) -> None:
+        """Of what came from now on only what is of this term counts; what does not count goes."""
+        names = [name for name in self._files(FOLDERS) if (layout.term_of(name) or term.epoch) < term.epoch]
+        fence = Fence(term.epoch, frozenset(names))
+        self._put_fence(term, fence)
+        self._insist()
+        for name in self._slow.sizes():
+            if not fence.passes(name):  # nobody will ever make one of this name again
+                self._slow.delete(name)
+
+    def _put_fence(self, term: Term, fence: Fence) -> None:
+        self._turn += 1
+        put_fence(self._slow, term.number, self._turn, fence)
+        self._term, self._fence = term, fence
+
+    def _mirror(self) -> int:
+        """Make the folder what the bucket is, whatever it was; returns how many files were got."""
+        there = self._counting(self._slow.sizes())
+        for name, stamp in self._files(FOLDERS).items():
+            if there.get(name) != stamp.size:
+                (self._root / name).unlink()
+        for name in self._copied.all():
+            if not (self._root / name).exists():
+                self._copied.remove(name)
+        return self._fetch(there)
+
+    def _counting(self, there: Mapping[str, int]) -> dict[str, int]:
+        """Names and bytes of the objects that count."""
+        fence = fence_of(self._slow)
+        return {name: size for name, size in there.items() if fence.passes(name)}
 
     def settle(self, segments: Iterable[Path]) -> None:
         """Put segments that are written, and the keys; all of it is in the bucket when this returns.
@@ -151,6 +229,8 @@ class Copy:
                 return
 
     def _follow(self, *, with_log: bool) -> int:
+        if not self._may():
+            raise CopyError("the lease is not held for sure")
         if not self._following.acquire(timeout=QUICK_S):
             raise CopyError("compacted files are being put")
         try:
@@ -164,6 +244,10 @@ class Copy:
             vanished = [name for name in new if not self._put_there(name)]
             gone = [] if vanished else [name for name in known if name not in local and not self._aside(name).exists()]
             gone.sort(key=lambda name: not name.endswith(_LAST))
+            if strays := [name for name in new if not self._fence.passes(name)]:  # compacted by who began before
+                self._put_fence(self._term, self._fence._replace(names=self._fence.names.union(strays)))
+            if gone:
+                self._insist()  # then whoever comes next finds all that was put until now, and misses none of what goes
             for name in gone:
                 self._slow.delete(name)
                 self._copied.remove(name)
@@ -183,12 +267,25 @@ class Copy:
     def _put(self, path: Path, bucket: ObjectBucket) -> None:
         name, stamp = self._name(path), stamp_of(path)
         if self._copied.of(name) is None and (name.startswith(LOG) or name.endswith(".key")):
-            bucket.put_new(name, path.read_bytes())
+            self._put_new(name, path.read_bytes(), bucket)
         elif name.startswith(KEYS):
             bucket.put(name, path.read_bytes())  # who the vehicles are grows meanwhile, and is then put again
         else:
             bucket.put(name, path)
         self._copied.add(name, stamp)
+
+    def _put_new(self, name: str, content: bytes, bucket: ObjectBucket) -> None:
+        """Put what must be new. A key that a former service put when it had lost its lease is of rows that do not
+        count, and gives way."""
+        if self._alone is None or name.startswith(LOG) or bucket.make(name, content):
+            bucket.put_new(name, content)
+        else:
+            self._alone()
+            bucket.put(name, content)
+
+    def _insist(self) -> None:
+        if self._alone is not None:
+            self._alone()
 
     def _claim(self, service: str) -> None:
         mine = json.dumps({"service": service}).encode()

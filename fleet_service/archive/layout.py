@@ -7,7 +7,9 @@
     requests/…                                                  see `requests`
     drafts/                                                     what is being written; nothing there counts
 
-The date is that of the measurement (UTC). NAME is that of the newest segment whose rows the file holds.
+The date is that of the measurement (UTC). NAME is that of the newest segment whose rows the file holds; where services
+succeed each other by a lease, the epoch of who compacted is behind its SHARD: two that do it at once, since one was
+frozen, never make two files of one name.
 """
 
 from __future__ import annotations
@@ -28,6 +30,8 @@ TIME: Final = {Kind.OBSERVATION: "leave_time", Kind.STATE: "time"}  # of the mea
 CHECKPOINTS: Final = "checkpoints"  # a folder
 DAY_NS: Final = 86_400_000_000_000
 _EPOCH: Final = date(1970, 1, 1)
+_NAMED: Final = re.compile(r"(\.(?P<term>\d{10}))?-(?P<epoch>\d{10,})-\d{8,}\.parquet$")
+_OF_A_TERM: Final = ("inbox", "observations", "states", "rollup")
 _DAY: Final = re.compile(r"date=\d{4}-(0[1-9]|1[0-2])-(0[1-9]|[12]\d|3[01])")  # and no copy that somebody made of one
 
 
@@ -105,6 +109,24 @@ def days(root: Path, table: str, since_day: int | None = None, until_day: int | 
 def segment_name(prefix: str, number: int) -> str:
     """Name of a segment: `prefix` is SHARD-EPOCH."""
     return f"{prefix}-{number:08d}.parquet"
+
+
+def signed(name: str, term: int) -> str:
+    """Name of a compacted file, by that of its newest segment and the term of who compacts; 0: there are no terms."""
+    shard, epoch, number = name.rsplit("-", 2)
+    return f"{shard}.{term:010d}-{epoch}-{number}" if term else name
+
+
+def term_of(name: str) -> int | None:
+    """Epoch of the service that made an object of an archive's copy; None: its name does not tell.
+
+    Segments and checkpoints tell the epoch of their service, compacted files and their roll-ups who compacted.
+    """
+    folder, _, rest = name.partition("/")
+    if folder == CHECKPOINTS:
+        return int(epoch) if (epoch := rest.partition("-")[0]).isdigit() else None
+    found = _NAMED.search(rest) if folder in _OF_A_TERM else None
+    return None if found is None else int(found["term"] or found["epoch"])
 
 
 def age(name: str) -> tuple[int, int, str]:

@@ -59,10 +59,11 @@ class SegmentLog(Generic[Batch]):
         root: of the archive.
         shard: name of the service.
         copy: of the archive; with one, durable is what is in both places.
+        epoch: at the least, as a lease has it.
     """
 
-    def __init__(self, root: Path, shard: str, copy: Copy | None = None) -> None:
-        self._writer, self._copy = Writer(root, shard), copy
+    def __init__(self, root: Path, shard: str, copy: Copy | None = None, epoch: int = 0) -> None:
+        self._writer, self._copy = Writer(root, shard, epoch), copy
         self._next: _Load[Batch] = _Load()
         self._load: _Load[Batch] = _Load()  # what was handed over
         self._written: Future[None] | None = None

@@ -51,9 +51,10 @@ class Writer:
     Args:
         root: of the archive.
         shard: name of the service.
+        epoch: at the least, as a lease has it.
     """
 
-    def __init__(self, root: Path, shard: str) -> None:
+    def __init__(self, root: Path, shard: str, epoch: int = 0) -> None:
         self._root, self._shard, self._seq = root, shard, 0
         folders = [folder(root, kind) for kind in SCHEMAS]
         for inbox in folders:
@@ -66,7 +67,7 @@ class Writer:
         # Compacted rows are known by the names of their segments, so that these may not be used again either.
         named = [path for kind in SCHEMAS for path in (*paths(root, kind), *layout.compacted(root, kind))]
         used = [layout.age(path.name)[0] for path in named]
-        self._epoch = max([int(time.time()), *(epoch + 1 for epoch in used)])
+        self._epoch = max([epoch or int(time.time()), *(one + 1 for one in used)])
 
     @property
     def newest(self) -> layout.Cut:

@@ -28,12 +28,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--config", metavar="FILE", help="JSON; every setting has a default")
     parser.add_argument("--archive", metavar="DIR", type=Path, help="one service per archive; else the configuration's")
+    parser.add_argument(
+        "--standby", action="store_true", help="wait until the service with this copy is gone; go on as it"
+    )
     parser.add_argument("--weather", metavar="FILE", type=Path, help="Parquet of road weather to begin with")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve."""
+    from fleet_service.app.precompile import warm_up
     from fleet_service.app.service import Service
+    from fleet_service.shards.holding import hold
+    from fleet_service.shards.serving import standing_by
     from schemas.config import ServiceConfig, load
 
     stop = stop_on_signals()
@@ -43,11 +49,23 @@ def run(arguments: argparse.Namespace) -> int:
     root = arguments.archive or config.archive.path
     if root is None:
         raise InputError("archive", "is missing", "give --archive DIR, or archive.path in the configuration")
+    if arguments.standby:
+        config = config.model_copy(update={"standby": True})
     if arguments.weather is not None:
         config = config.model_copy(update={"weather": arguments.weather})
     try:
         log_line = line_logger(config.log, sys.stdout, service=config.name)
-        service = Service(config, root, log_line)
+        if config.standby:
+            warm_up()  # compiled when it is needed
+        with standing_by(config, stop) as signs:
+            holding = None if stop.is_set() else hold(config, root, stop, log_line, signs)
+        if holding is None:
+            return 0
+        try:
+            service = Service(config, root, log_line, holding)
+        except BaseException:
+            holding.close()
+            raise
     except OSError as error:
         problem = f"cannot use {error.filename} ({error.strerror})"
         raise InputError("archive", problem, "give a folder you may read and write") from error
@@ -58,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
     threading.Thread(target=_leave_at_last, args=(stop, stopped, service, log_line), daemon=True).start()
     service.run(stop)
     stopped.set()
-    return 0
+    return service.exit_code if holding.lease is not None else 0
 
 
 def _leave_at_last(

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import secrets
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Final
 
 import zenoh
 
+from schemas.config import ServiceConfig
 from schemas.errors import InputError
 from schemas.keys import Served
 from schemas.regions import overlap
-from schemas.runtime import tokens
+from schemas.runtime import tokens, zenoh_session
 
 GONE_S: Final = 5.0  # in which the token of a service that froze or lost its host falls: its lease is 3 s
 LOOK_S: Final = 0.1
@@ -31,13 +32,13 @@ def serving(
         name: of the service.
         regions: key expressions.
         stop: ends the wait for another's token to fall.
-        owns: whether a lease says that the regions are its own: then whoever says so too is to leave.
+        owns: whether a lease says that it is the one of this name: then another that says so too is to leave.
 
     Raises:
         InputError: another service serves one of them.
     """
     mine = frozenset(Served(region, name, secrets.token_hex(4)) for region in regions)
-    held = _claimed(session, mine, stop) if not owns else _declared(session, mine)
+    held = _claimed(session, mine, stop, name if owns else None)
     try:
         yield mine
     finally:
@@ -45,17 +46,18 @@ def serving(
             token.undeclare()
 
 
-def rivals(mine: frozenset[Served], there: set[Served]) -> list[Served]:
-    """Tokens of others for the same regions."""
-    return sorted(one for one in there - mine if any(overlap(one.region, own.region) for own in mine))
+def rivals(mine: frozenset[Served], there: set[Served], former: str | None = None) -> list[Served]:
+    """Tokens of others for the same regions, but for those of a `former` service."""
+    others = (one for one in there - mine if one.service != former)
+    return sorted(one for one in others if any(overlap(one.region, own.region) for own in mine))
 
 
 def _claimed(
-    session: zenoh.Session, mine: frozenset[Served], stop: threading.Event
+    session: zenoh.Session, mine: frozenset[Served], stop: threading.Event, former: str | None
 ) -> list[zenoh.LivelinessToken]:  # fmt: skip
     for _ in range(_TRIES):
         waited = 0.0
-        while others := rivals(mine, tokens.standing(session)):
+        while others := rivals(mine, tokens.standing(session), former):
             if waited > GONE_S or stop.wait(LOOK_S):
                 break
             waited += LOOK_S
@@ -63,7 +65,7 @@ def _claimed(
             problem = f"{others[0].region} is served by {others[0].service} already"
             raise InputError("regions", problem, "stop that service, or give each its own regions")
         held = _declared(session, mine)
-        if not rivals(mine, tokens.standing(session)):
+        if not rivals(mine, tokens.standing(session), former):
             return held
         for token in held:  # both began at once: the one that comes back first has it
             token.undeclare()
@@ -73,3 +75,20 @@ def _claimed(
 
 def _declared(session: zenoh.Session, mine: frozenset[Served]) -> list[zenoh.LivelinessToken]:
     return [session.liveliness().declare_token(token.key) for token in sorted(mine)]
+
+
+@contextmanager
+def standing_by(
+    config: ServiceConfig, stop: threading.Event
+) -> Iterator[tuple[Callable[[], bool], Callable[[str], bool]] | None]:
+    """Of a standby: whether it would be heard if it took over now, as it reaches a router, and whether the token of a
+    service stands. None: it is none, or was stopped before it reached a router."""
+    session = zenoh_session.open_session(config.zenoh, stop, config.name) if config.standby else None
+    if session is None:
+        yield None
+        return
+    with session, tokens.watched(session) as there:
+        yield (
+            lambda: bool(list(session.info.routers_zid())),
+            lambda name: any(one.service == name for one in there.here),
+        )

@@ -95,7 +95,7 @@ SHOWN_BELOW: Final = {
     "forget": {"--yes", "--put-to", "--config"},  # test_commands.py; archive/test_retention.py; app/test_copy.py
     "completion": {"shell"},
     "certs": {"--renew-days", "--revoke", "--dry-run"},  # enrolment/test_certificates.py
-    "run": {"--config", "--archive", "--weather"},
+    "run": {"--config", "--archive", "--weather", "--standby"},  # shards/test_successor.py
     "export": {  # client/test_datex.py, archive/test_iceberg.py
         *("--country", "--supplier", "--status", "--follow", "--connect", "--config"),
         *("--catalog", "--namespace", "--at"),

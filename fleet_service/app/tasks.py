@@ -1,0 +1,52 @@
+"""What other threads want the worker to do between two segments."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, wait
+from typing import Any, Final, TypeVar
+
+WAIT_S: Final = 0.2  # between two looks whether the service stops
+MOST_S: Final = 10.0  # for a good segment; a full disk gives none, and other jobs make room
+T = TypeVar("T")
+
+
+class Tasks:
+    """A queue of such work, true while there is some."""
+
+    def __init__(self) -> None:
+        self._queue: queue.SimpleQueue[tuple[Future[Any], Callable[[], object]]] = queue.SimpleQueue()
+
+    def __bool__(self) -> bool:
+        return not self._queue.empty()
+
+    def ask(self, work: Callable[[], T], stop: threading.Event) -> T | None:
+        """Have something done and return what that gave; None if stopped meanwhile.
+
+        Raises:
+            OSError: no segment could be written for too long.
+        """
+        done: Future[T] = Future()
+        self._queue.put((done, work))
+        deadline = time.monotonic() + MOST_S
+        while True:
+            wait([done], WAIT_S)
+            if done.done():
+                return done.result()
+            if (stop.is_set() or time.monotonic() > deadline) and done.cancel():
+                if stop.is_set():
+                    return None
+                raise OSError("no segment could be written for so long")
+
+    def do(self) -> None:
+        """Do all of it: by the worker."""
+        while self:
+            done, work = self._queue.get()
+            if done.set_running_or_notify_cancel():
+                try:
+                    done.set_result(work())
+                except Exception as error:  # noqa: BLE001 who wanted it is told
+                    done.set_exception(error)

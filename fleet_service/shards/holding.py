@@ -1,0 +1,173 @@
+"""What a service has for itself while it runs: the folder by a lock, and where it has a copy, the bucket by a lease."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import BinaryIO, Final
+
+from fleet_service.archive import terms
+from fleet_service.archive.bucket import CopyError, ObjectBucket
+from fleet_service.archive.copies import FOLDERS, Copy, copy_for
+from fleet_service.archive.files import lock
+from fleet_service.shards.lease import Lease, Standby, forget_holder, holder_of
+from schemas.config import ServiceConfig
+from schemas.errors import InputError
+
+AGAIN_S: Final = 1.0  # between two tries to reach the bucket
+REQUESTS: Final = 4  # of a lease that fit into its time
+
+
+class Holding:
+    """A locked archive, filled from its copy; `close` it.
+
+    Attributes:
+        copy: of the archive; None: it has none.
+        lease: of the copy; None: nobody else is to be told.
+    """
+
+    def __init__(self, lock_file: BinaryIO, copy: Copy | None, lease: Lease | None = None) -> None:
+        self._lock_file, self.copy, self.lease = lock_file, copy, lease
+
+    @property
+    def epoch(self) -> int:
+        """Of segments' names, at the least."""
+        return 0 if self.lease is None else self.lease.term.epoch
+
+    @property
+    def may_acknowledge(self) -> bool:
+        """Whether what is durable now will be known to whoever comes after this service."""
+        return self.lease is None or self.lease.fresh
+
+    @property
+    def lost(self) -> bool:
+        """Whether another has taken over."""
+        return self.lease is not None and self.lease.lost
+
+    def close(self) -> None:
+        """Let the next have it."""
+        if self.lease is not None:
+            self.lease.end()
+        if self.copy is not None:
+            self.copy.close()
+        self._lock_file.close()
+
+
+def alone(config: ServiceConfig, root: Path) -> Holding:
+    """An archive without a lease.
+
+    Raises:
+        InputError: another service holds it, or its copy cannot be used.
+        OSError: it cannot be read or written.
+    """
+    lock_file = lock(root)
+    try:
+        forget_holder(root)
+        return Holding(lock_file, copy_for(config, root))
+    except BaseException:
+        lock_file.close()
+        raise
+
+
+Signs = tuple[Callable[[], bool], Callable[[str], bool]]  # as of `serving.standing_by`
+
+
+def hold(
+    config: ServiceConfig, root: Path, stop: threading.Event, say: Callable[[str], None], signs: Signs | None = None
+) -> Holding | None:
+    """An archive with the lease of its copy, where it has one; None if stopped.
+
+    Args:
+        config: settings.
+        root: of the archive.
+        stop: ends the wait.
+        say: takes a line whenever there is something new to wait for.
+        signs: of a standby: whether it would be heard, and whether a service's token stands.
+
+    Raises:
+        InputError: another service holds folder or copy, or the copy is not usable as it is set.
+        OSError: the folder cannot be read or written.
+    """
+    url = config.archive.second
+    if url is None:
+        if signs is not None:
+            raise InputError("standby", "needs archive.copy", "name the bucket of the service that it is to follow")
+        return alone(config, root)
+    lock_file = lock(root)
+    try:
+        holding = _leased(config, root, stop, say, signs, lock_file)
+    except BaseException:
+        lock_file.close()
+        raise
+    if holding is None:
+        lock_file.close()
+    return holding
+
+
+def _leased(
+    config: ServiceConfig, root: Path, stop: threading.Event, say: Callable[[str], None], signs: Signs | None,
+    lock_file: BinaryIO,
+) -> Holding | None:  # fmt: skip
+    url, options = str(config.archive.second), config.archive.options
+    empty = not any((root / folder).exists() for folder in FOLDERS)
+    holder, known = holder_of(root, url)
+    lease = Lease(holder, ObjectBucket(url, options, config.lease_s / REQUESTS), config.name, config.lease_s)
+    copy = Copy(root, url, options)
+    mirrors = empty or known
+    standby = None if signs is None else Standby(*signs, copy.get_ahead if mirrors else lambda: None)
+    try:
+        while lease.wait(stop, say, copy.epoch, standby):
+            lease.keep()
+            if lease.succeeds and not mirrors:
+                raise InputError("archive.path", f"{root} is no archive of {url}", "give the service an empty folder")
+            copy.under(partial(_fresh, lease), lease.alone)
+            if _joined(config, copy, lease, stop, say if standby else None):
+                terms.note(root, lease.term.epoch)
+                return Holding(lock_file, copy, lease)
+            lease.end()
+            if not lease.lost:
+                break
+            lease = lease.again()
+    except CopyError as error:
+        _leave(lease, copy)
+        fix = "see that it is reached, and endpoint, region and credentials; start again, nothing is lost"
+        raise InputError("archive.copy", f"{url} cannot be used ({error})", fix) from error
+    except BaseException:
+        _leave(lease, copy)
+        raise
+    _leave(lease, copy)
+    return None
+
+
+def _fresh(lease: Lease) -> bool:
+    return lease.fresh
+
+
+def _leave(lease: Lease, copy: Copy) -> None:
+    lease.end()
+    copy.close()
+
+
+def _joined(
+    config: ServiceConfig, copy: Copy, lease: Lease, stop: threading.Event, say: Callable[[str], None] | None
+) -> bool:  # fmt: skip
+    """Let the folder become what the copy is; False if stopped, or another has the lease. A standby, which has `say`,
+    tries again while the bucket is away."""
+    said = ""
+    while not stop.is_set():
+        try:
+            copy.join(config.name, lease.term, succeeds=lease.succeeds)
+        except CopyError as error:
+            if lease.lost:
+                return False
+            if say is None:
+                raise
+            if str(error) != said:
+                say(f"waiting: the copy cannot be read ({error})")
+                said = str(error)
+            stop.wait(AGAIN_S)
+        else:
+            return True
+    return False

@@ -1,0 +1,248 @@
+"""A service that is gone, frozen or cut off is followed by another; what it acknowledged is there, once."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from fleet_service.archive import segments
+from fleet_service.archive.bucket import CopyError, ObjectBucket
+from fleet_service.archive.compaction import compact
+from fleet_service.archive.copies import Copy
+from fleet_service.archive.log import SegmentLog
+from fleet_service.shards.holding import Holding, alone, hold
+from fleet_service.shards.lease import Lease, holder_of
+from schemas.config import ServiceConfig, ZenohSettings
+from schemas.errors import InputError
+from schemas.wire import Batch, Kind
+from tests.buckets import BucketServer, bucket_server
+from tests.fleet_service.app.test_copy import BATCHES, PATIENCE_S, reports
+from tests.fleet_service.app.test_kill import archived, identities
+from tests.fleet_service.app.test_service import Fleet
+from tests.fleet_service.archive.rows import identities as rows_in
+from tests.fleet_service.archive.rows import rows_of
+from tests.standbys import Host, hosts, restored
+from tests.waiting import until
+
+
+@pytest.fixture
+def bucket(tmp_path: Path) -> Iterator[BucketServer]:
+    pytest.importorskip("obstore", reason="pip install 'gripmap[objects]'")
+    with bucket_server(tmp_path / "objects") as server:
+        yield server
+
+
+RESEND_S = 1.0
+
+
+def frozen(host: Host) -> None:
+    host.part.send(signal.SIGSTOP)
+
+
+GONE: dict[str, Callable[[Host], None]] = {
+    "killed": lambda host: host.part.kill(),
+    "stopped": lambda host: host.part.send(signal.SIGTERM),
+    "frozen": frozen,
+    "cut from the bucket": lambda host: host.to_bucket.cut(),
+    "cut from the routers": lambda host: host.to_router.cut(),
+}
+
+
+@pytest.mark.parametrize(
+    "how", [how if how == "killed" else pytest.param(how, marks=pytest.mark.campaign) for how in GONE]
+)
+def test_a_standby_goes_on_with_all_that_was_acknowledged(
+    router: ZenohSettings, session: zenoh.Session, bucket: BucketServer, tmp_path: Path, how: str
+) -> None:
+    fleet = Fleet(session)
+    before, during, after = (reports(0.8, n * BATCHES + 1, (n + 1) * BATCHES) for n in range(3))
+    with hosts(tmp_path, ["one", "two"], router.connect[0], bucket, lease_s=3.0) as (one, two):
+        one.part.start()
+        one.part.line_with("ready: ")
+        two.part.start()
+        two.part.line_with("standby: ")
+        until(driven(fleet, before), PATIENCE_S)
+        for sent in during[: len(during) // 2]:
+            fleet.publish(sent)
+        GONE[how](one)
+        two.part.line_with("ready: ")
+        until(driven(fleet, during), PATIENCE_S)
+        if how == "frozen":
+            one.part.send(signal.SIGCONT)
+        one.to_bucket.mend()
+        one.to_router.mend()
+        if how not in {"killed", "stopped"}:
+            assert one.part.wait(PATIENCE_S) == 1
+            assert one.said("followed: ")
+        one.part.start()  # and is the standby from now on, whose folder becomes what the bucket is
+        one.part.line_with("standby: ")
+        two.part.stop()
+        one.part.line_with("ready: ")
+        until(driven(fleet, after), PATIENCE_S)
+        assert one.part.stop() == 0
+    _whole(fleet, before + during + after, tmp_path / "one")
+    restored(tmp_path / "new", bucket)
+    _whole(fleet, before + during + after, tmp_path / "new")
+
+
+def driven(fleet: Fleet, sent: list[Batch]) -> Callable[[], bool]:
+    """Whether all is acknowledged; what is not is sent again each second, as spools do."""
+    last = [0.0]
+
+    def done() -> bool:
+        if time.monotonic() - last[0] < RESEND_S:
+            return not fleet.unsettled(sent)
+        last[0] = time.monotonic()
+        for one in fleet.unsettled(sent):
+            fleet.publish(one)
+        return False
+
+    return done
+
+
+def _whole(fleet: Fleet, sent: list[Batch], folder: Path) -> None:
+    found = archived(folder)
+    assert len(found) == len(set(found)) == 3 * len(sent)
+    assert sorted(found) == sorted(identities(fleet, folder))
+
+
+@pytest.mark.campaign
+def test_of_two_standbys_one_takes_over_and_the_other_waits_for_it(
+    router: ZenohSettings, session: zenoh.Session, bucket: BucketServer, tmp_path: Path
+) -> None:
+    fleet, sent = Fleet(session), reports(0.8, 1, BATCHES)
+    with hosts(tmp_path, ["one", "two", "three"], router.connect[0], bucket, lease_s=3.0) as (one, two, three):
+        one.part.start()
+        one.part.line_with("ready: ")
+        for host in (two, three):
+            host.part.start()
+            host.part.line_with("standby: ")
+        until(driven(fleet, sent), PATIENCE_S)
+        one.part.kill()
+        until(lambda: two.said("ready: ") or three.said("ready: "), PATIENCE_S)
+        first, second = (two, three) if two.said("ready: ") else (three, two)
+        until(lambda: second.said("standby: shard-0 is served under lease 2"), PATIENCE_S)
+        assert not second.said("ready: ")
+        first.part.kill()
+        second.part.line_with("ready: ")
+        assert second.part.stop() == 0
+    _whole(fleet, sent, second.root.parent)
+
+
+class Machine:
+    """A folder whose service is no process, so that it can be stopped between any two steps."""
+
+    def __init__(self, root: Path, bucket: BucketServer, name: str = "shard-0") -> None:
+        root.mkdir(exist_ok=True)
+        self.root = root
+        self.config = ServiceConfig.model_validate({"name": name, "lease_s": 1.0, "archive": bucket.settings})
+        held = hold(self.config, root, threading.Event(), print)
+        assert held is not None
+        self.holding: Holding = held
+        self.log: SegmentLog[int] = SegmentLog(root, name, held.copy, held.epoch)
+
+    @property
+    def copy(self) -> Copy:
+        assert self.holding.copy is not None
+        return self.holding.copy
+
+    def freeze(self) -> None:
+        """No renewal any more."""
+        assert self.holding.lease is not None
+        self.holding.lease._stop.set()
+
+    def write(self, seed: int) -> None:
+        self.log.add(Kind.OBSERVATION, rows_of(Kind.OBSERVATION, 5, seed), [seed])
+        assert self.log.flush() == [seed]
+
+    def close(self) -> None:
+        self.log.close()
+        self.holding.close()
+
+
+def acknowledges(one: Machine) -> bool:
+    return one.holding.may_acknowledge
+
+
+def test_what_a_frozen_service_had_under_way_counts_for_nothing(bucket: BucketServer, tmp_path: Path) -> None:
+    one = Machine(tmp_path / "one", bucket)
+    for seed in range(3):
+        one.write(seed)
+    assert acknowledges(one)
+    one.freeze()
+    two = Machine(tmp_path / "two", bucket)  # waits until the lease is old
+    assert not acknowledges(one)
+    before = rows_in(two.root, Kind.OBSERVATION)
+    assert len(before) == 15
+    # It wakes amid of everything: a segment, a compaction that is put, the deletes of what was compacted.
+    one.write(3)
+    assert not acknowledges(one)
+    compact(one.root)
+    with pytest.raises(CopyError):
+        one.copy.follow()
+    one.copy._may = lambda: True  # as if it had been frozen right behind the look at its lease
+    with pytest.raises(CopyError, match="another service has the lease"):
+        one.copy.follow()
+    names = bucket.objects()
+    assert any(name.startswith("observations/") for name in names)
+    assert sum(name.startswith("inbox/") for name in names) == 4  # nothing was deleted
+    compact(two.root)
+    two.copy.follow()
+    for root in (two.root, restored(tmp_path / "new", bucket)):
+        assert sorted(rows_in(root, Kind.OBSERVATION)) == sorted(before)
+    two.close()
+    again = Machine(tmp_path / "two", bucket)  # its start takes away what does not count
+    assert not [name for name in bucket.objects() if name.startswith("inbox/")]
+    again.close()
+    one.close()
+    back = Machine(tmp_path / "one", bucket)
+    assert sorted(rows_in(back.root, Kind.OBSERVATION)) == sorted(before)
+    assert not segments.paths(back.root, Kind.OBSERVATION)
+    back.close()
+
+
+def test_a_folder_that_was_served_without_its_bucket_is_not_made_what_the_bucket_is(
+    bucket: BucketServer, tmp_path: Path
+) -> None:
+    one = Machine(tmp_path / "one", bucket)
+    one.write(0)
+    one.close()
+    alone(ServiceConfig(), one.root).close()
+    two = Machine(tmp_path / "two", bucket)
+    two.close()
+    with pytest.raises(InputError, match="is no archive of"):
+        Machine(one.root, bucket)
+    assert len(rows_in(one.root, Kind.OBSERVATION)) == 5
+
+
+def test_a_lease_that_lives_is_not_taken_by_who_is_no_standby(bucket: BucketServer, tmp_path: Path) -> None:
+    one = Machine(tmp_path / "one", bucket)
+    with pytest.raises(InputError, match="is served by shard-0"):
+        Machine(tmp_path / "two", bucket)
+    one.close()
+    Machine(tmp_path / "two", bucket).close()  # it was given free
+
+
+def test_a_copy_of_a_folder_is_somebody_else(tmp_path: Path) -> None:
+    one, two = tmp_path / "one", tmp_path / "two"
+    one.mkdir()
+    two.mkdir()
+    first, known = holder_of(one, "s3://bucket/a")
+    assert not known
+    assert holder_of(one, "s3://bucket/a") == (first, True)
+    (two / "holder.json").write_bytes((one / "holder.json").read_bytes())
+    assert holder_of(two, "s3://bucket/a")[0] != first
+    assert holder_of(one, "s3://bucket/b") != (first, True)
+
+
+def test_one_of_many_takes_a_lease(bucket: BucketServer) -> None:
+    stores = ObjectBucket(bucket.url, bucket.store, 5.0)
+    leases = [Lease(f"holder-{n}", stores, "shard-0", 5.0) for n in range(3)]
+    taken = [lease._take(None, lambda: 0, threading.Event()) for lease in leases]
+    assert taken == [True, False, False]

@@ -1,0 +1,121 @@
+"""Two services, or three, that follow each other: real processes, a real S3 server, and links that can be cut."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from fleet_service.archive.copies import Copy
+from tests.buckets import BucketServer
+from tests.faults.processes import Part
+
+
+class Link:
+    """A port that leads to another one of this machine; `cut`, it takes connections and passes nothing on."""
+
+    def __init__(self, port: int) -> None:
+        self._to, self._open = port, threading.Event()
+        self._open.set()
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.port = int(self._server.getsockname()[1])
+        self._ends: list[socket.socket] = []
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def cut(self) -> None:
+        """Nothing passes."""
+        self._open.clear()
+
+    def mend(self) -> None:
+        """What waited goes on."""
+        self._open.set()
+
+    def close(self) -> None:
+        """Be gone."""
+        for end in [self._server, *self._ends]:
+            with suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+            end.close()
+        self._open.set()
+
+    def _accept(self) -> None:
+        with suppress(OSError):
+            while True:
+                near, _ = self._server.accept()
+                try:
+                    far = socket.create_connection(("127.0.0.1", self._to), 5.0)
+                except OSError:
+                    near.close()
+                    continue
+                far.settimeout(None)
+                self._ends += [near, far]
+                for ends in ((near, far), (far, near)):
+                    threading.Thread(target=self._pass, args=ends, daemon=True).start()
+
+    def _pass(self, source: socket.socket, sink: socket.socket) -> None:
+        with suppress(OSError):
+            while data := source.recv(1 << 16):
+                self._open.wait()
+                sink.sendall(data)
+        with suppress(OSError):
+            sink.shutdown(socket.SHUT_WR)
+
+
+class Host:
+    """A machine with a service on it, its way to the routers and its way to the bucket."""
+
+    def __init__(self, folder: Path, router: str, bucket: BucketServer, **settings: Any) -> None:  # noqa: ANN401
+        folder.mkdir(parents=True)
+        self.root = folder / "archive"
+        self.to_router = Link(int(router.rpartition(":")[2]))
+        self.to_bucket = Link(int(bucket.store["endpoint"].rpartition(":")[2]))
+        store = {**bucket.store, "endpoint": f"http://127.0.0.1:{self.to_bucket.port}"}
+        told = {
+            "zenoh": {"connect": [f"tcp/127.0.0.1:{self.to_router.port}"]}, "standby": True, "segment_s": 0.1,
+            "archive": {"path": str(self.root), "copy": bucket.url, "store": store}, **settings,
+        }  # fmt: skip
+        config = folder / "service.json"
+        config.write_text(json.dumps(told))
+        words = ["-m", "fleet_service.cli", "run", "--config", str(config)]
+        self.part = Part("service", [sys.executable, *words], folder)
+
+    def said(self, start: str) -> bool:
+        """Whether a line of the present start begins so."""
+        return any(line.startswith(start) for line in self.part.lines())
+
+    def close(self) -> None:
+        """End whatever is left of it."""
+        self.to_router.close()
+        self.to_bucket.close()
+        self.part.send(signal.SIGCONT)
+        self.part.kill()
+
+
+@contextmanager
+def hosts(
+    folder: Path, names: Sequence[str], router: str, bucket: BucketServer, **settings: Any  # noqa: ANN401
+) -> Iterator[list[Host]]:  # fmt: skip
+    """Hosts, whose services are not started; they are gone after the block."""
+    with ExitStack() as stack:
+        made = [Host(folder / name, router, bucket, **settings) for name in names]
+        for host in made:
+            stack.callback(host.close)
+        yield made
+
+
+def restored(folder: Path, bucket: BucketServer) -> Path:
+    """The archive that an empty disk gets from the bucket; nothing is changed there."""
+    root = folder / "archive"
+    root.mkdir(parents=True)
+    copy = Copy(root, bucket.url, bucket.store)
+    try:
+        copy.get_ahead()
+    finally:
+        copy.close()
+    return root
