@@ -128,9 +128,9 @@ SETTINGS: Final[dict[str, tuple[object, Show]]] = {
     "put_s": (0.1, of_service(turns)),
 }
 # Where the network or the operator sees them: zenoh and regions where two services share the world, in
-# app/test_service.py, the archive and its copy in app/test_copy.py, the others in tests/schemas/runtime and
-# app/test_metrics.py.
-SEEN_OUTSIDE: Final = {"zenoh", "regions", "archive", "metrics_port", "metrics_host", "log"}
+# app/test_service.py, the archive and its copy in app/test_copy.py, the lease and who waits for it in
+# shards/test_successor.py, the others in tests/schemas/runtime and app/test_metrics.py.
+SEEN_OUTSIDE: Final = {"zenoh", "regions", "archive", "standby", "lease_s", "metrics_port", "metrics_host", "log"}
 
 
 def test_every_setting_of_the_service_is_in_a_table() -> None:

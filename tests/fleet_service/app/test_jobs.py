@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 import zenoh
 
-from fleet_service.app import engine as engine_module
+from fleet_service.app import tasks
 from fleet_service.app.clock import SteadyClock
 from fleet_service.app.engine import Engine
 from fleet_service.app.jobs import Job, Upkeep, archive_jobs
@@ -87,7 +87,7 @@ def test_a_copy_of_a_days_folder_is_none_of_the_archive(tmp_path: Path) -> None:
 def test_a_checkpoint_that_no_good_segment_comes_for_does_not_keep_the_jobs_that_make_room(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(engine_module, "CHECKPOINT_MOST_S", 0.05)
+    monkeypatch.setattr(tasks, "MOST_S", 0.05)
     with closing(Engine(ServiceConfig(), tmp_path)) as engine, pytest.raises(OSError, match="no segment"):
         engine.checkpoint(threading.Event())  # the worker, which nobody is here, flushes nothing
 

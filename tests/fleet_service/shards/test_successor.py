@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import zenoh
@@ -246,3 +247,22 @@ def test_one_of_many_takes_a_lease(bucket: BucketServer) -> None:
     leases = [Lease(f"holder-{n}", stores, "shard-0", 5.0) for n in range(3)]
     taken = [lease._take(None, lambda: 0, threading.Event()) for lease in leases]
     assert taken == [True, False, False]
+
+
+@pytest.mark.parametrize("lease_s", [4.0, 40.0])
+def test_half_a_lease_after_a_renewal_began_nothing_is_acknowledged_any_more(
+    bucket: BucketServer, monkeypatch: pytest.MonkeyPatch, lease_s: float
+) -> None:
+    now = [100.0]
+    clock = SimpleNamespace(monotonic=lambda: now[0], time=time.time)
+    monkeypatch.setattr("fleet_service.shards.lease.time", clock)
+    lease = Lease("one", ObjectBucket(bucket.url, bucket.store, 5.0), "shard-0", lease_s)
+    fresh = [lease.fresh]
+    assert lease.wait(threading.Event(), print, lambda: 0, None)
+    for _ in range(2):
+        for share in (0.49, 0.02):
+            now[0] += share * lease_s
+            fresh.append(lease.fresh)
+        lease.renew()
+    assert fresh == [False, True, False, True, False]
+    assert lease.fresh
