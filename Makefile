@@ -8,7 +8,7 @@ PAPERS := .venv/.papers
 TESTS := $(BIN)/python -m pytest -q --numprocesses $$(( $$(getconf _NPROCESSORS_ONLN) + 1 )) --dist loadfile
 export PYTHONDONTWRITEBYTECODE :=  # what was parsed once is kept: tests start hundreds of processes
 
-.PHONY: setup demo test test-all test-shuffled check package docs lint types faults faults-quick soak bench tune proto lock clean analytics-bench spark-test usability figures roads-bench page-bench browser-test batch-bench
+.PHONY: setup demo test test-all test-shuffled check package docs lint types faults faults-quick cluster-faults soak bench tune proto lock clean analytics-bench spark-test usability figures roads-bench page-bench ahead-bench browser-test batch-bench
 
 setup: $(STAMP)  ## make .venv and install everything, pinned
 
@@ -55,10 +55,10 @@ check: lint types test-all package faults-quick  ## what CI runs
 package: setup  ## wheel and sdist, installed in a fresh environment outside the repository and used there
 	$(BIN)/python -m tests.packaging
 
-faults: setup  ## the fault campaigns, half an hour; writes .faults/figures.json
+faults: setup  ## the fault campaigns, hours; writes .faults/figures.json
 	$(BIN)/python -m tests.faults
 
-faults-quick: setup  ## the same mechanisms in two minutes
+faults-quick: setup  ## the same mechanisms in three minutes
 	$(BIN)/python -m tests.faults --quick
 
 roads-bench: setup  ## how often cells are joined to the right link, against SUMO's traffic; writes .roads/figures.json
@@ -68,11 +68,18 @@ page-bench: setup  ## the live page measured, beside MapLibre in the same browse
 	$(BIN)/python -m tests.npm axe-core maplibre-gl
 	$(BIN)/python -m tests.benchmarks.page
 
+ahead-bench: setup  ## cars that listen: warned in time, cost, delay, the map as a prior, towns that listen; .evaluation
+	$(BIN)/edge-agent evaluate --only ahead --out .evaluation/ahead; first=$$?; \
+	$(BIN)/python -m deploy.listening --out .evaluation/listening && exit $$first
+
 usability: setup  ## the first hour of a new user as figures; wants chromium and unshare; writes .usability/figures.json
 	$(BIN)/python -m tests.usability
 
 figures: setup  ## keep what the campaigns' last runs measured in deploy/figures, and write the READMEs' numbers anew
 	$(BIN)/python -m tests.usability.kept
+
+cluster-faults: setup  ## services that follow each other, a hundred times; writes .faults/cluster/figures.json
+	$(BIN)/python -m tests.faults.cluster
 
 soak: setup  ## half an hour of steady load: does anything grow?
 	$(BIN)/python -m tests.faults.soak
@@ -81,7 +88,8 @@ bench: setup  ## cost of each part, side by side; writes .bench/figures.json
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[bench]'
 	$(BIN)/python -m tests.benchmarks
 
-batch-bench: setup  ## rows of the Iceberg tables beside those of the archive; writes .batch/figures.json
+batch-bench: setup  ## Iceberg tables beside the archive, Spark beside this machine; wants a Java; writes .batch/figures.json
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[spark]'
 	$(BIN)/python -m tests.benchmarks.batch
 
 analytics-bench: setup  ## archive and analytics on ten million rows, Spark beside; writes .analytics/figures.json
@@ -90,7 +98,7 @@ analytics-bench: setup  ## archive and analytics on ten million rows, Spark besi
 
 spark-test: setup  ## Spark beside DuckDB and beside this machine; installs it, wants a Java
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[spark]'
-	$(BIN)/python -m pytest -q -m long tests/fleet_service/analytics/test_spark.py tests/fleet_service/analytics/test_spark_rebuild.py
+	$(BIN)/python -m pytest -q -m long tests/fleet_service/analytics/test_spark.py tests/fleet_service/analytics/test_spark_rebuild.py tests/edge_agent/app/test_spark_replay.py
 
 tune: setup  ## the ant colony over the memberships; writes the shipped file anew
 	$(BIN)/edge-agent tune --out edge_agent/app/tuned/aco-fckf.json

@@ -32,11 +32,11 @@ def main(words: list[str]) -> int:
     names = [name for name, _ in known_estimators() if name != DEFAULT] if papers else [DEFAULT]
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count()) as workers:
         service = [] if papers else [workers.submit(_run, folder, SERVICE)]
-        said = _run(folder, AGENT, "simulate", *DRIVE)
+        lines = _run(folder, AGENT, "simulate", *DRIVE)
         replays = [workers.submit(_run, folder, AGENT, "replay", *_estimate(name)) for name in names]
         for done in (*service, *replays):
-            said += done.result()
-    print(f"compiled in {time.monotonic() - began:.0f} s", *said, sep="\n", flush=True)
+            lines += done.result()
+    print(f"compiled in {time.monotonic() - began:.0f} s", *lines, sep="\n", flush=True)
     return 0
 
 

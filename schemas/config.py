@@ -128,7 +128,9 @@ class ServiceConfig(MonitoringSettings):
         default=1, ge=1, description="cells are shown of so many vehicles; from 2 on, of the last 12 to 24 h (privacy)"
     )
     clock_ahead_s: Positive = Field(default=30.0, description="records further in the future are refused")
-    oldest_s: Positive = Field(default=30 * 86400.0, description="records older than this are refused")
+    oldest_s: Positive = Field(
+        default=30 * 86400.0, le=30 * 86400.0, description="records older than this are refused, 30 days at the most"
+    )  # a start reads 31 days back for what it holds: an older batch would be taken twice
     compact_s: float = Field(
         default=3600.0, ge=0.0, allow_inf_nan=False, description="time between two compactions of the archive; 0: never"
     )

@@ -15,6 +15,8 @@ from schemas.errors import InputError
 
 ROOT: Final = "gripmap/v1"
 SERVES: Final = f"{ROOT}/serves"  # tokens of who serves which region, see `Served`
+CLAIMS: Final = f"{ROOT}/claims"  # likewise of who has it for itself, from before it answers until it does no more
+WAITS: Final = f"{ROOT}/waits"  # likewise of who stands by for it
 _ALL: Final = "all"
 _CHUNKS: Final = (4, 3, 3, 4)
 
@@ -136,18 +138,22 @@ class Served(NamedTuple):
     @property
     def key(self) -> str:
         """The token: `gripmap/v1/serves/<region>/<service>/<start>`, with `all` for `*`, which no key may have."""
-        return f"{SERVES}/{self.region.replace('*', _ALL)}/{self.service}/{self.start}"
+        return self.below(SERVES)
+
+    def below(self, root: str) -> str:
+        """The token below another root: CLAIMS, or WAITS, where a standby says for which region it waits."""
+        return f"{root}/{self.region.replace('*', _ALL)}/{self.service}/{self.start}"
 
 
-def parse_served(key: str) -> Served:
+def parse_served(key: str, root: str = SERVES) -> Served:
     """Read such a token.
 
     Raises:
         InputError: it is none.
     """
-    *found, service, start = ["", "", *key.removeprefix(f"{SERVES}/").split("/")]
+    *found, service, start = ["", "", *key.removeprefix(f"{root}/").split("/")]
     region = "/".join(found[2:]).replace(_ALL, "*")
-    if not key.startswith(f"{SERVES}/") or not re.fullmatch(REGION_PATTERN, region):
+    if not key.startswith(f"{root}/") or not re.fullmatch(REGION_PATTERN, region):
         raise InputError("key", f"{key[:80]!r} names no service's region", "see `Served`")
     return Served(region, service, start)
 

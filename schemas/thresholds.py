@@ -3,6 +3,7 @@
 EXCITED_SHARE       share of μ that must be used for a reading of μ to be more than a lower bound (contract)
 UTILISED_WINDOW_S   `mu_utilised` is the largest grip used within this time [s] (contract)
 SLIPPERY_MU         slippery is μ below this: packed snow has .2–.35, wet asphalt .5–.8 (Pacejka 2012, ch. 1)
+SURFACES            kinds of road by their μ: above and up to; the interval is judged on each of its own
 Z_95                95 % quantile of the standard normal: half a 90 % interval in standard deviations
 GRAVITY             [m/s²], rounded; standard gravity is 9.80665 (ISO 80000-3)
 EARTH_RADIUS_M      [m] of the sphere that Web Mercator tiles are cut from: WGS 84, semi-major axis
@@ -19,6 +20,7 @@ from typing import Final
 EXCITED_SHARE: Final = 0.6
 UTILISED_WINDOW_S: Final = 1.0
 SLIPPERY_MU: Final = 0.4
+SURFACES: Final = {"ice": (0.0, 0.2), "snow": (0.2, 0.45), "wet": (0.45, 0.75), "dry": (0.75, 2.0)}
 Z_95: Final = NormalDist().inv_cdf(0.95)
 GRAVITY: Final = 9.81
 EARTH_RADIUS_M: Final = 6_378_137.0

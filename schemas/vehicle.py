@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -11,6 +12,10 @@ from schemas.config import explain
 from schemas.errors import InputError
 
 Metres = Annotated[float, Field(gt=0.0, lt=20.0, allow_inf_nan=False)]
+# Radius of gyration about the vertical axis over the wheelbase: .43 to .5 of cars (Heydinger et al., SAE 1999-01-1336).
+# A mass in tonnes makes it thirty times that.
+LEAST_GYRATION: Final = 0.1
+MOST_GYRATION: Final = 2.0
 
 
 Spread = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -80,11 +85,21 @@ def load_vehicle(path: Path | str) -> Vehicle:
     """Read a vehicle file (JSON).
 
     Raises:
-        InputError: the file cannot be read, a field is missing or out of range; names the field and the fix.
+        InputError: the file cannot be read, a field is missing or out of range, or mass and yaw inertia are not of one
+            vehicle; names the field and the fix.
     """
     try:
-        return Vehicle.model_validate_json(Path(path).read_bytes())
+        vehicle = Vehicle.model_validate_json(Path(path).read_bytes())
     except OSError as error:
         raise InputError("vehicle", f"cannot read {path} ({error.strerror})", "name a vehicle file") from error
     except ValidationError as error:
         raise explain(error, f"vehicle file {path}") from error
+    wheelbase = vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle
+    gyration = math.sqrt(vehicle.yaw_inertia / vehicle.mass)
+    if not LEAST_GYRATION < gyration / wheelbase < MOST_GYRATION:
+        problem = (
+            f"{vehicle.mass:g} with yaw_inertia {vehicle.yaw_inertia:g} has a radius of gyration of {gyration:.3g} m"
+        )
+        fix = f"give kg and kg m^2: that of cars is half the wheelbase, here {wheelbase:.3g} m"
+        raise InputError("mass", problem, fix)
+    return vehicle

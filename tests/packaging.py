@@ -21,15 +21,15 @@ from tests.house import ROOT
 FIRST_USE = """
 import gripmap
 assert {"schemas", "edge_agent", "fleet_service", "deploy"} == set(gripmap.PACKAGES)
-import edge_agent, fleet_service, schemas
+import deploy, edge_agent, fleet_service, schemas
 from importlib.metadata import metadata
 about = metadata("gripmap")
 assert about["License-Expression"] == "Apache-2.0" and about["Summary"] and about["Description"], about
 from pathlib import Path
-for package in (schemas, edge_agent, fleet_service):
+for package in (schemas, edge_agent, fleet_service, deploy):
     assert (Path(package.__file__).parent / "py.typed").is_file(), package
 """
-HIDING = "import gripmap"
+HIDING = {"schemas": ("gripmap", "edge_agent", "fleet_service"), "deploy": ("gripmap",)}  # what says so
 VERSIONS = ("3.11", "3.12", "3.13")
 WORKS = "import ensurepip, sys, venv; print('%d.%d' % sys.version_info[:2])"
 
@@ -102,14 +102,17 @@ def use(python: str, wheel: Path, folder: Path) -> None:
         folder,
     )
     run([scripts / "fleet-service", "--help"], folder)
-    own = folder / "own"
-    (own / "schemas").mkdir(parents=True)
-    (own / "schemas" / "__init__.py").touch()
-    hidden = subprocess.run(
-        [scripts / "python", "-c", HIDING], cwd=own, capture_output=True, text=True, check=False, timeout=60
-    )
-    if hidden.returncode == 0 or str(own / "schemas") not in hidden.stderr or "rename it" not in hidden.stderr:
-        raise SystemExit(f"a package `schemas` of the user's own is not named: {hidden.stderr}")
+    for name, imports in HIDING.items():
+        own = folder / f"own-{name}" / name
+        own.mkdir(parents=True)
+        (own / "__init__.py").touch()
+        for module in imports:
+            hidden = subprocess.run(
+                [scripts / "python", "-c", f"import {module}"],
+                cwd=own.parent, capture_output=True, text=True, check=False, timeout=60,
+            )  # fmt: skip
+            if hidden.returncode == 0 or str(own) not in hidden.stderr or "rename it" not in hidden.stderr:
+                raise SystemExit(f"a package `{name}` of the user's own is not named: {hidden.stderr}")
 
 
 def run(command: list[str | Path], folder: Path) -> None:

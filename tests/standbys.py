@@ -32,6 +32,11 @@ class Link:
         """Nothing passes."""
         self._open.clear()
 
+    @property
+    def is_cut(self) -> bool:
+        """Whether it is cut."""
+        return not self._open.is_set()
+
     def mend(self) -> None:
         """What waited goes on."""
         self._open.set()
@@ -70,7 +75,9 @@ class Link:
 class Host:
     """A machine with a service on it, its way to the routers and its way to the bucket."""
 
-    def __init__(self, folder: Path, router: str, bucket: BucketServer, **settings: Any) -> None:  # noqa: ANN401
+    def __init__(
+        self, folder: Path, router: str, bucket: BucketServer, module: str = "fleet_service.cli", **settings: Any  # noqa: ANN401
+    ) -> None:  # fmt: skip
         folder.mkdir(parents=True)
         self.root = folder / "archive"
         self.to_router = Link(int(router.rpartition(":")[2]))
@@ -82,7 +89,7 @@ class Host:
         }  # fmt: skip
         config = folder / "service.json"
         config.write_text(json.dumps(told))
-        words = ["-m", "fleet_service.cli", "run", "--config", str(config)]
+        words = ["-m", module, "run", "--config", str(config)]
         self.part = Part("service", [sys.executable, *words], folder)
 
     def said(self, start: str) -> bool:
@@ -99,11 +106,13 @@ class Host:
 
 @contextmanager
 def hosts(
-    folder: Path, names: Sequence[str], router: str, bucket: BucketServer, **settings: Any  # noqa: ANN401
+    folder: Path, names: Sequence[str], router: str, bucket: BucketServer, *, named: bool = False,
+    **settings: Any,  # noqa: ANN401
 ) -> Iterator[list[Host]]:  # fmt: skip
-    """Hosts, whose services are not started; they are gone after the block."""
+    """Hosts, whose services are not started, each of its own name if `named`; they are gone after the block."""
     with ExitStack() as stack:
-        made = [Host(folder / name, router, bucket, **settings) for name in names]
+        own = [{"name": name} if named else {} for name in names]
+        made = [Host(folder / name, router, bucket, **settings, **one) for name, one in zip(names, own, strict=True)]
         for host in made:
             stack.callback(host.close)
         yield made

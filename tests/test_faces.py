@@ -47,6 +47,19 @@ def test_importing_a_face_loads_nothing_heavy() -> None:
     assert subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True).stdout == "[]\n"
 
 
+@pytest.mark.parametrize("face", ["gripmap", "edge_agent.estimators", "fleet_service.client"])
+def test_a_package_of_ones_own_that_hides_ours_is_named(tmp_path: Path, face: str) -> None:
+    own = tmp_path / "schemas" / "__init__.py"
+    own.parent.mkdir()
+    own.touch()
+    done = subprocess.run(
+        [sys.executable, "-c", f"import {face}"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith(f"ImportError: schemas: {own} stands where"), done.stderr
+    assert "rename it" in last
+
+
 def test_a_log_is_estimated_in_three_lines_as_the_command_does(tmp_path: Path) -> None:
     log, car = tmp_path / "x.parquet", tmp_path / "x.json"
     assert main(["simulate", "slalom", "--duration", "2", "--out", str(log), "--vehicle-out", str(car)]) == 0

@@ -35,6 +35,10 @@ def test_every_campaign_owes_figures_of_the_table_and_none_is_owed_twice() -> No
     assert len(owed) == len(set(owed))
 
 
+def test_every_campaign_owes_a_figure_of_what_it_did_so_that_none_holds_when_nothing_happened() -> None:
+    assert [one.name for one in CAMPAIGNS if not any(BARS[name].better == "more" for name in one.owes)] == []
+
+
 def test_a_figure_that_is_owed_and_not_given_does_not_hold(tmp_path: Path) -> None:
     def forgetful(site: Site) -> list[Figure]:
         return [figure("faults.kill.doubled", 0)]

@@ -44,7 +44,7 @@ def test_the_real_minute_comes_onto_the_map_under_three_names(minute: tuple[Cell
 
 
 @pytest.mark.xfail(
-    reason="pulling away up 3 degrees, the default estimator reads ice for a second: one cell, one alert"
+    reason="pulling away up 3 degrees, the default estimator reads ice for a second: one cell, one alert", strict=True
 )
 @pytest.mark.timeout(900)
 def test_a_dry_road_raises_no_alert(minute: tuple[Cells, list[str]]) -> None:

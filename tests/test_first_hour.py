@@ -26,7 +26,7 @@ from tests.waiting import until
 
 
 def test_a_mistake_in_a_recording_is_mentioned_by_replay_and_a_sound_one_passes_in_silence(tmp_path: Path) -> None:
-    assert unnoticed(tmp_path, ["a_y flipped", "yaw rate in deg/s"], 9000) == []
+    assert unnoticed(tmp_path, ["a_y flipped", "yaw rate in deg/s", "mass in tonnes"], 9000) == []
 
 
 def test_two_cars_of_one_shipped_configuration_have_an_outbox_each() -> None:

@@ -60,8 +60,25 @@ The observations, as any Parquet reader sees them:
                     from '{folder}/archive/observations/*/*/*.parquet' where value group by sector"))""")
 
 
+def report(
+    folder: Path, comparison: compare.MapComparison, measured: list[figures.Figure], grip: compare.LostGrip, seed: int
+) -> list[figures.Figure]:
+    """Write and print all figures, and draw the map beside the truth, with who lost grip; returns the figures."""
+    found = [*measured, *grip.figures()]
+    figures.write(folder / "figures.json", "demo", [seed], found)
+    picture.draw(comparison, folder / "map.png", grip)
+    page.write(comparison, found, folder / "map.html")
+    table = figures.markdown(found)
+    print(f"\n{grip.line()}\n\n{table}\n\npicture {folder}/map.png, page {folder}/map.html, ", end="")
+    print(f"figures {folder}/figures.json", flush=True)
+    return found
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the demo; exit code 1 where a bar does not hold."""
+    """Run the demo; exit code 1 where a bar does not hold that a promise or this machine's part in it has.
+
+    How soon the first alert comes is a goal: one that is missed is said, in figures and README, and no failed demo.
+    """
     parser = argparse.ArgumentParser(prog="make demo", description="From wheels to map on this machine.")
     parser.add_argument("--vehicles", type=int, default=36, help="simulated vehicles (default 36)")
     parser.add_argument("--duration", type=float, default=150.0, help="seconds of driving (default 150)")
@@ -89,20 +106,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         show(FOLDER, endpoint, comparison)
         listener.close()
         wall_s = time.monotonic() - began
-        found = compare.figures(comparison, visits, listener.alerts, changed_ns, counts, FOLDER / "archive", wall_s)
-        figures.write(FOLDER / "figures.json", "demo", [args.seed], found)
-        picture.draw(comparison, FOLDER / "map.png")
-        page.write(comparison, found, FOLDER / "map.html")
+        measured = compare.figures(comparison, visits, listener.alerts, changed_ns, counts, FOLDER / "archive", wall_s)
+        grip = compare.lost_grip(visits, listener.alerts, changed_ns, args.warned)
+        found = report(FOLDER, comparison, measured, grip, args.seed)
         if args.screenshot is not None:
             screenshot.take(address, args.screenshot)
-        table = figures.markdown(found)
-        print(
-            f"\n{table}\n\npicture {FOLDER}/map.png, page {FOLDER}/map.html, figures {FOLDER}/figures.json", flush=True
-        )
         if args.stay:
             print(f"\n{address} stays until Ctrl-C; the truth can be laid over it.", flush=True)
             stop_on_signals().wait()
-    return 0 if all(figure.holds for figure in found) else 1
+    return 0 if all(figure.holds for figure in found if figure.name != compare.DELAY) else 1
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ def draw(comparison: MapComparison, path: Path, grip: LostGrip | None = None) ->
     truth.set_title("truth")
     if grip is not None and len(grip.cell):
         _mark(truth, grip, cells["cell"].to_numpy())
-    found.set_title(f"map: median (hatched: {UNKNOWN})")
+    found.set_title(f"map: median\n(hatched: {UNKNOWN})", fontsize="medium")
     width.set_title("map: width of the 90 % interval")
     bar = figure.colorbar(colours, ax=found, label=f"{MU}, the darker the more slippery", shrink=0.8)
     bar.set_ticks(list(SURFACES.values()), labels=[f"{mu:g} {name}" for name, mu in SURFACES.items()])
@@ -43,13 +43,14 @@ def draw(comparison: MapComparison, path: Path, grip: LostGrip | None = None) ->
 
 
 def _mark(axes: Axes, grip: LostGrip, drawn: IntArray) -> None:
-    """Passes over the new ice: warned drivers left of their cell's middle, others right of it; crossed where lost."""
+    """Passes over the new ice: circles of warned drivers, squares of others; black where grip was lost, else white."""
     shapes = cell_shapes(np.concatenate([drawn, grip.cell]))[len(drawn) :]  # in the axes of what is drawn
     x, y = shapes.mean(axis=1).T
     side = np.ptp(shapes[0, :, 0])
-    for warned, name, beside in ((True, "warned", -0.25), (False, "not warned", 0.25)):
-        for lost, word, mark in ((True, "lost grip", "x"), (False, "kept it", "o")):
+    for warned, name, mark, beside in ((True, "warned", "o", -0.25), (False, "not warned", "s", 0.25)):
+        for lost, word, fill in ((True, "lost grip", "black"), (False, "kept it", "white")):
             rows = (grip.warned == warned) & (grip.lost == lost)
             label = f"{name}, {word}: {int(rows.sum())}"
-            axes.scatter(x[rows] + beside * side, y[rows], marker=mark, s=30, color="black", label=label)
+            where = x[rows] + beside * side, y[rows]
+            axes.scatter(*where, marker=mark, s=30, facecolor=fill, edgecolor="black", label=label)
     axes.legend(loc="lower right", fontsize=7)

@@ -16,6 +16,7 @@ from schemas.wire import Alert
 from schemas.wire.tile import decode_tile
 
 AHEAD_OF_TIME_S: Final = 60.0  # by which the service's clock may be ahead of the car's
+OLDEST_S: Final = 1e8  # three years: no cell is kept so long, and nanoseconds do not overflow
 MOST_TILE_BYTES: Final = 4 << 20  # a tile with every cell and sector of a dense city is 3 MB
 SLACK: Final = 1e-3  # single precision, and quantiles to the ends of their bins
 _BASIS: Final = {name: number for number, name in enumerate(BASES)}
@@ -32,21 +33,22 @@ def heard_cells(key: str, payload: bytes, now: int) -> tuple[int, HeardCells]:
         raise WireError("tile", f"{len(payload)} bytes", f"ask for less than {MOST_TILE_BYTES}")
     table = decode_tile(payload)
     names = ("cell", "sector", "vehicles", "last_time")
-    if any(table[name].null_count for name in (*names, "mu_lower", "mu_upper", "p_slippery", "basis")):
+    if any(table[name].null_count for name in (*names, "mu_lower", "mu_upper", "p_slippery", "age_s", "basis")):
         raise WireError("tile", "has holes", "send every needed column whole")
     cell, sector, vehicles, last = (_whole(table, name) for name in names)
-    lower, mu, upper, p = (_real(table, name) for name in ("mu_lower", "mu", "mu_upper", "p_slippery"))
+    lower, mu, upper, p, age = (_real(table, name) for name in ("mu_lower", "mu", "mu_upper", "p_slippery", "age_s"))
     basis = np.array([_BASIS.get(str(name), -1) for name in table["basis"].to_pylist()], np.int64)
-    said = np.isfinite(mu)
+    measured = np.isfinite(mu)
     wrong = {
         "cell": grid.tile_of(cell) != tile,
         "sector": (sector < 0) | (sector >= grid.SECTORS),
         "vehicles": vehicles < 1,
         "last_time": (last <= 0) | (last > now + AHEAD_OF_TIME_S * NS),
-        "basis": (basis < BOUND) | (said == (basis == BOUND)),
-        "mu_lower": ~_ordered(mugrid.LOWER, lower, np.where(said, mu, lower)),
-        "mu_upper": ~_ordered(np.where(said, mu, lower), upper, mugrid.UPPER),
+        "basis": (basis < BOUND) | (measured == (basis == BOUND)),
+        "mu_lower": ~_ordered(mugrid.LOWER, lower, np.where(measured, mu, lower)),
+        "mu_upper": ~_ordered(np.where(measured, mu, lower), upper, mugrid.UPPER),
         "p_slippery": ~_ordered(0.0, p, 1.0),
+        "age_s": ~_ordered(0.0, age, OLDEST_S),
     }
     for name, rows in wrong.items():
         if rows.any():
@@ -54,7 +56,7 @@ def heard_cells(key: str, payload: bytes, now: int) -> tuple[int, HeardCells]:
     place = cell * grid.SECTORS + sector
     if len(np.unique(place)) < len(place):
         raise WireError("cell", "is there twice", "send each place once")
-    heard = np.full(len(place), now)
+    heard = np.minimum(last + (age * NS).astype(np.int64), now)  # when the tile was made: somebody may have kept it
     return tile, HeardCells(place, belief_of(lower, mu, upper, p), basis, vehicles, np.minimum(last, now), heard)
 
 

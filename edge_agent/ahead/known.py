@@ -37,7 +37,7 @@ class HeardCells(NamedTuple):
     basis: IntArray
     vehicles: IntArray
     last_time: IntArray  # [ns] of the last observation
-    heard: IntArray  # [ns] when the car heard of it
+    heard: IntArray  # [ns] when the map said so: when the car heard of it, or before, where an older tile came
 
 
 class PlaceBelief(NamedTuple):
@@ -60,8 +60,8 @@ def belief_of(lower: FloatArray, mu: FloatArray, upper: FloatArray, slippery: Fl
     The distribution function goes straight from one known value to the next.
     """
     n = len(lower)
-    said = np.isfinite(mu)
-    middle = np.where(said, mu, (lower + upper) / 2.0)
+    measured = np.isfinite(mu)
+    middle = np.where(measured, mu, (lower + upper) / 2.0)
     x = np.column_stack([np.full(n, mugrid.LOWER), lower, middle, upper, np.full(n, mugrid.UPPER)])
     x = np.maximum.accumulate(np.clip(x, mugrid.LOWER, mugrid.UPPER), axis=1)
     f = np.tile([0.0, 0.05, 0.5, 0.95, 1.0], (n, 1))
@@ -103,10 +103,12 @@ class HeardMap:
         return [alert for alert, _ in self._alerts.values()]
 
     def take(self, tile: int, cells: HeardCells, now: int) -> None:
-        """Cells of a tile were heard: what is said of them replaces what was known of them."""
+        """Cells of a tile were heard: what is said of them replaces what was known of them, if it is no older."""
         before = self._tiles.pop(tile, NOTHING)
-        kept = ~np.isin(before.key, cells.key) & (now - before.heard < HELD_S * NS)
-        self._tiles[tile] = _joined([_some(before, kept), cells])
+        both = _joined([_some(before, now - before.heard < HELD_S * NS), cells])
+        latest_first = np.lexsort((both.heard, both.key))[::-1]
+        _, newest = np.unique(both.key[latest_first], return_index=True)
+        self._tiles[tile] = _some(both, latest_first[newest])
         self._all = None
         while len(self._tiles) > 1 and self.cells > self._most:
             self._tiles.popitem(last=False)
@@ -134,7 +136,7 @@ class HeardMap:
 
     def forget(self, now: int) -> None:
         """Drop what is too old to say anything."""
-        for tile in [tile for tile, cells in self._tiles.items() if now - cells.heard.max() > HELD_S * NS]:
+        for tile in [tile for tile, cells in self._tiles.items() if now - cells.heard.max(initial=0) > HELD_S * NS]:
             del self._tiles[tile]
             self._all = None
         for key in [key for key, (_, at) in self._alerts.items() if now - at > ALERT_HELD_S * NS]:
@@ -155,10 +157,11 @@ class HeardMap:
             alert, heard = self._alerts[place if own else place ^ OTHER_WAY]
             if now - heard > ALERT_HELD_S * NS:
                 continue
-            alerted[k] = own or alert.time > last[k]  # who found grip since, on this side, knows better
-            if alert.time >= last[k] and alerted[k]:
-                said = (np.array([value]) for value in (alert.mu_lower, alert.mu, alert.mu_upper, alert.p_slippery))
-                belief[k], last[k], at[k], vehicles[k] = belief_of(*said)[0], alert.time, heard, alert.vehicles
+            grip = basis[k] == MEASURED or mugrid.quantiles(belief[k : k + 1], 0.05)[0] >= SLIPPERY_MU
+            alerted[k] = own or alert.time > last[k] or not grip  # who found grip since, on this side, knows better
+            if alerted[k] and (alert.time >= last[k] or basis[k] != MEASURED):  # a bound tells no value
+                shown = (np.array([value]) for value in (alert.mu_lower, alert.mu, alert.mu_upper, alert.p_slippery))
+                belief[k], last[k], at[k], vehicles[k] = belief_of(*shown)[0], alert.time, heard, alert.vehicles
                 basis[k] = MEASURED if own else BORROWED
         since = np.maximum(now - at, 0) / NS
         share = -np.expm1(-since / CHANGE_S)[:, None]

@@ -1,7 +1,8 @@
 """The road as the map shows it: from cell to cell and sector to sector, as vehicles visited them one after the other.
 
 Two places of the map follow each other when the second lies within two cells, in front, and vehicles head there as they
-must to come from the first. Where a road forks all ways are followed, the straightest first.
+must to come from the first. Where a road forks all ways are followed, the straightest first. Behind its last place that
+one goes straight on, as far as a corridor: a car has heard of no more than it asked for, and it asks along its way.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.ahead.path import Path, Pose, along, plane
+from edge_agent.ahead.path import CORRIDOR_M, NONE, Path, Pose, along, plane
 from schemas import grid
 from schemas.numeric import IntArray
 
@@ -25,6 +26,7 @@ FORK: Final = math.radians(50.0)  # links that differ by more lead to different 
 MOST_WAYS: Final = 3
 LEAST_OWN: Final = 2  # places of a way that no other has
 MOST_STEPS: Final = 120
+STEP_M: Final = 10.0  # a cell
 
 
 def ways_on(pose: Pose, keys: IntArray, length: float) -> list[Path]:
@@ -51,7 +53,7 @@ def ways_on(pose: Pose, keys: IntArray, length: float) -> list[Path]:
     ):  # one that joins another, or ends where another bends, is no way of its own
         if len(set(way).difference(*(other for other in done if other is not way))) < LEAST_OWN:
             done.remove(way)
-    return [_as_path(way, places, pose, length) for way in done]
+    return [_as_path(way, places, pose, length, beyond=k == 0) for k, way in enumerate(done)]
 
 
 class _Neighbours:
@@ -107,11 +109,19 @@ def _heading(way: list[int], places: dict[int, tuple[float, float]], pose: Pose)
     return math.atan2(dy, dx) if math.hypot(dx, dy) > 1.0 else pose.yaw
 
 
-def _as_path(way: list[int], places: dict[int, tuple[float, float]], pose: Pose, length: float) -> Path:
+def _as_path(
+    way: list[int], places: dict[int, tuple[float, float]], pose: Pose, length: float, *, beyond: bool
+) -> Path:
     line = np.array([(0.0, 0.0), *(places[key] for key in way)])
     smooth = line.copy()
     smooth[1:-1] = (line[:-2] + line[1:-1] + line[2:]) / 3.0
-    return along("road", smooth, pose, length, np.array([way[0], *way]))
+    known = np.array([way[0], *way])
+    if beyond:
+        heading, metres = _heading(way, places, pose), np.arange(STEP_M, CORRIDOR_M + 1.0, STEP_M)
+        straight = smooth[-1] + metres[:, None] * [math.cos(heading), math.sin(heading)]
+        smooth = np.concatenate([smooth, straight])
+        known = np.concatenate([known, np.full(len(straight), NONE)])
+    return along("road", smooth, pose, length, known)
 
 
 def _apart(a: float, b: float) -> float:

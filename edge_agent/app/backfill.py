@@ -1,6 +1,7 @@
-"""Many recorded drives to estimates, several at a time.
+"""Many recorded drives to estimates, several at a time: here, or on Spark.
 
 Threads and not processes: the kernels and Parquet release the interpreter's lock, and the compiled code is loaded once.
+Either engine runs the same function for each drive, and what it writes is the same, byte for byte.
 """
 
 from __future__ import annotations
@@ -8,15 +9,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.app.estimates_file import EstimatesFile
+from edge_agent.app.estimates_file import EstimatesFile, writable
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.inputs.correct import corrected
 from edge_agent.inputs.signal_log import read_log
 from schemas.errors import InputError
+from schemas.runtime import spark
+from schemas.runtime.durable import own_drafts, sweep_drafts, sync_directory
 from schemas.vehicle import load_vehicle
 
 
@@ -70,6 +74,31 @@ def backfill(
     with ThreadPoolExecutor(jobs) as pool:
         for future in as_completed([pool.submit(estimate, task, estimator, memberships) for task in tasks]):
             yield future.result()
+
+
+def backfill_on_spark(
+    tasks: Sequence[Task], estimator: str, memberships: Memberships | None = None
+) -> Iterator[Outcome]:  # fmt: skip
+    """As `backfill`, on the machines that Spark has, all of which see the same files; outcomes in the tasks' order.
+
+    Raises:
+        InputError: Spark is not there or gave up, or the folder of the estimates cannot be made.
+    """
+    folders = {writable("out", task.out).parent for task in tasks}
+    yield from spark.spread(spark.session(), tasks, partial(tried, estimator=estimator, memberships=memberships))
+    for folder in folders:
+        sweep_drafts(folder)
+
+
+def tried(task: Task, estimator: str, memberships: Memberships | None) -> Outcome:
+    """Estimate one drive such that its file is there whole, whoever else is at the same drive."""
+    folder = task.out.parent
+    with own_drafts(folder) as drafts:
+        outcome = estimate(task._replace(out=drafts / task.out.name), estimator, memberships)
+        if outcome.error is None:
+            (drafts / task.out.name).rename(task.out)
+            sync_directory(folder)
+    return outcome._replace(task=task)
 
 
 def estimate(task: Task, estimator: str, memberships: Memberships | None = None) -> Outcome:

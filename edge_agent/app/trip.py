@@ -132,19 +132,19 @@ class Trip:
     def _examine(self, part: list[tuple[FloatArray, FloatArray, FloatArray]], final: bool) -> None:
         t, signals, ground = (np.concatenate(columns) for columns in zip(*part, strict=True))
         try:
-            said = diagnose(t, signals, self._plain, ground)
-            self._faults = [f"{fault.channel} {fault.kind}" for fault in said.findings]
+            diagnosis = diagnose(t, signals, self._plain, ground)
+            self._faults = [f"{fault.channel} {fault.kind}" for fault in diagnosis.findings]
             if self._faults:
                 log.warning("the signal doctor: %s", ", ".join(self._faults))
             estimates: DriveEstimates = {}
-            if said.passed and final and t[-1] - t[0] >= LEAST_S:
+            if diagnosis.passed and final and t[-1] - t[0] >= LEAST_S:
                 estimates = one_drive(t, signals, self._plain)
         except (ValueError, FloatingPointError, np.linalg.LinAlgError) as error:
             log.warning("a part of this trip cannot be examined: %s", error)
             return
-        if said.passed and not self._known.passed:
+        if diagnosis.passed and not self._known.passed:
             log.info("the signal doctor has passed: units, signs, clocks and offsets agree with each other")
-        passed = said.passed or (self._known.passed and not self._faults)
+        passed = diagnosis.passed or (self._known.passed and not self._faults)
         if estimates or passed != self._known.passed:
             drives = [*self._known.drives, estimates][-MOST_DRIVES:] if estimates else self._known.drives
             self._known = self._known.model_copy(update={"passed": passed, "drives": drives})

@@ -39,22 +39,22 @@ def run(args: argparse.Namespace) -> int:
 
     file = args.vehicle or beside(args.log)
     vehicle, log = load_vehicle(file), read_log(args.log)
-    said = diagnose(log.t, log.signals, vehicle, log.ground)
+    diagnosis = diagnose(log.t, log.signals, vehicle, log.ground)
     if args.json:
-        print(json.dumps({"log": str(args.log), **document(said)}, allow_nan=False))
+        print(json.dumps({"log": str(args.log), **document(diagnosis)}, allow_nan=False))
     else:
-        print("\n".join([*lines(said), f"{args.log}: {advice(said)}"]))
+        print("\n".join([*lines(diagnosis), f"{args.log}: {advice(diagnosis)}"]))
     if args.out is not None:
-        writable("out", args.out).write_text(page(said, f"{args.log.name}, {vehicle.name}"), encoding="utf-8")
-    if args.fix is not None and said.findings:
-        profile, corrected, left = fixed(said.findings, profile_of(args.log), vehicle)
+        writable("out", args.out).write_text(page(diagnosis, f"{args.log.name}, {vehicle.name}"), encoding="utf-8")
+    if args.fix is not None and diagnosis.findings:
+        profile, corrected, left = fixed(diagnosis.findings, profile_of(args.log), vehicle)
         writable("fix", args.fix).write_text(profile.text(), encoding="utf-8")
         if corrected != vehicle:
             writable("vehicle", file).write_text(corrected.model_dump_json(indent=1, exclude_none=True) + "\n")
         for finding in left:
             _tell(f"not mended: {finding.channel} {finding.kind}: its recording must be decoded otherwise")
         _tell(f"{args.fix}: the corrected profile; import the recording again with it")
-    return 0 if said.passed else NOT_PASSED
+    return 0 if diagnosis.passed else NOT_PASSED
 
 
 def _tell(line: str) -> None:

@@ -76,10 +76,10 @@ def insist_on_sound(log: SignalLog, vehicle: Vehicle) -> None:
     from edge_agent.inputs.doctor.findings import diagnose
     from edge_agent.inputs.doctor.report import advice, lines
 
-    said = diagnose(log.t, log.signals, vehicle, log.ground)
-    if not said.passed:
-        print("\n".join(line for line in lines(said) if not line.startswith("sound")), file=sys.stderr)
-        raise InputError("log", "is not fit to be published", f"{advice(said)}; --trust publishes it as it is")
+    diagnosis = diagnose(log.t, log.signals, vehicle, log.ground)
+    if not diagnosis.passed:
+        print("\n".join(line for line in lines(diagnosis) if not line.startswith("sound")), file=sys.stderr)
+        raise InputError("log", "is not fit to be published", f"{advice(diagnosis)}; --trust publishes it as it is")
 
 
 def warn_of_faults(log: SignalLog, vehicle: Vehicle) -> None:

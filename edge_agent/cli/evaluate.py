@@ -22,6 +22,7 @@ ONLY: Final = ("inputs", "ahead")
 LEARNED_CARS: Final = 20
 LIVE_S: Final = 60.0
 QUICK_S: Final = 10
+APPROACHES_S: Final = 300.0  # 24 cars drive .2 km/s: 20 towns are 1 200 km, for a bar of one in 1 000
 ENTRY_TOWNS: Final = 4  # of the map as a prior, where the estimator itself drives
 CARS: Final = 5  # smooth ones, and as many rough ones, of the inputs' campaign
 
@@ -109,7 +110,7 @@ def _ahead(args: argparse.Namespace, count: int) -> int:
     rows: list[Callable[[], list[Figure]]] = [
         lambda: cost.figures(FIGURES, 2e3 if quick else 20e3),
         lambda: latency.figures(FIGURES, 20 if quick else 300, 20 if quick else latency.VEHICLES),
-        lambda: approaches.figures(seeds[:1] if quick else seeds, 60.0 if quick else 150.0, 6 if quick else 24),
+        lambda: approaches.figures(seeds[:1] if quick else seeds, 60.0 if quick else APPROACHES_S, 6 if quick else 24),
         lambda: entry.figures(seeds[:1] if quick else seeds[:ENTRY_TOWNS], 40.0 if quick else 90.0, 6 if quick else 16),
     ]
     figures: list[Figure] = []
@@ -117,7 +118,8 @@ def _ahead(args: argparse.Namespace, count: int) -> int:
         found = row()
         figures += found
         print(markdown(found).partition("|---|---|---|---|\n")[2], file=sys.stderr, flush=True)
-    write(args.out / "figures.json", "edge-agent evaluate --only ahead", list(seeds), figures)
+    part = " --quick" if quick else f" --seeds {count}" if count < LEAST_SEEDS else ""
+    write(args.out / "figures.json", f"edge-agent evaluate --only ahead{part}", list(seeds), figures)
     text = f"# What lies ahead\n\n{markdown(figures)}\n"
     (args.out / "report.md").write_text(text, encoding="utf-8")
     print(text)

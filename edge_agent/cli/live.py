@@ -22,6 +22,7 @@ from edge_agent.observe.pipeline import Pipeline
 from edge_agent.publish.publisher import Publisher
 from edge_agent.publish.vss import RoadFrictionOutput
 from schemas.config import AgentConfig
+from schemas.runtime import talk
 from schemas.runtime.metrics import serving
 from schemas.runtime.process import Line, line_logger, log_as, print_line
 from schemas.signals import CHANNELS
@@ -33,7 +34,16 @@ def _warm_up(estimator: str, vehicle: Vehicle, config: AgentConfig, memberships:
     """Load or compile the kernels before the clock runs, on a vehicle that is thrown away."""
     t, time = np.zeros((1, 1)), np.zeros((1, 1), dtype=np.int64)
     signals = np.full((1, 1, len(CHANNELS)), np.nan)
-    Pipeline(bank_of(estimator, [vehicle], memberships), 1, config).step(Block(t, time, signals))
+    with talk.busy("starting the estimator"):
+        Pipeline(bank_of(estimator, [vehicle], memberships), 1, config).step(Block(t, time, signals))
+
+
+def warm_up_simulation(scenario: str, rate_hz: float, rough: float = 0.0) -> None:
+    """The same for the simulation: else its first step is silent for as long as its kernels take."""
+    from edge_agent.lab.simulation import SimulatedFleet
+
+    with talk.busy("starting the simulation"):
+        SimulatedFleet(scenario, 1, 0, rate_hz, rough=rough).step(1)
 
 
 def drive_live(

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edge_agent.cli.options import add_estimator, memberships_of
+from schemas.errors import InputError
 from schemas.runtime import commandline
 from schemas.thresholds import NS
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from schemas.config import AgentConfig
 
 NOW = "now"
+LOCAL, SPARK = "local", "spark"
 OLD_NS = 29 * 86_400 * NS  # a service takes nothing of more than thirty days ago, unless it is told otherwise
 DRAIN_S = 30.0  # for a busy service; what is not settled by then stays in the outbox
 PROGRESS_S = 1.0
@@ -36,6 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, required=True, help="estimates to write (.parquet, .csv); of several logs, a folder"
     )
     parser.add_argument("--jobs", type=int, default=1, help="logs at a time (default 1)")
+    parser.add_argument("--engine", default=LOCAL, metavar="local|spark", help="several logs: where (default local)")
     parser.add_argument("--publish", action="store_true", help="send observations and states, wait for acknowledgement")
     parser.add_argument("--trust", action="store_true", help="publish although the signal doctor did not pass the log")
     parser.add_argument("--config", type=Path, help="agent configuration (JSON), for --publish")
@@ -48,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Replay; 0 when all was written and acknowledged, 1 when something was left or refused, 3 when not plausible."""
-    from edge_agent.app.backfill import backfill, beside, tasks_of
+    from edge_agent.app.backfill import backfill, backfill_on_spark, beside, tasks_of
     from edge_agent.app.estimates_file import EstimatesFile
     from edge_agent.app.estimator_factory import bank_of
     from edge_agent.app.plausible import IMPLAUSIBLE, Plausibility
@@ -56,18 +59,21 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.inputs.correct import corrected
     from edge_agent.inputs.signal_log import read_log
     from schemas.config import AgentConfig, load
-    from schemas.errors import InputError
     from schemas.vehicle import load_vehicle
 
     config = load(args.config, AgentConfig)
     estimator = args.estimator or config.estimator
     memberships = memberships_of(args)
-    if len(args.log) > 1 or args.out.is_dir():
+    several = len(args.log) > 1 or args.out.is_dir()
+    _check_engine(args.engine, args.jobs, several=several)
+    if several:
         if args.publish:
             raise InputError(
                 "publish", f"{len(args.log)} logs into a folder", "publish one log, to one file, at a time"
             )
         tasks = tasks_of(args.log, args.vehicle, args.out)  # refuses to write over a log
+        if args.engine == SPARK:
+            return _print_outcomes(backfill_on_spark(tasks, estimator, memberships), len(tasks))
         return _print_outcomes(backfill(tasks, estimator, args.jobs, memberships), len(tasks))
     path = args.log[0]
     commandline.not_an_input("out", args.out, [path, args.vehicle or beside(path)])
@@ -95,6 +101,15 @@ def run(args: argparse.Namespace) -> int:
                 keep(block, bank.advance(block.t, block.signals))
     print(plausibility.line(), file=sys.stderr)
     return code or (IMPLAUSIBLE if plausibility.troubles() else 0)
+
+
+def _check_engine(engine: str, jobs: int, *, several: bool) -> None:
+    if engine not in (LOCAL, SPARK):
+        raise InputError("engine", f"{engine!r} is none", f"use {LOCAL} or {SPARK}")
+    if engine == SPARK and not several:
+        raise InputError("engine", "one log into one file needs no cluster", "give several logs, or an existing folder")
+    if engine == SPARK and jobs != 1:
+        raise InputError("jobs", f"{jobs} says nothing to Spark", "its master says how many run at once, e.g. local[4]")
 
 
 def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from edge_agent.cli.options import add_estimator, memberships_of
+from schemas.runtime import talk
 
 if TYPE_CHECKING:
     from edge_agent.ahead.lookout import Lookout
@@ -48,13 +49,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Drive until the source ends, the duration has passed, or a signal comes."""
-    from edge_agent.cli.common import checked_name
-    from edge_agent.cli.live import drive_live
-    from edge_agent.inputs.live.sources import is_live
-    from schemas.config import AgentConfig, load
-    from schemas.errors import InputError
-    from schemas.runtime import plugins
-    from schemas.vehicle import load_vehicle
+    with talk.busy("loading"):
+        from edge_agent.cli.common import checked_name
+        from edge_agent.cli.live import drive_live
+        from edge_agent.inputs.live.sources import is_live
+        from schemas.config import AgentConfig, load
+        from schemas.errors import InputError
+        from schemas.runtime import plugins
+        from schemas.vehicle import load_vehicle
 
     config = load(args.config, AgentConfig)
     if args.route is not None and not args.ahead:
@@ -135,10 +137,12 @@ def _vehicle_file(args: argparse.Namespace) -> Path:
 
 
 def _simulated(args: argparse.Namespace) -> tuple[Vehicle, str, Iterator[Block]]:
+    from edge_agent.cli.live import warm_up_simulation
     from edge_agent.lab.simulation import SimulatedFleet
     from edge_agent.lab.simulation.blocks import blocks
 
     fleet = SimulatedFleet(args.scenario, 1, args.seed, args.rate)
+    warm_up_simulation(args.scenario, args.rate)
     return fleet.vehicles[0], args.name or fleet.names[0], blocks(fleet, args.rate)
 
 

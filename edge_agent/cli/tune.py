@@ -148,7 +148,8 @@ def _study(args: argparse.Namespace, ants: int, iterations: int) -> int:
         reporter=lambda way: reporter(way, iterations, time.monotonic, print_line),
     )  # fmt: skip
     listed = study_report.figures(done)
-    figures.write(args.study / "figures.json", "edge-agent tune --study", list(seeds), listed)
+    title = "edge-agent tune --study" + " --quick" * args.quick
+    figures.write(args.study / "figures.json", title, list(seeds), listed)
     text = study_report.markdown(listed)
     (args.study / "study.md").write_text(text, encoding="utf-8")
     study_report.draw(listed, ants, args.study / "convergence.png")

@@ -10,8 +10,6 @@ for each zone, and what it writes is the same, byte for byte.
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -27,10 +25,10 @@ from fleet_service.replay.rebuild import past
 from schemas import grid
 from schemas.errors import InputError
 from schemas.runtime import spark
+from schemas.runtime.durable import own_drafts, sweep_drafts
 from schemas.wire import Kind
 
 ENGINES: Final = ("local", "spark")
-_DRAFTS: Final = ".drafts-"  # the dot hides them from readers
 
 
 class Rebuild(NamedTuple):
@@ -79,8 +77,7 @@ def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[Rebuilt]:
         raise InputError("archive", f"no compacted observations in {wanted.root}", "run fleet-service compact")
     work = partial(rebuilt, wanted)
     yield from map(work, zones) if engine == "local" else spark.spread(spark.session(), zones, work)
-    for draft in wanted.out.glob(f"{_DRAFTS}*"):
-        shutil.rmtree(draft, ignore_errors=True)  # of tries that died
+    sweep_drafts(wanted.out)
 
 
 def zones_of(root: Path) -> list[int]:
@@ -100,8 +97,8 @@ def rebuilt(wanted: Rebuild, zone: int) -> Rebuilt:
     cells = visited_cells(past(wanted.root, wanted.lateness_s, wanted.until, box), wanted.until, box)
     cells = cells.filter(pa.array(grid.zone_of(cells["cell"].to_numpy()) == zone))
     named = f"zone=q{grid.quadkey(zone, grid.ZONE_ZOOM)}"
-    with tempfile.TemporaryDirectory(prefix=_DRAFTS, dir=wanted.out) as drafts:
-        place = partial(_placed, wanted.out, Path(drafts))
+    with own_drafts(wanted.out) as drafts:
+        place = partial(_placed, wanted.out, drafts)
         if cells.num_rows:
             path = snapshots.path_of(wanted.out, wanted.until)
             place(path.parent / named / path.name, kept(cells, wanted.until), MAP)

@@ -72,7 +72,7 @@ def _erase(
     key_of(root, wanted.month)
     vehicle = wanted.vehicle
     if vehicle is None:
-        gone = _recalled(engine, lambda: destroy_key(root, wanted.month), stop)
+        gone = _recalled(engine, lambda: destroy_key(root, wanted.month, engine.newest), stop)
         return {"rows": 0, "files": []} if gone else None
     cut = engine.between(lambda: engine.written_to, stop)
     if cut is None:

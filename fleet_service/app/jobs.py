@@ -32,7 +32,7 @@ ROUND_ROWS: Final = 250_000  # of one round of compaction: a second of work, 150
 INVENTORY_S: Final = 300.0  # thousands of files are looked through in a tenth of a second
 FOLLOW_S: Final = 30.0  # after which the archive's copy has what compaction, checkpoints and snapshots made
 DAY_S: Final = 86_400.0
-ASKED_S: Final = 2.0  # between two looks whether an erasure is asked for
+ASKED_S: Final = 2.0  # between two looks whether an erasure, or a hand-over, is asked for
 SOON_S: Final = 60.0  # after the start; the first turn of a job does not wait for its whole interval
 HANGS_S: Final = 1800.0  # a compaction of a day's backlog takes minutes
 _NICE: Final = 10  # the worker goes first
@@ -108,6 +108,19 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
             engine.copy.follow()
         return None
 
+    def handing_over(stop: threading.Event) -> str | None:
+        holding = engine.holding
+        if not holding.to:
+            return None
+        try:
+            checkpoint(stop)
+            following(stop)
+        except BaseException:
+            holding.to = ""  # it goes on here
+            raise
+        holding.leaves = True
+        return f"handing over: to {holding.to}"
+
     return [
         Job("compaction", config.compact_s, with_room(compaction)),
         Job("checkpoint", config.checkpoint_s, checkpoint),
@@ -116,6 +129,7 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
         Job("inventory", INVENTORY_S, inventory),
         Job("old_cells", DAY_S, old_cells),
         Job("following", 0.0 if engine.copy is None else FOLLOW_S, following),
+        Job("handing_over", ASKED_S if engine.holding.lease is not None else 0.0, handing_over),
         Job("erasure", ASKED_S, lambda stop: erasing.asked(engine, config, root, stop)),
     ]
 
@@ -141,9 +155,14 @@ class Upkeep:
         busy = self._busy
         if busy is not None and time.monotonic() - busy[1] > HANGS_S:
             found.append(f"{busy[0]} has not ended for {time.monotonic() - busy[1]:.0f} s")
-        if self._thread.ident is not None and not self._thread.is_alive() and not self._stop.is_set():
+        if self.ended:
             found.append("upkeep has ended; start the service again")
         return found
+
+    @property
+    def ended(self) -> bool:
+        """Whether its thread is gone though nobody stopped it."""
+        return self._thread.ident is not None and not self._thread.is_alive() and not self._stop.is_set()
 
     def __enter__(self) -> Upkeep:
         self._thread.start()

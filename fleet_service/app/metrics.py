@@ -23,6 +23,10 @@ _SINGLE: Final = {
     "key_failures": "batches without a key for their month: it is damaged, or cannot be written",
     "witnesses_damaged": "lines of keys/MONTH.witnesses that were damaged when the service began",
     "too_many_gaps": "batches with too many missing before them",
+    "too_many_streams": "batches that wait with a vehicle that opened too many streams",
+    "too_many_places": "observations archived and not fused: too many new places of their vehicle",
+    "implausible_moves": "observations archived and not fused: their vehicle cannot be there",
+    "refused_queries": "queries told to come again, since too many waited",
     "clock_doubted": "batches neither let in nor refused, since the time is in doubt",
     "checkpoints_refused": "checkpoints that were damaged, of another version, or died of",
     "duplicates": "batches that came again",
@@ -35,12 +39,14 @@ _SINGLE: Final = {
 
 
 class Pulse(NamedTuple):
-    """What only the running service knows: seconds since the worker's last turn, the queue, routers, clock lag [s]."""
+    """What only the running service knows: seconds since the worker's last turn, the queue, routers, clock lag [s], for
+    how long one tile of an answer is being made [s]."""
 
     turn_age_s: float
     queued: int
     routers: int
     clock_lag_s: float
+    answer_s: float = 0.0
 
 
 def metrics(engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path) -> list[Metric]:
@@ -65,6 +71,8 @@ def metrics(engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path) -> 
         gauge("report_lag_seconds", "between the end of the newest visit and its arrival", engine.report_lag_s),
         gauge("unsettled_batches", "batches that are admitted and not on disk yet", engine.unsettled),
         gauge("copy_away_seconds", "for which the archive's copy takes no segments", away_s),
+        gauge("lease_left_seconds", "for which it may acknowledge without renewing its lease", engine.holding.left_s),
+        _serves(config, 1.0),
         gauge("cells", "cells and sectors with a belief", engine.fusion.size),
         gauge("window_observations", "observations younger than the checkpoint", engine.fusion.waiting),
         gauge("alerts", "cells under an alert", engine.alerts),
@@ -72,11 +80,23 @@ def metrics(engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path) -> 
     ]  # fmt: skip
 
 
+def of_standby(config: ServiceConfig) -> list[Metric]:
+    """All values of a service that waits."""
+    return [_serves(config, 0.0)]
+
+
+def _serves(config: ServiceConfig, value: float) -> Metric:
+    text = "1 where this service serves its regions, 0 where it stands by for them"
+    return Metric("serves", "gauge", text, {" ".join(sorted(config.regions)): value}, "regions")
+
+
 def troubles(engine: Engine, pulse: Pulse, config: ServiceConfig) -> list[str]:
     """What is not as it should be."""
     found = [] if pulse.routers else ["no router is connected"]
     if pulse.turn_age_s > STALLED_S:
         found.append(f"the worker has done nothing for {pulse.turn_age_s:.0f} s")
+    if pulse.answer_s > STALLED_S:
+        found.append(f"a tile of an answer is being made for {pulse.answer_s:.0f} s")
     if engine.hangs_s > STALLED_S:
         found.append(f"a segment is being written for {engine.hangs_s:.0f} s")
     if abs(pulse.clock_lag_s) > CLOCK_S:

@@ -27,7 +27,9 @@ from fleet_service.ingest.rate_limit import RateLimiter
 from fleet_service.ingest.weather import WeatherMessage
 from fleet_service.serve.queryable import Answering, MapQueryable
 from fleet_service.serve.tile_rounds import SHARE_S, TileRounds
+from fleet_service.shards import moving
 from fleet_service.shards.holding import Holding
+from fleet_service.shards.serving import claimed, successors
 from fleet_service.shards.serving import serving as serving_regions
 from schemas import grid, keys, wire
 from schemas.config import ServiceConfig, load
@@ -40,7 +42,7 @@ from schemas.wire import Alert, Kind
 IDLE_S: Final = 0.05  # longest wait for a message; bounds how late a segment or a tile can be
 REPEAT_S: Final = 2.0  # between two puts of alerts that stand: who comes back waits less than 5 s for them
 REPEATED: Final = 1000  # alerts in such a turn, 150 kB; more go in turn
-HANGS_S: Final = 60.0  # of a segment that is being written: the disk is gone, and systemd is to start anew
+HANGS_S: Final = 60.0  # of a segment or a tile of an answer that is being made: systemd is to start anew
 STUCK_S: Final = 10.0  # a worker that does nothing for so long is to be followed by another service
 STATUS_S: Final = 5.0
 LEAVE_S: Final = 1.5  # of the three seconds in which a service is gone
@@ -104,21 +106,38 @@ class Service:
         config = self._config
         with (
             session,
-            serving_regions(session, config.name, config.regions, stop, owns=self.engine.holding.lease is not None),
+            claimed(session, config.name, config.regions, stop, self.engine.holding.former) as mine,
+            successors(session, mine) as came,
             self._upkeep,
             self._declared(session),
+            serving_regions(session, mine),
         ):
             self._session = session
             self._log_line(f"ready: {self._config.name}, {self.engine.fusion.size} cells from the archive{address}")
             watchdog.alive()
             try:
-                while not stop.is_set() and not self.engine.holding.lost:
+                while not (stop.is_set() or self._lost(came) or self.engine.holding.leaves):
                     self._step(session, stop)
-                self._shut_down(session)
+                self._shut_down(session, stop)
             except BaseException as error:
                 self.failure = error
                 stop.set()
                 raise
+
+    def _lost(self, came: Callable[[], bool]) -> bool:
+        """Whether another has taken over, by the lease, or by its tokens while the bucket does not say."""
+        holding = self.engine.holding
+        if not holding.may_acknowledge and came():
+            holding.give_up()
+        return holding.lost
+
+    def _hanging(self) -> str | None:
+        """What has died or hangs beside the worker, so that only another start helps."""
+        if self.engine.hangs_s >= HANGS_S:
+            return f"a segment is being written for {self.engine.hangs_s:.0f} s"
+        if self._replies.hangs_s >= HANGS_S:
+            return f"a tile of an answer is being made for {self._replies.hangs_s:.0f} s"
+        return "upkeep has ended" if self._upkeep.ended else None
 
     def _works(self) -> bool:
         """Whether this service does for its regions what a successor could do."""
@@ -131,7 +150,8 @@ class Service:
 
         def pulse() -> Pulse:
             routers = len(list(self._session.info.routers_zid())) if self._session else 0
-            return Pulse(time.monotonic() - self._stepped_at, len(self.inbox), routers, self._clock.lag() * 1e-9)
+            lag_s, turn_s = self._clock.lag() * 1e-9, time.monotonic() - self._stepped_at
+            return Pulse(turn_s, len(self.inbox), routers, lag_s, self._replies.hangs_s)
 
         return serving(
             config.metrics_host, config.metrics_port,
@@ -142,7 +162,7 @@ class Service:
     @contextmanager
     def _declared(self, session: zenoh.Session) -> Iterator[None]:
         regions = self._config.regions
-        token = session.liveliness().declare_token(keys.shard_key(self._config.name))
+        own = keys.shard_key(self._config.name)
         inputs = [
             session.declare_subscriber(f"{keys.ROOT}/{kind}/{region}/*", self.inbox.callback(kind))
             for kind in Kind
@@ -156,14 +176,21 @@ class Service:
             session.declare_queryable(f"{keys.ROOT}/alert/{region}/*", self._standing, complete=True)
             for region in regions
         ]
+        if self.engine.holding.lease is not None:
+            queryables.append(session.declare_queryable(own, lambda query: self._hand_over(query, session)))
+        token = session.liveliness().declare_token(own)  # last: who sees it may ask
         try:
             yield
         finally:
+            token.undeclare()
             for subscriber in inputs:
                 subscriber.undeclare()
             for queryable in queryables:
                 queryable.undeclare()
-            token.undeclare()
+
+    def _hand_over(self, query: zenoh.Query, session: zenoh.Session) -> None:
+        """Leave in good order, for the standby that is named."""
+        self.engine.holding.to = moving.asked(query, session, self._config.regions) or self.engine.holding.to
 
     def _standing(self, asked: zenoh.Query) -> None:
         """Tell who came late which alerts stand."""
@@ -202,18 +229,23 @@ class Service:
             self._put_alerts(session, self.engine.repeated(REPEATED))
         if now - self._reported_at >= STATUS_S:
             self._status(now)
-            if self.engine.hangs_s < HANGS_S:
+            if hanging := self._hanging():
+                self._log_line(f"no sign of life is given: {hanging}")
+            else:
                 watchdog.alive()
         if not self._survived and now - self._began >= SURVIVED_S:
             self._survived = True
             self.engine.survived()
 
-    def _shut_down(self, session: zenoh.Session) -> None:
+    def _shut_down(self, session: zenoh.Session, stop: threading.Event) -> None:
         """Take what is waiting, as far as LEAVE_S allows, and settle it; the rest its senders keep."""
         if self.engine.holding.lost:
             self._followed = True
+            stop.set()  # then nothing that hangs on a bucket, or on a router, keeps it for long
             self._log_line("followed: another service has the lease; what it did not get its senders keep")
             return
+        if self.engine.holding.leaves:
+            stop.set()
         deadline = time.monotonic() + LEAVE_S
         while not self.engine.full and time.monotonic() < deadline:
             messages = self.inbox.drain(0.0)

@@ -59,7 +59,7 @@ class ObjectBucket:
             self._store: ObjectStore = from_url(url, config=given, client_options=client, retry_config=retry)
         except (BaseError, ValueError, TypeError) as error:
             fix = "see `store` in the settings; credentials may come from the environment"
-            raise InputError("archive.store", f"is not as {url} wants it ({said(error)})", fix) from error
+            raise InputError("archive.store", f"is not as {url} wants it ({reason(error)})", fix) from error
 
     def put(self, name: str, content: bytes | Path) -> None:
         """Put an object, in place of one that is there.
@@ -158,12 +158,12 @@ class ObjectBucket:
         except FileNotFoundError as error:
             if error.filename is not None:
                 raise  # the file to be put
-            raise CopyError(f"{name}: {said(error)}") from None
+            raise CopyError(f"{name}: {reason(error)}") from None
         except self._failed as error:
-            raise CopyError(f"{name}: {said(error)}") from None
+            raise CopyError(f"{name}: {reason(error)}") from None
 
 
-def said(error: BaseException) -> str:
+def reason(error: BaseException) -> str:
     """The first words of an error: no headers, and nothing of what the server answered."""
     line = (str(error).splitlines() or [type(error).__name__])[0]
     return line.partition("<")[0].strip()[:_TEXT]

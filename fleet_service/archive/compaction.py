@@ -16,7 +16,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import BinaryIO, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -40,6 +40,15 @@ class Compacted(NamedTuple):
     files: int
 
 
+def alone(root: Path) -> BinaryIO:
+    """Take the compacted files for this process, until the handle is closed.
+
+    Raises:
+        InputError: another process adds to them, or rewrites them.
+    """
+    return exclusive(root / "compaction.lock", f"{root} is being compacted", "wait until that has ended")
+
+
 @contextmanager
 def compacting(root: Path) -> Iterator[None]:
     """Be the only one that adds to, or rewrites, the compacted files.
@@ -48,7 +57,7 @@ def compacting(root: Path) -> Iterator[None]:
         InputError: it is no archive, or another process does.
     """
     layout.insist_on_archive(root)
-    with exclusive(root / "compaction.lock", f"{root} is being compacted", "wait until that has ended"):
+    with alone(root):
         drafts = root / "drafts"
         drafts.mkdir(exist_ok=True)
         for draft in drafts.iterdir():  # of a run that died

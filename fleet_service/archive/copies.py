@@ -114,11 +114,11 @@ class Copy:
             fix = "see that it is reached, and endpoint, region and credentials; start again, nothing is lost"
             raise InputError("archive.copy", f"{self._url} cannot be used ({error})", fix) from error
 
-    def join(self, service: str, term: Term | None = None, *, succeeds: bool = False) -> int:
+    def join(self, service: str | None, term: Term | None = None, *, succeeds: bool = False) -> int:
         """As `begin`, with a lease's `term`: what a former holder puts from now on does not count.
 
         Args:
-            service: its name.
+            service: its name; None: a standby, which follows whoever has the bucket.
             term: of the lease; None: there is none.
             succeeds: another machine had the lease before: what only this folder has was never acknowledged, and goes.
 
@@ -127,7 +127,8 @@ class Copy:
             CopyError: the bucket cannot be reached; it may be tried again.
             OSError: the folder cannot be read or written.
         """
-        self._claim(service)
+        if service is not None:
+            self._claim(service)
         got = self._mirror() if succeeds else self._fetch(self._counting(self._slow.sizes()))
         self._follow(with_log=True)
         if term is not None:

@@ -27,11 +27,17 @@ from schemas.wire import Kind
 
 TABLES: Final = {Kind.OBSERVATION: "observations", Kind.STATE: "states"}
 TIME: Final = {Kind.OBSERVATION: "leave_time", Kind.STATE: "time"}  # of the measurement, by which rows are kept
+FIRST_TIME: Final = {Kind.OBSERVATION: "enter_time", Kind.STATE: "time"}  # by which a batch is too old, and its month
 CHECKPOINTS: Final = "checkpoints"  # a folder
 DAY_NS: Final = 86_400_000_000_000
 _EPOCH: Final = date(1970, 1, 1)
+_TERM: Final = re.compile(r"\.\d{10}$")
 _NAMED: Final = re.compile(r"(\.(?P<term>\d{10}))?-(?P<epoch>\d{10,})-\d{8,}\.parquet$")
-_OF_A_TERM: Final = ("inbox", "observations", "states", "rollup")
+_OF_A_TERM: Final = {
+    **dict.fromkeys(("inbox", "observations", "states", "rollup"), _NAMED),
+    "weather": re.compile(r"\.(?P<term>\d{10})-(?P<epoch>\d{20})\.parquet$"),
+    "keys": re.compile(r"(?P<epoch>)\.(?P<term>\d{10})\.witnesses$"),
+}
 _DAY: Final = re.compile(r"date=\d{4}-(0[1-9]|1[0-2])-(0[1-9]|[12]\d|3[01])")  # and no copy that somebody made of one
 
 
@@ -111,21 +117,28 @@ def segment_name(prefix: str, number: int) -> str:
     return f"{prefix}-{number:08d}.parquet"
 
 
+def with_term(name: str, term: int) -> str:
+    """First part of a file's name, with the term of who writes it in the place of a former one, so that it takes the
+    place of nobody's file; 0: there are no terms."""
+    return f"{_TERM.sub('', name)}.{term:010d}" if term else name
+
+
 def signed(name: str, term: int) -> str:
     """Name of a compacted file, by that of its newest segment and the term of who compacts; 0: there are no terms."""
     shard, epoch, number = name.rsplit("-", 2)
-    return f"{shard}.{term:010d}-{epoch}-{number}" if term else name
+    return f"{with_term(shard, term)}-{epoch}-{number}"
 
 
 def term_of(name: str) -> int | None:
     """Epoch of the service that made an object of an archive's copy; None: its name does not tell.
 
-    Segments and checkpoints tell the epoch of their service, compacted files and their roll-ups who compacted.
+    Segments, checkpoints, weather and the list of witnesses tell the epoch of their service, compacted files and their
+    roll-ups who compacted.
     """
     folder, _, rest = name.partition("/")
     if folder == CHECKPOINTS:
         return int(epoch) if (epoch := rest.partition("-")[0]).isdigit() else None
-    found = _NAMED.search(rest) if folder in _OF_A_TERM else None
+    found = _OF_A_TERM[folder].search(rest) if folder in _OF_A_TERM else None
     return None if found is None else int(found["term"] or found["epoch"])
 
 

@@ -16,14 +16,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_service.archive import iceberg, layout, reading, rollup, snapshots, witnesses
+from fleet_service.archive import erasures, iceberg, layout, reading, rollup, snapshots, witnesses
 from fleet_service.archive.between import Between
 from fleet_service.archive.compaction import compact, compacting
 from fleet_service.archive.files import COMPACTED, MAP, lock, put_in_place
 from fleet_service.archive.layout import TABLES
 from fleet_service.archive.load import BAD, content, load
 from fleet_service.archive.pseudonyms import Pseudonyms, number
-from fleet_service.archive.segments import SCHEMAS
+from fleet_service.archive.segments import SCHEMAS, nanoseconds
 from fleet_service.archive.version import KEY
 from schemas.errors import InputError
 from schemas.runtime.durable import sync_directory
@@ -86,21 +86,38 @@ def forget_period(root: Path, month: str) -> None:
 
     Raises:
         InputError: there is no such key, or a service runs on the archive.
+        OSError: a file cannot be read or written.
     """
     with lock(root):
-        destroy_key(root, month)
+        key_of(root, month)
+        destroy_key(root, month, _newest(root, month))
 
 
-def destroy_key(root: Path, month: str) -> None:
-    """As `forget_period`, for who holds the archive and keeps nothing of the month in mind.
+def destroy_key(root: Path, month: str, newest: int) -> None:
+    """As `forget_period`, for who holds the archive and keeps nothing of the month in mind. What was measured in it
+    until `newest` [ns], the newest that the archive holds, does not come in again.
 
     Raises:
         InputError: there is no such key.
+        OSError: the disk is full or broken; the key may be there still.
     """
     key = key_of(root, month)
+    erasures.note(key.parent, month, newest)
     witnesses.forget(key.parent, month)
     key.unlink()
     sync_directory(key.parent)
+
+
+def _newest(root: Path, month: str) -> int:
+    """Newest first time of a record that the archive holds of a month or after it [ns], -1 if of neither."""
+    begin, until = erasures.span_of(month)
+    newest = -1
+    for kind, name in layout.FIRST_TIME.items():
+        for table in reading.read(root, kind, [name], days=(begin // layout.DAY_NS, None)):
+            newest = max(newest, int(nanoseconds(table[name]).max(initial=-1)))
+            if newest >= until:
+                return newest
+    return newest
 
 
 class Forgotten(NamedTuple):
@@ -134,10 +151,9 @@ def erased(root: Path, vehicle: str, month: str) -> Iterator[Forgotten]:
     Raises:
         as `forget_vehicle`, but for the service.
     """
-    first = _month(month)
     key_of(root, month)
     compact(root)
-    begin, end = (first - date(1970, 1, 1)).days, _last_day(first) + 1
+    begin, end = _days(month)
     pseudonym = _pseudonym(root, vehicle, month)
     rows, files, cells = 0, [*root.rglob(f"*{BAD}")], set[int]()
     with compacting(root):
@@ -145,7 +161,6 @@ def erased(root: Path, vehicle: str, month: str) -> Iterator[Forgotten]:
         for damaged in files:  # nobody can tell what is in them
             damaged.unlink()
         for kind in Kind:
-            # a batch has the pseudonym of its first record and may end a day later
             theirs = [path for path in layout.compacted(root, kind, begin, end) if _names(kind, path, pseudonym)]
             iceberg.let_go(root, theirs)
             for path in theirs:
@@ -167,8 +182,7 @@ def forget_witness(root: Path, vehicle: str, month: str) -> None:
 
 
 def _pseudonym(root: Path, vehicle: str, month: str) -> str:
-    noon = (_month(month) - date(1970, 1, 1)).days * layout.DAY_NS + layout.DAY_NS // 2
-    return Pseudonyms(root / _KEYS).of(vehicle, noon)
+    return Pseudonyms(root / _KEYS).of(vehicle, erasures.span_of(month).begin)
 
 
 def _thinned(root: Path, path: Path, cells: set[int]) -> bool:
@@ -191,12 +205,10 @@ def rows_of_vehicle(root: Path, vehicle: str, month: str) -> int:
         InputError: the month's key is gone.
         OSError: a file cannot be read.
     """
-    first = (_month(month) - date(1970, 1, 1)).days
     key_of(root, month)
     pseudonym = _pseudonym(root, vehicle, month)
     where = [Between("vehicle", pseudonym, pseudonym)]
-    days = (first, _last_day(_month(month)) + 1)
-    return sum(table.num_rows for kind in Kind for table in reading.read(root, kind, ["vehicle"], where, days))
+    return sum(table.num_rows for kind in Kind for table in reading.read(root, kind, ["vehicle"], where, _days(month)))
 
 
 def drop_checkpoints(root: Path) -> None:
@@ -241,20 +253,14 @@ def key_of(root: Path, month: str) -> Path:
     Raises:
         InputError: there is none.
     """
-    _month(month)
+    erasures.first_day(month)
     path = root / _KEYS / f"{month}.key"
     if not path.exists():
         raise InputError("period", f"the archive has no key of {month}", "nobody can tell whose its rows are")
     return path
 
 
-def _month(month: str) -> date:
-    try:
-        return date.fromisoformat(f"{month}-01")
-    except ValueError as error:
-        raise InputError("period", f"{month!r} is no month", "give one like 2026-01") from error
-
-
-def _last_day(first: date) -> int:
-    following = (first.replace(day=28) + timedelta(days=4)).replace(day=1)
-    return (following - date(1970, 1, 1)).days - 1
+def _days(month: str) -> tuple[int, int]:
+    """Days of a month, and the one after it: a batch has the pseudonym of its first record and may end a day later."""
+    begin, until = erasures.span_of(month)
+    return begin // layout.DAY_NS, until // layout.DAY_NS

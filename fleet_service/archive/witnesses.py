@@ -2,6 +2,7 @@
 
     keys/witness.key            of the service: a vehicle's number is its name's keyed hash
     keys/2026-01.witnesses      which pseudonym of the month is whose number; goes with the month's key
+    keys/2026-01.TERM.witnesses likewise, of a service that succeeds others: each writes into a file of its own
 
 One car must not be two witnesses because a month ended, or because it says so. The second file is for restarts and
 replays, which see pseudonyms; a line that is lost or damaged makes one vehicle two again there, and nothing else. So
@@ -22,6 +23,7 @@ from typing import Final
 
 import numpy as np
 
+from fleet_service.archive import layout, terms
 from fleet_service.archive.pseudonyms import kept_key
 from schemas.numeric import IntArray
 from schemas.runtime.durable import sync_directory, written
@@ -30,7 +32,7 @@ ENDING: Final = ".witnesses"
 _KEY: Final = "witness.key"
 _LINE: Final = 24  # bytes: pseudonym, number, check
 _SECRET: Final = 0o600
-_MONTH: Final = re.compile(r"\d{4}-\d{2}")
+_MONTH: Final = re.compile(r"(\d{4}-\d{2})(\.\d{10})?")
 
 
 class Witnesses:
@@ -41,7 +43,7 @@ class Witnesses:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
+        self._folder, self._term = folder, terms.of(folder.parent)
         self._key: bytes | None = None
         self._known: set[int] | None = None
         self._unsynced: set[Path] = set()
@@ -57,7 +59,7 @@ class Witnesses:
             self._known = set(read(self._folder))
         number = int.from_bytes(blake2b(vehicle.encode(), key=self._key, digest_size=8).digest(), signed=True)
         if pseudonym not in self._known:
-            path = self._folder / f"{month}{ENDING}"
+            path = self._folder / f"{layout.with_term(month, self._term)}{ENDING}"
             path.touch(_SECRET)
             self._unsynced.add(path)
             with path.open("r+b", buffering=0) as file:
@@ -126,16 +128,16 @@ def numbers_of(known: Mapping[int, int], pseudonyms: IntArray) -> IntArray:
 
 def forget(folder: Path, month: str, pseudonym: int | None = None) -> None:
     """Remove one vehicle's line of a month, or all of them."""
-    path = folder / f"{month}{ENDING}"
-    if not path.exists():
-        return
-    if pseudonym is None:
-        path.unlink()
-        return
-    data = path.read_bytes()
-    lines = [data[at : at + _LINE] for at in range(0, len(data), _LINE)]
-    with written(path, _SECRET) as file:
-        file.write(b"".join(line for line in lines if int.from_bytes(line[:8], signed=True) != pseudonym))
+    for path in _files(folder):
+        if path.name.partition(".")[0] != month:
+            continue
+        if pseudonym is None:
+            path.unlink()
+            continue
+        data = path.read_bytes()
+        lines = [data[at : at + _LINE] for at in range(0, len(data), _LINE)]
+        with written(path, _SECRET) as file:
+            file.write(b"".join(line for line in lines if int.from_bytes(line[:8], signed=True) != pseudonym))
 
 
 def _line(pseudonym: int, number: int) -> bytes:

@@ -1,5 +1,5 @@
-"""`fleet-service`: run, query, watch, page, compact, retention, forget, export, roads, analyze, rebuild,
-certs, evaluate, completion.
+"""`fleet-service`: run, query, watch, page, hand-over, compact, retention, forget, export, roads, analyze,
+rebuild, certs, evaluate, completion.
 
 Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. What a command needs is imported when
 it is chosen, so that help comes at once.
@@ -29,6 +29,8 @@ COMMANDS: Final = (
             "fleet-service watch --bbox 11.9,57.6,12.1,57.8"),
     Command("page", "fleet_service.cli.page", "the live map in a browser: now, alerts, the past, routes",
             "fleet-service page --connect tcp/127.0.0.1:7447 --archive archive"),
+    Command("hand-over", "fleet_service.cli.hand_over", "a region goes to a service that stands by for it, live",
+            "fleet-service hand-over 1202/310/* --to north-b"),
     Command("compact", "fleet_service.cli.compact", "sort the log into files by date and zone, roll them up",
             "fleet-service compact --archive archive"),
     Command("retention", "fleet_service.cli.retention", "remove old raw rows; their roll-ups stay",

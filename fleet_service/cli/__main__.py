@@ -1,7 +1,6 @@
 """`python -m fleet_service.cli`."""
 
-import sys
-
 from fleet_service.cli import main
+from schemas.runtime.process import leave
 
-sys.exit(main())
+raise SystemExit(leave(main()))

@@ -33,9 +33,9 @@ def _compact(arguments: argparse.Namespace) -> ArchiveReport:
         raise InputError("round-rows", f"{rows} is below 1", "give the rows of one round")
     done = compact(arguments.archive, rows)
     parts = rollup.complete(arguments.archive)
-    said = f"{done.rows} rows of {done.segments} segments moved into {done.files} files, {parts} rolled up"
+    summary = f"{done.rows} rows of {done.segments} segments moved into {done.files} files, {parts} rolled up"
     values: dict[str, object] = {"rows": done.rows, "segments": done.segments, "files": done.files, "rolled_up": parts}
     if arguments.to is not None:
         put = mirror.put(arguments.archive, arguments.to)
-        said, values = f"{said}, {put} put", {**values, "put": put}
-    return ArchiveReport(said, values)
+        summary, values = f"{summary}, {put} put", {**values, "put": put}
+    return ArchiveReport(summary, values)

@@ -14,10 +14,13 @@ from typing import TYPE_CHECKING
 
 from fleet_service.cli.common import stop_on_signals
 from schemas.errors import InputError
+from schemas.runtime import talk
 from schemas.runtime.process import end_now, line_logger, log_as
 
 if TYPE_CHECKING:
     from fleet_service.app.service import Service
+    from fleet_service.shards.holding import Holding
+    from schemas.config import ServiceConfig
 
 PRIVATE = 0o027  # where persons drove is for the service and its group alone, whatever the mask was
 SWITCH_S = 0.0005  # after which a busy worker lets an answer go first; ten times that is Python's own
@@ -36,11 +39,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve."""
-    from fleet_service.app.precompile import warm_up
-    from fleet_service.app.service import Service
-    from fleet_service.shards.holding import hold
-    from fleet_service.shards.serving import standing_by
-    from schemas.config import ServiceConfig, load
+    with talk.busy("loading"):
+        from fleet_service.app.precompile import warm_up
+        from fleet_service.app.service import Service
+        from schemas.config import ServiceConfig, load
 
     stop = stop_on_signals()
     os.umask(os.umask(0o077) | PRIVATE)
@@ -56,13 +58,14 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         log_line = line_logger(config.log, sys.stdout, service=config.name)
         if config.standby:
-            warm_up()  # compiled when it is needed
-        with standing_by(config, stop) as signs:
-            holding = None if stop.is_set() else hold(config, root, stop, log_line, signs)
+            with talk.busy("compiling"):
+                warm_up()  # compiled when it is needed
+        holding = _waited(config, root, stop, log_line)
         if holding is None:
             return 0
         try:
-            service = Service(config, root, log_line, holding)
+            with talk.busy("starting"):
+                service = Service(config, root, log_line, holding)
         except BaseException:
             holding.close()
             raise
@@ -77,6 +80,34 @@ def run(arguments: argparse.Namespace) -> int:
     service.run(stop)
     stopped.set()
     return service.exit_code if holding.lease is not None else 0
+
+
+def _waited(
+    config: ServiceConfig, root: Path, stop: threading.Event, log_line: Callable[[str], None]
+) -> Holding | None:  # fmt: skip
+    """The archive, once it is this service's; None if stopped before. A standby shows itself while it waits."""
+    from fleet_service.app.metrics import of_standby
+    from fleet_service.shards.holding import hold
+    from fleet_service.shards.serving import standing_by
+    from schemas.runtime import watchdog
+    from schemas.runtime.metrics import serving
+
+    if not config.standby:
+        return hold(config, root, stop, log_line)
+    told = [""]
+
+    def say(line: str) -> None:
+        told[0] = line
+        log_line(f"{line}, {address}" if address else line)
+
+    with (
+        serving(
+            config.metrics_host, config.metrics_port, lambda: of_standby(config),
+            lambda: [line for line in told if "cannot" in line],
+        ) as address,
+        standing_by(config, stop, watchdog.patient()) as signs,
+    ):  # fmt: skip
+        return None if stop.is_set() else hold(config, root, stop, say, signs)
 
 
 def _leave_at_last(

@@ -73,11 +73,19 @@ def ask(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
     """
     asked = query.parse(parameters)
     with joined(connection) as session, tokens.watched(session) as services:
-        told = bool(services.here)
+        before = services.here
         payloads = sorted(replies(session, EVERYWHERE, parameters))
-        whole = {token.region for token in services.here} - (gone := {token.region for token in services.gone})
-        told = told or bool(gone)
+        after = services.asked(session)  # who came meanwhile may not have been asked
+        # and who went may have been asked in place of who followed it, even if it is back
+        gone = {token.region for token in services.fell | (before - after)}
+        stayed = {token.region for token in before & after}
+        whole = {one for one in stayed if not any(regions.overlap(one, region) for region in gone)}
+        told = bool(before | after)
         served = bool(payloads) or (bool(whole) if told else is_served(session, asked))
+        if not told and services.asked(session):  # it came while it was looked for
+            told, served = True, bool(payloads)
+        elif not told and served and not payloads:  # likewise, and its token is on the way; or it has none
+            payloads = sorted(replies(session, EVERYWHERE, parameters))
     answer = replace(_joined(asked, [payload for _, payload in payloads]), served=served)
     if not told:  # services of a former version, or an access list of one
         return answer
@@ -85,7 +93,7 @@ def ask(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
     whole |= {one for one in tiles if not any(regions.overlap(one, region) for region in gone)}
     somewhere = asked.bbox is not None or asked.route is not None
     missing = regions.unserved(asked, whole) if somewhere else sorted(gone)
-    found = tuple(sorted({token.region for token in services.here}))
+    found = tuple(sorted({token.region for token in after}))
     return replace(answer, missing=tuple(missing), regions=found)
 
 

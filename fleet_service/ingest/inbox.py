@@ -17,7 +17,8 @@ from typing import Final, NamedTuple
 import numpy as np
 import zenoh
 
-from fleet_service.archive.layout import TIME
+from fleet_service.archive import erasures
+from fleet_service.archive.layout import FIRST_TIME, TIME
 from fleet_service.archive.pseudonyms import Pseudonyms, number, texts
 from fleet_service.archive.segments import Rows, stepped
 from fleet_service.archive.witnesses import Witnesses
@@ -37,7 +38,6 @@ from schemas.thresholds import NS
 from schemas.wire import Kind
 from schemas.wire.batches import Decoded, Head, Heads, head_of
 
-FIRST_TIME: Final = {Kind.OBSERVATION: "enter_time", Kind.STATE: "time"}  # by which a batch is too old
 # Of a step of the worker, so that a flood does not delay alerts, answers and segments by more than a moment. Most of
 # the work is by the record, of which 160 bytes are one.
 STEP_MESSAGES: Final = 4096
@@ -137,6 +137,7 @@ class BatchIntake:
     def __init__(self, streams: SequenceTrackers, pseudonyms: Pseudonyms, counts: Counter[str], acks: Acks) -> None:
         self._streams, self._pseudonyms, self._counts, self._acks = streams, pseudonyms, counts, acks
         self._witnesses = Witnesses(pseudonyms.folder)
+        self._erased = erasures.read(pseudonyms.folder)
         self._budget = Bucket(STREAMS_AT_ONCE, STREAMS_PER_HOUR)
         self._pending: set[BatchId] = set()  # accepted, not yet on disk
         self._known: dict[Kind, dict[tuple[str, int, int, int], SequenceTracker]] = {kind: {} for kind in Kind}
@@ -190,7 +191,11 @@ class BatchIntake:
                 self._counts["clock_doubted"] += 1  # neither let in nor refused: its sender keeps it
             else:
                 self._refuse(str(owners[place].name), found.heads.at(place), rules[broken[place]])
-        new = self._new(kind, found.heads, time, broken < 0)
+        good = broken < 0
+        for place in np.flatnonzero(good & erasures.within(self._erased, time)).tolist():
+            good[place] = False
+            self._refuse(str(owners[place].name), found.heads.at(place), validation.ERASED)
+        new = self._new(kind, found.heads, time, good)
         return self._rows(kind, new, found, clock) if new else AcceptedBatches([], {})
 
     def _tell_time(self, owners: Sequence[Parsed], time: IntArray) -> None:

@@ -21,8 +21,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from fleet_service.archive import terms
 from fleet_service.archive.files import SEGMENT, write_table
-from fleet_service.archive.layout import DAY_NS
+from fleet_service.archive.layout import DAY_NS, with_term
 from fleet_service.archive.load import Damaged, load, pass_over
 from fleet_service.archive.segments import nanoseconds
 from fleet_service.fusion import Fusion
@@ -60,7 +61,8 @@ class WeatherInbox:
     """
 
     def __init__(self, root: Path, name: str, fusion: Fusion, counts: Counter[str]) -> None:
-        self._folder, self._name, self.fusion, self._counts = root / FOLDER, name, fusion, counts
+        self._folder, self.fusion, self._counts = root / FOLDER, fusion, counts
+        self._name = with_term(name, terms.of(root))
         self._waiting: deque[WeatherMessage] = deque(maxlen=WAITING)
         self._last = 0
 
@@ -177,6 +179,7 @@ def gather(root: Path, damaged: Damaged = pass_over) -> int:
         OSError: a file cannot be read or written; nothing is lost.
     """
     days: dict[int, list[Path]] = {}
+    term = terms.of(root)
     for path in files(root):
         days.setdefault(_day(path), []).append(path)
     saved = 0
@@ -184,9 +187,13 @@ def gather(root: Path, damaged: Damaged = pass_over) -> int:
         found = [(p, load(p, tables.WEATHER_ARCHIVE, whole=True, damaged=damaged)) for p in paths]
         whole = [(path, table) for path, table in found if table is not None]
         if len(whole) > 1:
-            write_table(pa.concat_tables([table for _, table in whole]), whole[-1][0], SEGMENT)
-            for path, _ in whole[:-1]:
-                path.unlink()
+            newest = whole[-1][0]
+            name, _, moment = newest.name.rpartition("-")
+            place = newest.with_name(f"{with_term(name, term)}-{moment}")
+            write_table(pa.concat_tables([table for _, table in whole]), place, SEGMENT)
+            for path, _ in whole:
+                if path != place:
+                    path.unlink()
             saved += len(whole) - 1
     return saved
 

@@ -152,13 +152,17 @@ def replayed(rng: Generator, drive: AttackedDrive) -> int:
     old = np.flatnonzero(at < 60.0 * BEGIN)
     again = rng.choice(old, min(len(old), 600), replace=False)
     forged = [m for k in again.tolist() for m in (sent[k].message, *rebadged(sent[k].message, VEHICLES + k % NAMES))]
-    alone, attacked = _alerted(sent, at, []), _alerted(sent, at, forged)
+    key = rng.bytes(32)
+    alone, attacked = _alerted(sent, at, [], key), _alerted(sent, at, forged, key)
     return differing(drive, alone, attacked)
 
 
-def _alerted(sent: list[SentMessage], at: FloatArray, forged: list[Message]) -> list[BoolArray]:
+def _alerted(sent: list[SentMessage], at: FloatArray, forged: list[Message], key: bytes) -> list[BoolArray]:
+    """Alerts of each minute; by the `key` vehicles have the same numbers each time, and with them the same peers."""
     out = []
     with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "keys").mkdir()
+        Path(folder, "keys", "witness.key").write_bytes(key)
         engine = Engine(ServiceConfig(), Path(folder))
         for minute in range(MINUTES):
             part = [sent[k].message for k in np.flatnonzero((at >= 60.0 * minute) & (at < 60.0 * (minute + 1)))]

@@ -10,7 +10,20 @@ from typing import Final
 
 import numpy as np
 
-from fleet_service.lab import attacks, bars, changes, end_to_end, exact, fleets, models, moments, plots, situations
+from fleet_service.lab import (
+    attacks,
+    bars,
+    changes,
+    end_to_end,
+    exact,
+    fading,
+    fleets,
+    models,
+    moments,
+    plots,
+    resampled,
+    situations,
+)
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
 
@@ -20,7 +33,7 @@ SEEDS, QUICK_SEEDS = 10, 1
 LENGTHS: Final = {end_to_end.LEVEL: (200, 60.0), end_to_end.HILLS: (120, 180.0)} | dict.fromkeys(
     end_to_end.WAYS, (20, 1800.0)
 )  # vehicles, seconds
-WHOLE_WAY: Final = "fusion.whole_way"  # prefix of what is measured end to end
+END_TO_END: Final = ("fusion.whole_way", "fusion.resampled")  # prefixes of what is measured end to end
 EXACT_SEEDS: Final = 8  # drives of 20 minutes; nothing random is averaged there, the largest difference counts
 
 LogLine = Callable[[str], None]
@@ -41,11 +54,11 @@ def run(folder: Path, quick: bool, drives: Drives, log_line: LogLine, *, alone: 
     folder.mkdir(parents=True, exist_ok=True)
     seeds = range(JUDGING, JUDGING + (QUICK_SEEDS if quick else SEEDS))
     found: dict[str, float] = {}
-    for name, part in ([] if alone else _parts(seeds, log_line)) + _ways(drives, folder):
+    for name, part in ([] if alone else _parts(seeds, log_line)) + _ways(drives, folder, seeds):
         began = time.perf_counter()
         found |= part()
         log_line(f"{name}: {time.perf_counter() - began:.0f} s")
-    judged = [figure for figure in bars.judged(found) if not alone or figure.name.startswith(WHOLE_WAY)]
+    judged = [figure for figure in bars.judged(found) if not alone or figure.name.startswith(END_TO_END)]
     figures.write(folder / "figures.json", "fusion" + (" --quick" if quick else ""), list(seeds), judged)
     barred = [figure for figure in judged if figure.bar is not None]
     shown = [figure for figure in judged if figure.bar is None and not _curve(figure.name)]
@@ -71,13 +84,17 @@ def _curve(name: str) -> bool:
     return "reliability" in name or "share_after" in name
 
 
-def _ways(drives: Drives, folder: Path) -> list[tuple[str, Part]]:
+def _ways(drives: Drives, folder: Path, seeds: range) -> list[tuple[str, Part]]:
     ways = {world: drive for world, drive in drives.items() if world in end_to_end.WAYS}
     parts: list[tuple[str, Part]] = [
         (f"end to end, {world.scenario}", partial(end_to_end.measure, drive, folder, world))
         for world, drive in drives.items() if world not in ways
     ]  # fmt: skip
-    return [*parts, (f"end to end, {len(ways)} rough ways", partial(_rough, ways, folder))] if ways else parts
+    rough = [
+        (f"end to end, {len(ways)} rough ways", partial(_rough, ways, folder)),
+        ("towns with the errors of these ways", partial(_resampled, ways, folder, seeds)),
+    ]
+    return [*parts, *rough] if ways else parts
 
 
 def _rough(ways: Drives, folder: Path) -> dict[str, float]:
@@ -85,7 +102,12 @@ def _rough(ways: Drives, folder: Path) -> dict[str, float]:
     for world, drive in ways.items():
         drive(folder / world.scenario)
         found.append(moments.moments(folder / world.scenario))
-    return moments.figures(found, WHOLE_WAY)
+    return moments.figures(found, end_to_end.WHOLE_WAY)
+
+
+def _resampled(ways: Drives, folder: Path, seeds: range) -> dict[str, float]:
+    visits = resampled.joined([end_to_end.driven_in(folder / world.scenario) for world in ways])
+    return models.measure_real(visits, seeds)
 
 
 def _parts(seeds: range, log_line: LogLine) -> list[tuple[str, Part]]:
@@ -96,6 +118,7 @@ def _parts(seeds: range, log_line: LogLine) -> list[tuple[str, Part]]:
         ("fleets and rules", lambda: fleets.measure(seeds, log_line)),
         ("attacks", lambda: attacks.measure(seeds)),
         ("fleets that err otherwise", lambda: models.measure(seeds, log_line)),
+        ("how long a dry road stays dry", lambda: fading.measure(seeds)),
         ("bounds, a backlog, gentle drivers, a wet curve", lambda: situations.measure(seeds)),
     ]
 

@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 
 from fleet_service.fusion import Fusion, Observations, observations_of
 from fleet_service.lab.drive import LATENESS_S
+from fleet_service.lab.resampled import DrivenVisits, TrueVisits, driven
 from fleet_service.lab.score import Scores, of_beliefs, safe
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.view import LOWER, UPPER, measured
@@ -43,11 +44,12 @@ class World(NamedTuple):
     seed: int = 20_000  # of the vehicles
 
 
-LEVEL: Final = World("demo", 0.0, "fusion.whole_way.level")
-HILLS: Final = World("hills-20000", 0.5, "fusion.whole_way.hills")  # frictions and hills that nobody tuned on
+WHOLE_WAY: Final = "fusion.whole_way"  # prefix of the figures
+LEVEL: Final = World("demo", 0.0, f"{WHOLE_WAY}.level")
+HILLS: Final = World("hills-20000", 0.5, f"{WHOLE_WAY}.hills")  # frictions and hills that nobody tuned on
 # Half of the vehicles as real cars are, on five towns' own frictions and hills: what the figures without a further name
 # are of, see `moments`.
-WAYS: Final = tuple(World(f"hills-{seed}", 0.5, f"fusion.whole_way.{seed}", seed) for seed in range(20_001, 20_006))
+WAYS: Final = tuple(World(f"hills-{seed}", 0.5, f"{WHOLE_WAY}.{seed}", seed) for seed in range(20_001, 20_006))
 
 
 def command(vehicles: int, seconds: float, world: World) -> Drive:
@@ -147,6 +149,15 @@ def read(path: Path) -> dict[str, Any]:
         else:
             out[name] = table[name].to_numpy().astype(dtype)
     return out | {"vehicle": table["vehicle"].to_numpy()}
+
+
+def driven_in(folder: Path) -> DrivenVisits:
+    """What was reported on a way, beside the truth."""
+    truth = pq.read_table(folder / TRUTH)
+    _, vehicle = np.unique(truth["vehicle"].to_numpy(zero_copy_only=False), return_inverse=True)
+    enter = truth["enter_time"].cast(pa.int64()).to_numpy()
+    true = TrueVisits(vehicle, enter, truth["mu"].to_numpy(), truth["utilisation"].to_numpy())
+    return driven(read(folder / OBSERVATIONS), true)
 
 
 def observations_in(columns: dict[str, Any]) -> Observations:

@@ -2,20 +2,22 @@
 
 Each fleet gets to know itself on half of the roads and is judged on the other half, which nobody knew: so that the
 number of excited vehicles of a cell is what the map had to go by. Towns, ways and errors are drawn by judging seeds.
+One fleet errs as no model says: as the real estimator did on whole ways (`resampled`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
 
-from fleet_service.lab import rules, town
+from fleet_service.lab import resampled, rules, town
 from fleet_service.lab.agent import CLEAN, ErrorModel, Errors
 from fleet_service.lab.bars import COUNTS
 from fleet_service.lab.drive import watch
-from fleet_service.lab.score import Scores, calibration, coverage, joined, of_class, snapshots, worst_bin
+from fleet_service.lab.resampled import DrivenVisits
+from fleet_service.lab.score import Scores, by_surface, calibration, coverage, joined, of_class, snapshots, worst_bin
 from schemas.numeric import FloatArray
 
 VEHICLES: Final = 60
@@ -37,11 +39,13 @@ MODELS: Final[dict[str, ErrorModel]] = {
 }
 
 
-def one(model: ErrorModel, seed: int) -> tuple[Scores, list[Scores]]:
-    """Scores of the map, and of the rules, on one town."""
+def one(model: ErrorModel, seed: int, ways: DrivenVisits | None = None) -> tuple[Scores, list[Scores]]:
+    """Scores of the map, and of the rules, on one town; its reports are drawn from those of `ways`, if there are."""
     rng = np.random.default_rng([seed, 11])
     place, errors = town.build(rng, MINUTES, 0.0, model), Errors.draw(rng, VEHICLES, model)
     visits = town.drive(rng, place, errors, MINUTES, ACQUAINTED)
+    if ways is not None:
+        visits = resampled.drawn(rng, visits, ways, VEHICLES)
     watched = watch(rng, visits, MINUTES, AT)
     here = np.arange(town.CELLS) >= town.CELLS // 2
     return (
@@ -53,24 +57,33 @@ def one(model: ErrorModel, seed: int) -> tuple[Scores, list[Scores]]:
 def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
     """All fleets; `log_line` hears the progress."""
     out: dict[str, float] = {}
-    worst = 0.0
     for name, model in MODELS.items():
-        ours, theirs = zip(*(one(model, seed) for seed in seeds), strict=True)
-        whole, others = joined(list(ours)), [joined(list(of)) for of in zip(*theirs, strict=True)]
-        found = worst_bin(calibration([whole]))
-        worst = max(worst, found)
-        prefix = f"fusion.{name}"
-        out |= {f"{prefix}.coverage90": coverage(whole), f"{prefix}.worst_bin": found}
-        out[f"{prefix}.coverage90.spread"] = float(np.std([coverage(s) for s in ours]))
-        for n in COUNTS:
-            here = of_class(whole, n)
-            out[f"{prefix}.coverage90.n{n}"] = coverage(here)
-            out[f"{prefix}.rmse.n{n}"] = _root(here.error)
-            out[f"{prefix}.width.n{n}"] = _mean(here.width)
-            best = min((_mean(of_class(s, n).interval), label) for s, label in zip(others, rules.RULES, strict=True))
-            out[f"{prefix}.vs_best_rule.n{n}"] = _mean(here.interval) / best[0] if here.error.size else float("nan")
-        log_line(f"{name}: {len(whole.error)} answers")
-    return out | {"fusion.reliability.worst_bin": worst}
+        out |= _figures(f"fusion.{name}", [one(model, seed) for seed in seeds])
+        log_line(f"{name}: {len(seeds)} towns")
+    return out | {"fusion.reliability.worst_bin": max(out[f"fusion.{name}.worst_bin"] for name in MODELS)}
+
+
+def measure_real(ways: DrivenVisits, seeds: range) -> dict[str, float]:
+    """The fleet that errs as the real estimator did; nothing where no such visit was excited, or each was."""
+    if not ways.excited.any() or ways.excited.all():
+        return {}
+    return _figures("fusion.resampled", [one(CLEAN, seed, ways) for seed in seeds])
+
+
+def _figures(prefix: str, towns: Sequence[tuple[Scores, list[Scores]]]) -> dict[str, float]:
+    ours, theirs = zip(*towns, strict=True)
+    whole, others = joined(list(ours)), [joined(list(of)) for of in zip(*theirs, strict=True)]
+    out = {f"{prefix}.coverage90": coverage(whole), f"{prefix}.worst_bin": worst_bin(calibration([whole]))}
+    out[f"{prefix}.coverage90.spread"] = float(np.std([coverage(s) for s in ours]))
+    out |= {f"{prefix}.coverage90.{surface}": share for surface, share in by_surface(whole).items()}
+    for n in COUNTS:
+        here = of_class(whole, n)
+        out[f"{prefix}.coverage90.n{n}"] = coverage(here)
+        out[f"{prefix}.rmse.n{n}"] = _root(here.error)
+        out[f"{prefix}.width.n{n}"] = _mean(here.width)
+        best = min((_mean(of_class(s, n).interval), label) for s, label in zip(others, rules.RULES, strict=True))
+        out[f"{prefix}.vs_best_rule.n{n}"] = _mean(here.interval) / best[0] if here.error.size else float("nan")
+    return out
 
 
 def _mean(values: FloatArray) -> float:

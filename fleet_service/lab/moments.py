@@ -19,7 +19,7 @@ from fleet_service.fusion import Fusion
 from fleet_service.lab import end_to_end
 from fleet_service.lab.drive import LATENESS_S
 from fleet_service.lab.end_to_end import OBSERVATIONS, SEVERAL, TRUTH
-from fleet_service.lab.score import Scores, calibration, of_beliefs, worst_bin
+from fleet_service.lab.score import Scores, by_surface, calibration, joined, of_beliefs, worst_bin
 from fleet_service.serve.view import LOWER, UPPER, measured
 from schemas import mugrid
 from schemas.numeric import BoolArray, FloatArray
@@ -74,6 +74,7 @@ def figures(ways: Sequence[Sequence[AskedWay]], prefix: str) -> dict[str, float]
             f"{prefix}.interval_score.{name}": score[:, k].max(),
         }
     last = [way[-1].scores for way in ways]
+    out |= {f"{prefix}.coverage90.{surface}": share for surface, share in by_surface(joined(last)).items()}
     return out | {
         f"{prefix}.rmse": rmse.max(), f"{prefix}.coverage90": _farthest(cover.ravel()),
         f"{prefix}.worst_bin": worst_bin(calibration(last)), f"{prefix}.ways": float(len(ways)),

@@ -13,7 +13,7 @@ from fleet_service.lab.bars import COUNTS
 from fleet_service.lab.town import CELLS, Town, Visits
 from schemas import mugrid
 from schemas.numeric import BoolArray, FloatArray, IntArray
-from schemas.thresholds import SLIPPERY_MU
+from schemas.thresholds import SLIPPERY_MU, SURFACES
 
 ALPHA: Final = 0.10
 ENOUGH: Final = 3  # excited vehicles, for an error to count
@@ -113,6 +113,11 @@ def of_class(s: Scores, n: int) -> Scores:
     """The answers of a class of COUNTS, which reaches to the next."""
     edges = (*COUNTS[1:], np.iinfo(np.int64).max)
     return s.taken((s.vehicles >= n) & (s.vehicles < edges[COUNTS.index(n)]))
+
+
+def by_surface(s: Scores) -> dict[str, float]:
+    """Share of the truths inside the interval, by SURFACES."""
+    return {name: coverage(s.taken((s.truth > above) & (s.truth <= to))) for name, (above, to) in SURFACES.items()}
 
 
 def calibration(scores: Sequence[Scores]) -> FloatArray:

@@ -147,8 +147,8 @@ def _listen(host: str, port: int) -> socket.socket:
     found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         found.bind((host, port))
-    except OSError as error:
+    except (OSError, OverflowError) as error:  # the latter: no port has so high a number
         found.close()
         fix = "give another with --port, or 0 for a free one"
-        raise InputError("port", f"cannot listen on {host}:{port} ({error.strerror})", fix) from error
+        raise InputError("port", f"cannot listen on {host}:{port} ({error.args[-1]})", fix) from error
     return found

@@ -31,7 +31,6 @@ from schemas.tables import US_STEP
 from schemas.wire import Kind
 
 IDENTITY: Final = ["vehicle", "boot", "region", "seq"]
-_FIRST_TIME: Final = {Kind.OBSERVATION: "enter_time", Kind.STATE: "time"}  # by which a batch is too old
 COLUMNS: Final = [
     *("leave_time", "cell", "sector", "latitude", "position_std", "yaw", "mu", "mu_lower", "mu_upper"),
     *("mu_utilised", "log_likelihood", *IDENTITY, "row", "late", "weight"),
@@ -67,7 +66,7 @@ def restore_streams(
         begin: where the archive begins to matter.
         damaged: is told of a damaged file.
     """
-    for kind, first in _FIRST_TIME.items():
+    for kind, first in layout.FIRST_TIME.items():
         columns = (*IDENTITY, "first_held", first)
         wanted = reading.Wanted(columns, days=(begin.day, None), after=begin.after, until=begin.until)
         for table in reading.read_wanted(root, kind, wanted, damaged):
@@ -129,6 +128,17 @@ def too_much() -> InputError:
     return InputError("at", "would have to read too much of the archive", "narrow bbox")
 
 
+def weathered(root: Path, lateness_s: float, until: int) -> Fusion:
+    """A fusion that knows the weather received until a moment [ns], and no observation yet.
+
+    Raises:
+        OSError: the archive cannot be read.
+    """
+    fusion = Fusion(lateness_s)
+    fusion.update_weather(archived(root, received_until=until))
+    return fusion
+
+
 def past(
     root: Path, lateness_s: float, until: int, box: Box | None = None, most: int | None = None,
     listener: Callable[[Fusion], Heard] | None = None,
@@ -140,9 +150,8 @@ def past(
         InputError: there are more rows than `most`.
         OSError: the archive cannot be read.
     """
-    fusion = Fusion(lateness_s)
+    fusion = weathered(root, lateness_s, until)
     begin = Begin(until // layout.DAY_NS - MAP_DAYS)
-    fusion.update_weather(archived(root, received_until=until))
     wanted, heard = Since(begin, until=until, box=box, most=most), nobody if listener is None else listener(fusion)
     for _ in replay(root, fusion, wanted, heard=heard):
         pass  # the alerts of then are history

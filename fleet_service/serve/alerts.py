@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from fleet_service.fusion import Fusion
-from fleet_service.fusion.belief import SLIPPERY_SHARE, quantiles
+from fleet_service.fusion.belief import PRIOR, SLIPPERY_SHARE, quantiles
 from fleet_service.fusion.store.records import GRIP, ICE, SOURCES
 from fleet_service.serve.view import LOWER, UPPER
 from schemas import grid
@@ -17,9 +17,11 @@ from schemas.thresholds import NS, SLIPPERY_MU
 from schemas.wire import Alert
 
 RAISE_ABOVE: Final = 0.9  # P(slippery)
-# ... and by its own reports alone: neighbours confirm, they do not accuse. Nor do they where as many found grip as ice:
-# there the stretch may end, and fixes err by metres.
-LIKELY: Final = 0.5
+# ... and by its own reports alone no less than without any: neighbours confirm, they do not accuse. On a road that was
+# firmly dry each cell bears the doubt about a change by itself (CHANGE_LEAST), so that ice takes three passes to a half
+# where the reports of all neighbours are sure. Nor do they confirm where as many found grip as ice: there the stretch
+# may end, and fixes err by metres.
+LIKELY: Final = float(SLIPPERY_SHARE @ PRIOR)
 # Grip must be as sure as ice was: clearing too early is the dearer error, and a few liars can lower P for a while.
 CLEAR_BELOW: Final = 0.05
 FADE_BELOW: Final = 0.5  # ... but when nobody confirms it, it ends as soon as it is less likely than not

@@ -111,7 +111,14 @@ class MapQueryable:
         self._heavy: list[_Heavy] = []  # a heap
         self._light = _Light()
         self._worker: threading.Thread | None = None
+        self._busy_since: float | None = None  # with one tile of a heavy answer
         self._some = threading.Condition()
+
+    @property
+    def hangs_s(self) -> float:
+        """For how long one tile of a heavy answer is being made [s]."""
+        since = self._busy_since
+        return 0.0 if since is None else time.monotonic() - since
 
     def __call__(self, request: zenoh.Query) -> None:
         """Answer one query, now or a little later."""
@@ -166,11 +173,13 @@ class MapQueryable:
             with self._some:
                 self._some.wait_for(lambda: self._heavy)
                 first = heapq.heappop(self._heavy)
-            began = time.perf_counter()
-            if self._goes_on(first):
+            began = self._busy_since = time.monotonic()
+            goes_on = self._goes_on(first)
+            self._busy_since = None
+            if goes_on:
                 with self._some:
                     heapq.heappush(self._heavy, first)
-            time.sleep(min(REST * (time.perf_counter() - began), LONGEST_REST_S))
+            time.sleep(min(REST * (time.monotonic() - began), LONGEST_REST_S))
 
     def _goes_on(self, heavy: _Heavy) -> bool:
         """Answer with one tile more; whether there may be others."""

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from fleet_service.archive import terms
+from fleet_service.archive import compaction, terms
 from fleet_service.archive.bucket import CopyError, ObjectBucket
 from fleet_service.archive.copies import FOLDERS, Copy, copy_for
 from fleet_service.archive.files import lock
@@ -26,10 +28,13 @@ class Holding:
     Attributes:
         copy: of the archive; None: it has none.
         lease: of the copy; None: nobody else is to be told.
+        to: the standby that it is to be handed over to; "": none.
+        leaves: all is ready for that.
     """
 
     def __init__(self, lock_file: BinaryIO, copy: Copy | None, lease: Lease | None = None) -> None:
         self._lock_file, self.copy, self.lease = lock_file, copy, lease
+        self.to, self.leaves = "", False
 
     @property
     def epoch(self) -> int:
@@ -42,14 +47,29 @@ class Holding:
         return self.lease is None or self.lease.fresh
 
     @property
+    def left_s(self) -> float:
+        """For which it may acknowledge without a renewal of the lease [s]; infinite without one."""
+        return math.inf if self.lease is None else self.lease.left_s
+
+    @property
     def lost(self) -> bool:
         """Whether another has taken over."""
         return self.lease is not None and self.lease.lost
 
+    @property
+    def former(self) -> tuple[str, ...]:
+        """Names of the services that had it earlier, and of this one; none without a lease."""
+        return () if self.lease is None else (*self.lease.former, self.lease.service)
+
+    def give_up(self) -> None:
+        """Another has taken over, as its tokens tell."""
+        if self.lease is not None:
+            self.lease.lost = True
+
     def close(self) -> None:
         """Let the next have it."""
         if self.lease is not None:
-            self.lease.end()
+            self.lease.end(self.to if self.leaves else "")
         if self.copy is not None:
             self.copy.close()
         self._lock_file.close()
@@ -71,7 +91,7 @@ def alone(config: ServiceConfig, root: Path) -> Holding:
         raise
 
 
-Signs = tuple[Callable[[], bool], Callable[[str], bool]]  # as of `serving.standing_by`
+Signs = tuple[Callable[[], bool], Callable[[str], bool], Callable[[], None]]  # as of `serving.standing_by`
 
 
 def hold(
@@ -84,7 +104,7 @@ def hold(
         root: of the archive.
         stop: ends the wait.
         say: takes a line whenever there is something new to wait for.
-        signs: of a standby: whether it would be heard, and whether a service's token stands.
+        signs: of a standby: whether it would be heard, whether a service's token stands, and what it does at each look.
 
     Raises:
         InputError: another service holds folder or copy, or the copy is not usable as it is set.
@@ -123,7 +143,7 @@ def _leased(
             if lease.succeeds and not mirrors:
                 raise InputError("archive.path", f"{root} is no archive of {url}", "give the service an empty folder")
             copy.under(partial(_fresh, lease), lease.alone)
-            if _joined(config, copy, lease, stop, say if standby else None):
+            if _joined(config, root, copy, lease, stop, say):
                 terms.note(root, lease.term.epoch)
                 return Holding(lock_file, copy, lease)
             lease.end()
@@ -151,23 +171,37 @@ def _leave(lease: Lease, copy: Copy) -> None:
 
 
 def _joined(
-    config: ServiceConfig, copy: Copy, lease: Lease, stop: threading.Event, say: Callable[[str], None] | None
+    config: ServiceConfig, root: Path, copy: Copy, lease: Lease, stop: threading.Event, say: Callable[[str], None]
 ) -> bool:  # fmt: skip
-    """Let the folder become what the copy is; False if stopped, or another has the lease. A standby, which has `say`,
-    tries again while the bucket is away."""
-    said = ""
+    """Let the folder become what the copy is; False if stopped, or another has the lease. A standby tries again while
+    the bucket is away."""
+    logged = ""
     while not stop.is_set():
         try:
-            copy.join(config.name, lease.term, succeeds=lease.succeeds)
-        except CopyError as error:
+            with _still(root) if lease.succeeds else nullcontext():
+                copy.join(None if config.standby else config.name, lease.term, succeeds=lease.succeeds)
+        except (CopyError, _BusyError) as error:
             if lease.lost:
                 return False
-            if say is None:
+            if isinstance(error, CopyError) and not config.standby:
                 raise
-            if str(error) != said:
-                say(f"waiting: the copy cannot be read ({error})")
-                said = str(error)
+            if str(error) != logged:
+                say(f"waiting: {error}")
+                logged = str(error)
             stop.wait(AGAIN_S)
         else:
             return True
     return False
+
+
+class _BusyError(Exception):
+    """Somebody is at work in the folder."""
+
+
+def _still(root: Path) -> BinaryIO:
+    """See that no compaction goes on which the service began that had the folder before, and which outlived it: what it
+    has read may be rows that do not count any more."""
+    try:
+        return compaction.alone(root)
+    except InputError as error:
+        raise _BusyError(str(error)) from error

@@ -1,6 +1,6 @@
 """Who serves an archive's copy: a lease in its bucket, for which a bucket that makes an object only once is enough.
 
-    lease/NUMBER.json       {"holder", "service", "epoch", "turn", "released"}: the highest number holds
+    lease/NUMBER.json       {"holder", "service", "epoch", "turn", "released", "before", "to"}: the highest number holds
     ARCHIVE/holder.json     who this folder is to the others, over restarts
 
 Taking over is making the next number, which one alone can; renewing is putting one's own number again, with the next
@@ -19,8 +19,10 @@ Why nothing is doubled. What counts is one set of files, which B read whole befo
 archived and did not acknowledge is known to B, and acknowledged again. What of A's is not in the set its senders send
 again, and it is admitted once. A's folder becomes what the bucket is before A serves again.
 
-Not covered: a machine whose clock of elapsed time runs at less than half the speed of another's, and a bucket that does
-not show at once what it has taken.
+A machine that was suspended finds its lease old (`elapsed`).
+
+Not covered: a machine whose clock of elapsed time runs at less than half the speed of another's, or stands still while
+it is copied from host to host, and a bucket that does not show at once what it has taken.
 """
 
 from __future__ import annotations
@@ -48,11 +50,21 @@ HOLDER: Final = "holder.json"  # of an archive: who it is, over restarts
 TURNS: Final = 6  # in the time of a lease
 HINT: Final = 0.6  # of it, after which one whose token fell is followed: more than the half in which it acknowledges
 AHEAD_S: Final = 10.0  # between two times that a standby gets what is new, so that little is left when it must
+_BOOTTIME: Final[int | None] = getattr(time, "CLOCK_BOOTTIME", None)
 LOOK_S: Final = 0.25  # between two looks of who waits
 
 
 class Held(NamedTuple):
-    """A lease as the bucket has it."""
+    """A lease as the bucket has it.
+
+    Attributes:
+        number, epoch: of the term.
+        holder, service: the folder, and the name of the service on it.
+        turn: grows with each renewal.
+        released: it was given free.
+        before: names of the services that held it earlier.
+        to: the service that it was given free for; for a lease's time others leave it alone.
+    """
 
     number: int
     holder: str
@@ -60,6 +72,8 @@ class Held(NamedTuple):
     epoch: int
     turn: int
     released: bool
+    before: tuple[str, ...] = ()
+    to: str = ""
 
     @property
     def name(self) -> str:
@@ -77,6 +91,7 @@ class Standby(NamedTuple):
 
     may: Callable[[], bool]  # whether it would be heard if it took over now
     stands: Callable[[str], bool]  # whether a service's token stands
+    alive: Callable[[], None]  # is called at each look
     get_ahead: Callable[[], None]  # gets what is new in the bucket
 
 
@@ -91,12 +106,13 @@ class Lease:
 
     Attributes:
         lost: another has it.
+        service: its name.
         serves: whether the service does its work: one that reaches no router is to be followed.
         succeeds: whether somebody else had it before: the folder may hold what counts for nothing.
     """
 
     def __init__(self, holder: str, bucket: ObjectBucket, service: str, lease_s: float) -> None:
-        self._holder, self._bucket, self._service, self._lease_s = holder, bucket, service, lease_s
+        self._holder, self._bucket, self.service, self._lease_s = holder, bucket, service, lease_s
         self._mine: Held | None = None
         self._renewed, self._stop = 0.0, threading.Event()
         self._thread: threading.Thread | None = None
@@ -109,9 +125,19 @@ class Lease:
         return Term(0, 0) if self._mine is None else Term(self._mine.number, self._mine.epoch)
 
     @property
+    def former(self) -> tuple[str, ...]:
+        """Names of the services that held it earlier."""
+        return () if self._mine is None else self._mine.before
+
+    @property
+    def left_s(self) -> float:
+        """For which what is in the bucket may be acknowledged, without a renewal [s]; 0 or less: not now."""
+        return 0.0 if self.lost or self._mine is None else self._lease_s / 2 - (elapsed() - self._renewed)
+
+    @property
     def fresh(self) -> bool:
         """Whether what is in the bucket now may be acknowledged."""
-        return not self.lost and self._mine is not None and time.monotonic() - self._renewed < self._lease_s / 2
+        return self.left_s > 0.0
 
     def alone(self) -> None:
         """See that nobody has taken over: then who does later finds all that was put until now.
@@ -140,9 +166,11 @@ class Lease:
             CopyError: the bucket cannot be reached, and this one is no standby.
         """
         seen: Held | None = None
-        since, ahead, said, stood = time.monotonic(), 0.0, "", False
+        since, ahead, logged, stood = time.monotonic(), 0.0, "", False
         while not stop.is_set():
             line = ""
+            if standby is not None:
+                standby.alive()
             try:
                 found = self._newest()
                 if found is not None and found != seen:
@@ -154,7 +182,7 @@ class Lease:
                 stands = standby is not None and found is not None and standby.stands(found.service)
                 stale_s = self._lease_s * (HINT if stood and not stands else 1.0)
                 stood = stood or stands
-                free = found is None or found.released or found.holder == self._holder
+                free = found is None or (found.to in ("", self.service) and (found.released or self._had(found)))
                 if free or time.monotonic() - since >= stale_s:
                     if (standby is None or standby.may()) and self._take(found, epoch, stop):
                         return True
@@ -167,9 +195,9 @@ class Lease:
                 if standby is None:
                     raise
                 line = f"standby: the copy cannot be reached ({error})"
-            if line != said and line:
+            if line != logged and line:
                 say(line)
-                said = line
+                logged = line
             stop.wait(LOOK_S)
         return False
 
@@ -178,21 +206,21 @@ class Lease:
         self._thread = threading.Thread(target=self._keep, name="lease", daemon=True)
         self._thread.start()
 
-    def end(self) -> None:
-        """Give it free, if it is still held: nothing is acknowledged after this."""
+    def end(self, to: str = "") -> None:
+        """Give it free, if it is still held, for a service or for any: nothing is acknowledged after this."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join(self._lease_s)
         mine, self._mine = self._mine, None
         if mine is not None and not self.lost:
             try:
-                self._bucket.put(mine.name, mine._replace(released=True, turn=mine.turn + 1).content)
+                self._bucket.put(mine.name, mine._replace(released=True, turn=mine.turn + 1, to=to).content)
             except CopyError as error:
                 log.warning("the lease runs out by itself: %s", error)
 
     def again(self) -> Lease:
         """One to wait for, after this one was lost."""
-        return Lease(self._holder, self._bucket, self._service, self._lease_s)
+        return Lease(self._holder, self._bucket, self.service, self._lease_s)
 
     def renew(self) -> None:
         """Put the next turn; it counts if nobody has a higher number after it.
@@ -202,7 +230,7 @@ class Lease:
         """
         if self._mine is None or self.lost:
             return
-        began = time.monotonic()
+        began = elapsed()
         turn = self._mine._replace(turn=self._mine.turn + 1)
         self._bucket.put(turn.name, turn.content)
         self._mine = turn
@@ -219,6 +247,10 @@ class Lease:
             if self.lost:
                 return
 
+    def _had(self, found: Held) -> bool:
+        """Whether it was this folder's in a former start."""
+        return found.holder == self._holder
+
     def _newest(self) -> Held | None:
         names = [name for name in self._bucket.names(FOLDER) if name.endswith(".json")]
         content = self._bucket.get(max(names)) if names else None
@@ -228,8 +260,9 @@ class Lease:
         """Make the next number; False if another was faster."""
         number = 1 if found is None else found.number + 1
         epoch = max(int(time.time()), known() + 1, 0 if found is None else found.epoch + 1)
-        mine = Held(number, self._holder, self._service, epoch, 0, released=False)
-        began = time.monotonic()
+        before = () if found is None else tuple(dict.fromkeys((*found.before, found.service)))
+        mine = Held(number, self._holder, self.service, epoch, 0, released=False, before=before)
+        began = elapsed()
         if not self._bucket.make(mine.name, mine.content):
             return False
         self._mine, self._renewed = mine, began
@@ -237,6 +270,11 @@ class Lease:
         if found is not None and self._bucket.get(found.name) != found.content:
             stop.wait(self._lease_s / 2)  # it was renewed in between, and may acknowledge for so long
         return True
+
+
+def elapsed() -> float:
+    """Seconds that have passed; those in which the machine was suspended too, where the system counts them (Linux)."""
+    return time.monotonic() if _BOOTTIME is None else time.clock_gettime(_BOOTTIME)
 
 
 def holder_of(root: Path, url: str) -> tuple[str, bool]:
@@ -270,4 +308,4 @@ def forget_holder(root: Path) -> None:
 
 def _read(name: str, content: bytes) -> Held:
     told: dict[str, Any] = json.loads(content)
-    return Held(int(Path(name).stem), **told)
+    return Held(int(Path(name).stem), **{**told, "before": tuple(told.get("before", ()))})

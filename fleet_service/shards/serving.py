@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Final
 
@@ -12,7 +12,7 @@ import zenoh
 
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
-from schemas.keys import Served
+from schemas.keys import CLAIMS, SERVES, WAITS, Served
 from schemas.regions import overlap
 from schemas.runtime import tokens, zenoh_session
 
@@ -22,50 +22,75 @@ _TRIES: Final = 5  # of services that start at the same moment
 
 
 @contextmanager
-def serving(
-    session: zenoh.Session, name: str, regions: Sequence[str], stop: threading.Event, *, owns: bool = False
+def claimed(
+    session: zenoh.Session, name: str, regions: Sequence[str], stop: threading.Event, former: Collection[str] = ()
 ) -> Iterator[frozenset[Served]]:
-    """Say that a service serves these regions, until the block ends.
+    """Have regions for oneself, until the block ends.
 
     Args:
         session: of the service.
         name: of the service.
         regions: key expressions.
         stop: ends the wait for another's token to fall.
-        owns: whether a lease says that it is the one of this name: then another that says so too is to leave.
+        former: names of services that had the lease which this one has: one that says so still is to leave.
 
     Raises:
-        InputError: another service serves one of them.
+        InputError: another service has one of them.
     """
     mine = frozenset(Served(region, name, secrets.token_hex(4)) for region in regions)
-    held = _claimed(session, mine, stop, name if owns else None)
-    try:
+    with _standing(_claimed(session, mine, stop, former)):
         yield mine
+
+
+@contextmanager
+def serving(session: zenoh.Session, mine: frozenset[Served]) -> Iterator[None]:
+    """Say that regions are served, while the block runs. All that may be asked is to be answered before and after it:
+    an empty answer of a region that is served says that nobody was there."""
+    with _standing(_declared(session, mine, SERVES)):
+        yield
+
+
+@contextmanager
+def _standing(held: list[zenoh.LivelinessToken]) -> Iterator[None]:
+    try:
+        yield
     finally:
         for token in held:
             token.undeclare()
 
 
-def rivals(mine: frozenset[Served], there: set[Served], former: str | None = None) -> list[Served]:
-    """Tokens of others for the same regions, but for those of a `former` service."""
-    others = (one for one in there - mine if one.service != former)
+@contextmanager
+def successors(session: zenoh.Session, mine: frozenset[Served]) -> Iterator[Callable[[], bool]]:
+    """Whether a service has come for these regions since the block began: so does one hear that it was followed that is
+    cut off from its bucket, and would else go on telling what it knew then."""
+    with tokens.watched(session) as there:
+        before = there.here
+        yield lambda: bool(rivals(mine, there.here - before))
+
+
+def rivals(mine: frozenset[Served], there: set[Served], former: Collection[str] = ()) -> list[Served]:
+    """Tokens of others for the same regions, but for those of `former` services."""
+    others = (one for one in there - mine if one.service not in former)
     return sorted(one for one in others if any(overlap(one.region, own.region) for own in mine))
 
 
 def _claimed(
-    session: zenoh.Session, mine: frozenset[Served], stop: threading.Event, former: str | None
+    session: zenoh.Session, mine: frozenset[Served], stop: threading.Event, former: Collection[str]
 ) -> list[zenoh.LivelinessToken]:  # fmt: skip
+    def others_there() -> list[Served]:
+        return rivals(mine, tokens.standing(session) | tokens.standing(session, CLAIMS), former)
+
     for _ in range(_TRIES):
         waited = 0.0
-        while others := rivals(mine, tokens.standing(session), former):
+        while others := others_there():
             if waited > GONE_S or stop.wait(LOOK_S):
                 break
             waited += LOOK_S
         if others:
             problem = f"{others[0].region} is served by {others[0].service} already"
             raise InputError("regions", problem, "stop that service, or give each its own regions")
-        held = _declared(session, mine)
-        if not rivals(mine, tokens.standing(session), former):
+        held = _declared(session, mine, CLAIMS)
+        if not others_there():
             return held
         for token in held:  # both began at once: the one that comes back first has it
             token.undeclare()
@@ -73,22 +98,24 @@ def _claimed(
     raise InputError("regions", "others start for them at the same time", "start one service for each region")
 
 
-def _declared(session: zenoh.Session, mine: frozenset[Served]) -> list[zenoh.LivelinessToken]:
-    return [session.liveliness().declare_token(token.key) for token in sorted(mine)]
+def _declared(session: zenoh.Session, mine: frozenset[Served], root: str) -> list[zenoh.LivelinessToken]:
+    return [session.liveliness().declare_token(token.below(root)) for token in sorted(mine)]
 
 
 @contextmanager
 def standing_by(
-    config: ServiceConfig, stop: threading.Event
-) -> Iterator[tuple[Callable[[], bool], Callable[[str], bool]] | None]:
-    """Of a standby: whether it would be heard if it took over now, as it reaches a router, and whether the token of a
-    service stands. None: it is none, or was stopped before it reached a router."""
+    config: ServiceConfig, stop: threading.Event, alive: Callable[[], None] = lambda: None
+) -> Iterator[tuple[Callable[[], bool], Callable[[str], bool], Callable[[], None]] | None]:
+    """Of a standby: whether it would be heard if it took over now, as it reaches a router, whether the token of a
+    service stands, and `alive`. None: it is none, or was stopped before it reached a router."""
     session = zenoh_session.open_session(config.zenoh, stop, config.name) if config.standby else None
     if session is None:
         yield None
         return
-    with session, tokens.watched(session) as there:
+    waits = frozenset(Served(region, config.name, secrets.token_hex(4)) for region in config.regions)
+    with session, tokens.watched(session) as there, _standing(_declared(session, waits, WAITS)):
         yield (
             lambda: bool(list(session.info.routers_zid())),
             lambda name: any(one.service == name for one in there.here),
+            alive,
         )

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BufferedWriter
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final
 
 ENDING: Final = ".tmp"
+_OWN: Final = ".drafts-"
 
 
 def draft_of(path: Path) -> Path:
@@ -45,6 +48,20 @@ def written(path: Path, mode: int | None = None, *, named: bool = True) -> Itera
         raise
     if named:
         sync_directory(path.parent)
+
+
+@contextmanager
+def own_drafts(folder: Path) -> Iterator[Path]:
+    """A folder within `folder` for drafts that are renamed when they are whole: two tries at one file, on one machine
+    or on two, write different drafts. What a try leaves that is killed goes by `sweep_drafts`."""
+    with TemporaryDirectory(prefix=_OWN, dir=folder) as drafts:
+        yield Path(drafts)
+
+
+def sweep_drafts(folder: Path) -> None:
+    """Remove the drafts of tries that died, when none is under way."""
+    for drafts in folder.glob(f"{_OWN}*"):
+        shutil.rmtree(drafts, ignore_errors=True)
 
 
 def sync_directory(folder: Path) -> None:

@@ -37,8 +37,8 @@ class Figure:
         if self.bar is None:
             return not math.isnan(self.value)
         if isinstance(self.bar, tuple):
-            return self.bar[0] <= self.value <= self.bar[1]
-        return self.value <= self.bar if self.better == "less" else self.value >= self.bar
+            return bool(self.bar[0] <= self.value <= self.bar[1])  # NumPy's own is no JSON
+        return bool(self.value <= self.bar if self.better == "less" else self.value >= self.bar)
 
 
 def header(campaign: str, seeds: Sequence[int]) -> dict[str, object]:

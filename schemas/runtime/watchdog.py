@@ -4,13 +4,49 @@ from __future__ import annotations
 
 import os
 import socket
+import threading
+import time
+from collections.abc import Callable
 from contextlib import suppress
+from typing import Final
 
 _ADDRESS = "NOTIFY_SOCKET"
+_WITHIN: Final = "WATCHDOG_USEC"  # of systemd: a sign is due so often
+_USUAL_US: Final = 40e6
+LONG_S: Final = 900.0  # a start may take as long, see TimeoutStartSec of the units
+_at_work = threading.Event()
 
 
 def alive() -> None:
     """Tell the service manager that the process does its work, and so is ready; nothing where none asked for it."""
+    _at_work.set()
+    _tell()
+
+
+def patient(most_s: float = LONG_S) -> Callable[[], None]:
+    """Tell that a process is ready which waits for its work, as a standby does, and that it lives, until `alive`: from
+    a thread, since what it does meanwhile takes long in one piece.
+
+    Returns:
+        to be called again and again; so long [s] after the last call there are no more signs.
+    """
+    last = time.monotonic()
+    every_s = float(os.environ.get(_WITHIN, _USUAL_US)) * 1e-6 / 4
+
+    def beat() -> None:
+        nonlocal last
+        last = time.monotonic()
+
+    def keep() -> None:
+        while not _at_work.wait(every_s) and time.monotonic() - last < most_s:
+            _tell()
+
+    _at_work.clear()
+    threading.Thread(target=keep, name="patience", daemon=True).start()
+    return beat
+
+
+def _tell() -> None:
     address = os.environ.get(_ADDRESS)
     if address:
         with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:

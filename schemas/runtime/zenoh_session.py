@@ -70,7 +70,7 @@ def open_session(settings: ZenohSettings, stop: threading.Event | None = None, n
         try:
             return zenoh.open(configuration(settings, name))
         except zenoh.ZError as error:
-            reason = str(error)
+            reason = str(error).partition(" at /")[0].strip()  # where Zenoh was built is nobody's business
             if reason not in logged:
                 logged.add(reason)
                 log.warning("no session at %s yet: %s", ", ".join(settings.connect), reason)

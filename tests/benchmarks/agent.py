@@ -20,7 +20,7 @@ from schemas.vehicle import load_vehicle
 from tests.benchmarks.measure import median_s
 from tests.faults.processes import stage
 
-EDGE = (sys.executable, "-c", "import sys; from edge_agent.cli import main; sys.exit(main())")
+EDGE = (sys.executable, "-m", "edge_agent.cli")
 FIRST = """import sys
 from pathlib import Path
 from edge_agent.app.estimator_factory import bank_of

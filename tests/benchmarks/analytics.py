@@ -21,6 +21,7 @@ import geoparquet_validator
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pacsv
+import pyarrow.parquet as pq
 
 from fleet_service.analytics import output, synthetic
 from fleet_service.analytics.engines import QueryEngine
@@ -38,7 +39,7 @@ from schemas.runtime.figures import Figure
 from schemas.wire import Kind
 from tests.benchmarks.contract import size_of
 from tests.benchmarks.past import past
-from tests.fleet_service.analytics.agreement import differs
+from tests.fleet_service.analytics.agreement import differs, roads_along
 from tests.fleet_service.archive.readers import READERS, by_spark
 
 FOLDER = Path(".analytics")
@@ -179,11 +180,14 @@ def _reads(reader: Callable[[Path], tuple[float, ...]], root: Path, expected: in
 
 
 def _different(root: Path, readings: Path) -> int:
-    count = 0
+    count, roads = 0, root.parent / "roads.parquet"
+    pq.write_table(roads_along(next(reading.read(root, Kind.OBSERVATION, ["cell"]))["cell"].to_numpy()), roads)
     for question in QUESTIONS.values():
         if question.name == "replay":  # asks no engine
             continue
-        options = Options(at=HALF, stations=readings, report=lambda _: None)
+        options = Options(
+            at=HALF, stations=readings, report=lambda _: None, roads=roads, level=0.35, within_s=3600.0
+        )  # fmt: skip
         one, other = (question.ask(QueryEngine(name, root, PART), options) for name in ("duckdb", "spark"))
         said = differs(one, other, question)
         tell(f"{question.name}: {said or 'the engines agree'}")

@@ -1,4 +1,4 @@
-"""`make batch-bench`: what batch work makes of an archive, beside the archive; writes .batch/figures.json."""
+"""`make batch-bench`: what batch work makes of an archive and of drives, beside them; writes .batch/figures.json."""
 
 from __future__ import annotations
 
@@ -9,18 +9,29 @@ from typing import Final
 
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
-from tests.benchmarks import iceberg
+from tests.benchmarks import iceberg, spread
 from tests.house import ROOT
 
 FOLDER: Final = ROOT / ".batch"
+
+
+def measured(folder: Path) -> list[Figure]:
+    """All figures; what is made for them goes into a folder."""
+    logs = spread.drives(folder / "drives")
+    return [
+        Figure("iceberg.rows_different", iceberg.measured(folder / "iceberg"), "rows", 0.0),
+        Figure("spark.replay.difference", spread.replay_difference(logs, folder / "replay"), "files", 0.0),
+        Figure("spark.rebuild.difference", spread.rebuild_difference(folder / "rebuild"), "", 1e-6),
+        Figure("spark.replay.scaling", spread.replay_scaling(logs, folder / "scaling"), "", 1.6, "more"),
+    ]
 
 
 def main() -> int:
     """Measure; 1 where a bar does not hold."""
     FOLDER.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
-        rows = [Figure("iceberg.rows_different", iceberg.measured(Path(folder)), "rows", 0.0)]
-    figures.write(FOLDER / "figures.json", "batch", iceberg.SEEDS, rows)
+        rows = measured(Path(folder))
+    figures.write(FOLDER / "figures.json", "batch", (*iceberg.SEEDS, *spread.SEEDS), rows)
     print(figures.markdown(rows))
     return 0 if all(row.holds for row in rows) else 1
 

@@ -11,6 +11,7 @@ import pyarrow as pa
 import pytest
 
 from deploy.demo import compare, page, picture
+from deploy.demo.__main__ import report
 from schemas.runtime.figures import Figure
 from schemas.wire import Alert
 from tests.browser import opened
@@ -65,6 +66,7 @@ def test_a_cell_without_a_truth_is_left_out() -> None:
 
 def test_passes_count_excited_drives_over_the_patch_until_its_alert() -> None:
     road = visits(
+        ("z", 1, 7, 0.9, 0.9), ("z", 2, 8, 0.9, 0.9),  # it was dry
         ("a", 11, 7, 0.2, 0.9), ("a", 12, 8, 0.2, 0.9),  # one pass of a over two cells
         ("b", 20, 7, 0.2, 0.9), ("c", 21, 7, 0.2, 0.1),  # c rolled over it
         ("a", 40, 7, 0.2, 0.9), ("d", 60, 7, 0.2, 0.9),  # d comes after the alert
@@ -80,9 +82,11 @@ def test_an_alert_elsewhere_or_none_at_all_is_an_infinite_delay() -> None:
     assert compare.delay_passes(road, patch, [], 10 * S) == float("inf")
 
 
-def test_a_road_that_was_slippery_before_is_not_the_new_patch() -> None:
-    road = visits(("a", 1, 7, 0.2, 0.9), ("a", 11, 7, 0.2, 0.9), ("a", 12, 8, 0.2, 0.9))
-    assert compare.newly_slippery(road, 10 * S).tolist() == [False, False, True]
+def test_old_snow_its_border_and_where_nobody_was_before_are_not_the_new_patch() -> None:
+    before = (("a", 1, 7, 0.2, 0.9), ("a", 2, 8, 0.9, 0.9), ("a", 3, 9, 0.41, 0.9), ("b", 4, 9, 0.6, 0.9))
+    after = (("a", 11, 7, 0.2, 0.9), ("a", 12, 8, 0.2, 0.9), ("a", 13, 9, 0.39, 0.9), ("a", 14, 10, 0.2, 0.9))
+    new = compare.newly_slippery(visits(*before, *after), 10 * S)
+    assert new.tolist() == [False, False, False, False, False, True, False, False]
 
 
 def test_picture_and_page_are_written_and_no_value_can_end_the_script(tmp_path: Path) -> None:
@@ -117,7 +121,9 @@ def test_the_page_of_the_demo_opens_in_a_browser_with_both_maps_and_its_figures(
         assert "demo.map.rmse" in shown.page.locator("#table").inner_text()
 
 
-def test_who_was_warned_and_lost_grip_on_the_new_ice_is_counted_by_passes(tmp_path: Path) -> None:
+def test_who_was_warned_and_lost_grip_on_the_new_ice_is_counted_by_passes_told_and_drawn(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Of two warned and one unwarned pass since the first alert; what was before it counts for nobody."""
     driven = visits(
         ("sim-001", 1.0, 7, 0.9, 0.5), ("sim-002", 11.0, 7, 0.2, 1.0), ("sim-001", 31.0, 7, 0.2, 0.6),
@@ -132,8 +138,15 @@ def test_who_was_warned_and_lost_grip_on_the_new_ice_is_counted_by_passes(tmp_pa
         grip.line()
         == "Over the new ice, once it was known: 1 of 2 warned drivers lost grip, 1 of 1 who were not warned."
     )
-    assert not len(compare.lost_grip(driven, [], 10 * S, 0.5).lost), "nobody knew of it"
+    nobody = compare.lost_grip(driven, [], 10 * S, 0.5)
+    assert not len(nobody.lost), "nobody knew of it"
+    assert {one.name: one.value for one in nobody.figures()} == {"demo.passes.warned": 0, "demo.passes.unwarned": 0}
+    assert all(one.holds for one in nobody.figures())
     found = compare.MapComparison(tile([7, 8], 0.1, 0.3), np.array([0.2, 0.2]))
-    picture.draw(found, tmp_path / "a.png", grip)
-    picture.draw(found, tmp_path / "b.png")
-    assert (tmp_path / "a.png").read_bytes() != (tmp_path / "b.png").read_bytes()
+    told = report(tmp_path, found, [Figure("demo.map.rmse", 0.09, "", 0.12)], grip, 1)
+    assert grip.line() in capsys.readouterr().out
+    shares = {figure.name: figure.value for figure in told}
+    assert (shares["demo.lost_grip.warned"], shares["demo.lost_grip.unwarned"]) == (0.5, 1.0)
+    assert [row["name"] for row in json.loads((tmp_path / "figures.json").read_text())[1:]] == list(shares)
+    picture.draw(found, tmp_path / "without.png")
+    assert (tmp_path / "map.png").read_bytes() != (tmp_path / "without.png").read_bytes()

@@ -6,17 +6,14 @@ import json
 import re
 import shutil
 import subprocess
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import yaml
 
-from edge_agent.app import metrics as agent_metrics
-from fleet_service.app import metrics as service_metrics
-from fleet_service.app.engine import Engine
-from schemas.config import ServiceConfig
 from tests.house import ROOT
+from tests.usability import gauges
+from tests.usability.gauges import Shown
 
 FOLDER = ROOT / "deploy" / "dashboards"
 RULES: list[dict[str, Any]] = [
@@ -30,41 +27,26 @@ EXPRESSIONS = [rule["expr"] for rule in RULES] + [
 
 
 @pytest.fixture(scope="module")
-def shown(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
-    """Names of all metrics, as Prometheus stores them."""
-    root = tmp_path_factory.mktemp("archive")
-    config = ServiceConfig()
-    engine = Engine(config, root)
-    try:
-        pulse = service_metrics.Pulse(turn_age_s=0.0, queued=0, routers=1, clock_lag_s=0.0)
-        found = service_metrics.metrics(engine, pulse, config, root)
-    finally:
-        engine.close()
-    counts: Any = SimpleNamespace(
-        published={}, acknowledged={}, rejected={}, late={}, resent_batches=0, bad_acks=0, failures=0
-    )
-    publisher: Any = SimpleNamespace(
-        unanswered=0,
-        clock_behind_s=0.0,
-        counts=counts,
-        dropped=0,
-        damage=(0, 0),
-        stranded=0,
-        owed_s=0.0,
-        fill=0.0,
-        links=1,
-        unsettled=lambda: 0,
-    )
-    progress: Any = SimpleNamespace(behind=0, now_s=0.0, lag_s=0.0)
-    found += agent_metrics.metrics(publisher, progress)
-    return {f"gripmap_{metric.name}{'_total' if metric.kind == 'counter' else ''}" for metric in found}
+def shown(tmp_path_factory: pytest.TempPathFactory) -> Shown:
+    """All metrics of a service and of an agent."""
+    return gauges.shown(tmp_path_factory.mktemp("archive"))
 
 
 @pytest.mark.parametrize("expression", EXPRESSIONS)
-def test_every_expression_asks_for_metrics_that_are_shown(expression: str, shown: set[str]) -> None:
-    asked = set(re.findall(r"gripmap_\w+", expression))
-    assert asked <= shown, asked - shown
+def test_every_expression_asks_for_metrics_that_are_shown(expression: str, shown: Shown) -> None:
+    asked, known = (
+        set(re.findall(r"gripmap_\w+", expression)),
+        {gauges.stored(m) for found in shown.values() for m in found},
+    )
+    assert asked <= known, asked - known
     assert asked or expression.startswith("up{")
+
+
+def test_the_handbook_has_every_metric_with_its_meaning(shown: Shown) -> None:
+    """`python -m tests.usability.gauges` writes the table anew."""
+    rows = gauges.rows(gauges.PAGE.read_text(encoding="utf-8"))
+    assert rows == gauges.lines(shown)
+    assert len(rows) > 40
 
 
 def test_the_handbook_says_what_to_do_about_every_rule() -> None:

@@ -111,6 +111,24 @@ def test_systemd_accepts_the_units(site: Site, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd on this machine")
+def test_systemd_accepts_a_standby_and_starts_it_as_the_service_with_one_word_more(site: Site, tmp_path: Path) -> None:
+    folder = tmp_path / "units"
+    (folder / "gripmap-service.service.d").mkdir(parents=True)
+    unit = DEPLOY / "systemd" / "gripmap-service.service"
+    (folder / unit.name).write_text(site.placed(unit.read_text()))
+    standby = folder / "gripmap-service.service.d" / "standby.conf"
+    standby.write_text(site.placed((DEPLOY / "systemd" / "standby.conf").read_text()))
+    done = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", "--generators=no", "--recursive-errors=no", str(folder / unit.name)],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert not [line for line in done.stderr.splitlines() if "gripmap" in line or "standby" in line], done.stderr
+    *emptied, started = [line for line in standby.read_text().splitlines() if line.startswith("ExecStart=")]
+    assert emptied == ["ExecStart="]
+    assert started.removeprefix("ExecStart=") == f"{site.unit(unit, '')['ExecStart']} --standby"
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd on this machine")
 @pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
 def test_each_unit_is_shut_in(unit: Path, tmp_path: Path) -> None:
     """The exposure that systemd itself finds: 0 is a sealed box, 10 an open one."""
@@ -226,7 +244,8 @@ def test_what_the_units_start_works_together_and_leaves_in_time(site: Site) -> N
             assert process.wait(timeout=10.0) == 0, f"{process.args!r} after {time.monotonic() - began:.1f} s"
     said = [json.loads(line) for line in (site.root / "gripmap-service.log").read_text().splitlines()]
     assert said[0]["event"] == "ready"
-    assert said[-1]["event"] == "status"
+    # on a busy machine the last of it may be cut off; then it says so
+    assert said[-1]["event"] in ("status", "left at last")
     assert said[-1]["service"] == "shard-0"
 
 

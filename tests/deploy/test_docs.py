@@ -12,6 +12,7 @@ from fleet_service.analytics import synthetic
 from fleet_service.archive.compaction import compact
 from schemas import grid, tables
 from tests.house import ROOT
+from tests.usability import kept
 
 DOCS = ROOT / "deploy" / "docs"
 
@@ -32,6 +33,23 @@ def test_the_examples_of_the_reference_run_in_their_order(
         exec(compile(example, "api.md", "exec"), {})
         assert capsys.readouterr().out
     assert {"drive.svg", "worst.geojson"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_every_page_stands_in_the_contents_of_the_site() -> None:
+    """One that does not is a warning of Sphinx, and a warning is an error of `make docs`."""
+    tables = re.findall(r"```\{toctree\}\n(.*?)```", (DOCS / "index.md").read_text(), re.DOTALL)
+    entries = [line for table in tables for line in table.splitlines() if line and not line.startswith(":")]
+    listed = [(DOCS / f"{entry}.md").resolve() for entry in entries]
+    assert not [path for path in listed if not path.exists()]
+    written = {page for page in kept.pages() if page.name == "README.md" or page.parent == DOCS}
+    assert written - set(listed) == {DOCS / "index.md"}
+    assert len(written) > 25
+
+
+def test_every_glossary_is_found_from_one_page() -> None:
+    text = (DOCS / "glossary.md").read_text()
+    linked = {(DOCS / link).resolve() for link in re.findall(r"\]\(([^)#]+)#glossary\)", text)}
+    assert linked == {page for page in kept.pages() if "\n## Glossary\n" in page.read_text(encoding="utf-8")}
 
 
 def test_the_page_of_answers_has_every_column_of_the_map_the_sectors_and_the_cell_sizes() -> None:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +15,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from deploy.examples import archive_questions, first_estimate, own_estimator, query_map
+from deploy.examples import archive_questions, be_warned, first_estimate, own_estimator, query_map
 from deploy.router import open_router
 from fleet_service.analytics import synthetic
 from fleet_service.archive.compaction import compact
@@ -21,7 +24,7 @@ from schemas.runtime.palette import GRIP_RANGE, shade
 from schemas.runtime.zenoh_session import open_session
 from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.conftest import running
-from tests.fleet_service.examples import SECOND, batch
+from tests.fleet_service.examples import LATITUDE, LONGITUDE, SECOND, batch
 from tests.house import ROOT
 
 FOLDER = ROOT / "deploy" / "examples"
@@ -48,17 +51,34 @@ def test_an_estimator_of_one_s_own_says_at_least_what_was_used(capsys: Output) -
     assert row["mu_lower"] > 0.3
 
 
-def test_the_map_is_asked_and_a_tile_decoded(tmp_path: Path, capsys: Output) -> None:
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """Endpoint of a router whose service knows of the ice that three vehicles found."""
     session, endpoints = open_router(listen="tcp/127.0.0.1:0")
     settings = ZenohSettings(connect=endpoints)
-    with session, running(settings, tmp_path):
+    with session, running(settings, folder):
         heard: zenoh.Session | None = open_session(settings)
         assert heard is not None
         with heard:
             fleet = Fleet(heard).meet()
             fleet.settle(*(batch(f"sim-{k:03}", 1, time.time_ns() - SECOND, [0.2]) for k in range(3)))
-            assert query_map.main(endpoints[0]) == 1
+            yield endpoints[0]
+
+
+def test_the_map_is_asked_and_a_tile_decoded(tmp_path: Path, capsys: Output) -> None:
+    with served(tmp_path) as endpoint:
+        assert query_map.main(endpoint) == 1
     assert ": 1 cells" in capsys.readouterr().out
+
+
+def test_a_car_is_warned_of_what_three_others_found(tmp_path: Path, capsys: Output) -> None:
+    """Router, service, reports, alert and a car that comes along: all of it real."""
+    before = LONGITUDE - 60.0 / 111e3 / math.cos(math.radians(LATITUDE))
+    with served(tmp_path) as endpoint:
+        warned = be_warned.main(endpoint, LATITUDE, before)
+    assert warned.startswith("my-car: slippery in ")
+    assert "an alert stands" in warned or "the map says so" in warned
+    assert capsys.readouterr().out.startswith("ahead on ")
 
 
 def test_the_archive_is_the_same_in_pandas_and_duckdb(tmp_path: Path, capsys: Output) -> None:

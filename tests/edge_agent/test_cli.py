@@ -25,7 +25,7 @@ from tests.edge_agent.fakes import BAD_LOGS
 from tests.edge_agent.service import Router, Service
 from tests.faults.processes import Part
 
-COMMAND = (sys.executable, "-c", "import sys; from edge_agent.cli import main; sys.exit(main(sys.argv[1:]))")
+COMMAND = (sys.executable, "-m", "edge_agent.cli")
 Output = pytest.CaptureFixture[str]
 
 
@@ -246,6 +246,10 @@ def test_a_bad_log_is_one_line_and_exit_code_2_and_leaves_no_output(
 BAD_VEHICLES = {
     "negative mass": ({"mass": -1500.0}, "^error: mass: .*greater than 0 .*; correct it in the vehicle file"),
     "no mass": ({"mass": None}, "^error: mass: "),
+    "mass in tonnes": (
+        {"mass": 1.643},
+        "^error: mass: 1.643 with yaw_inertia .* radius of gyration of 3[0-9.]* m; give kg",
+    ),
     "text": ({"wheel_radius": "big"}, "^error: wheel_radius: "),
 }
 

@@ -84,6 +84,7 @@ ELSEWHERE = {
     "replay": {"log": REPLAYED, "--vehicle": REPLAYED, "--estimator": REPLAYED, "--out": REPLAYED, "--config": REPLAYED,
                "--publish": SENT_BY_REPLAY, "--trust": UNFIT, "--name": SENT_BY_REPLAY, "--start": SENT_BY_REPLAY,
                "--jobs": "test_so_many_drives_are_under_way_at_once",
+               "--engine": "test_an_engine_is_for_several_logs_and_wants_no_jobs",
                "--memberships": "test_memberships_that_tune_wrote_change_what_replay_says"},
     "check": {"log": FIX, "--vehicle": FIX, "--out": FIX, "--fix": FIX,
               "--json": "test_what_the_doctor_found_is_json_for_a_program"},

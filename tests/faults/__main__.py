@@ -14,7 +14,7 @@ def main() -> int:
     """Run; 0 if every bar holds, 1 if one does not."""
     names = [campaign.name for campaign in CAMPAIGNS]
     parser = argparse.ArgumentParser(prog="tests.faults", description="Fault campaigns; see tests/faults/README.md.")
-    parser.add_argument("--quick", action="store_true", help="two minutes at the most, smaller numbers")
+    parser.add_argument("--quick", action="store_true", help="three minutes, smaller numbers")
     parser.add_argument("--only", nargs="+", choices=names, help="these campaigns alone")
     parser.add_argument("--out", type=Path, default=Path(".faults"), help="figures and left-overs (default .faults)")
     parser.add_argument("--seed", type=int, default=0, help="of everything random (default 0)")

@@ -357,6 +357,14 @@ def batch_that_is_too_large_travels(ground: Ground) -> bool:
 
 
 @attempt
+def question_with_a_payload_travels(ground: Ground) -> bool:
+    session, answered = ground.open(ROGUE, ROUTERS[1]), ground.service.engine.counts["queries"]
+    asked: Any = session.get(keys.map_key(TILE), payload=SECRET + bytes(wire.MAX_BYTES))
+    through = any(reply.ok is not None for reply in asked)
+    return through or ground.service.engine.counts["queries"] > answered
+
+
+@attempt
 def administration_of_the_routers(ground: Ground) -> bool:
     session = ground.open(ROGUE, ROUTERS[1])
     for router in session.info.routers_zid():

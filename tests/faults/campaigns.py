@@ -20,13 +20,14 @@ from tests.faults import (
     outages,
     queries,
     security,
+    soak,
     truncation,
     versions,
 )
 from tests.faults.frame import Campaign
 
 CAMPAIGNS: Final = (
-    Campaign("crash-model", crash_model.run, ("faults.crash_model.violations",)),
+    Campaign("crash-model", crash_model.run, ("faults.crash_model.violations", "faults.crash_model.acknowledged")),
     Campaign(
         "compaction",
         compaction.run,
@@ -43,10 +44,10 @@ CAMPAIGNS: Final = (
         (
             *("faults.age.ready_s", "faults.age.ready_mb", "faults.age.at_mb"),
             *("faults.age.cold_s", "faults.age.cold_mb", "faults.age.cells", "faults.age.at_bytes"),
+            "faults.age.old_days",
         ),
-        in_quick=False,  # what it bounds shows only on a large archive
     ),
-    Campaign("truncation", truncation.run, ("faults.truncation.lost_rows",)),
+    Campaign("truncation", truncation.run, ("faults.truncation.lost_rows", "faults.truncation.damages")),
     Campaign(
         "versions",
         versions.run,
@@ -65,7 +66,7 @@ CAMPAIGNS: Final = (
         clocks.run,
         (
             *("faults.clocks.rejected", "faults.clocks.doubled", "faults.clocks.retired"),
-            *("faults.clocks.alerts_lost", "faults.clocks.sent"),
+            *("faults.clocks.alerts_lost", "faults.clocks.sent", "faults.clocks.jumps"),
         ),
     ),
     Campaign(
@@ -76,8 +77,16 @@ CAMPAIGNS: Final = (
             *("faults.kill.map_difference", "faults.kill.upkeep", "faults.kill.kills", "faults.kill.offered_per_s"),
         ),
     ),
-    Campaign("router-down", outages.router_down, ("faults.router_down.lost", "faults.router_down.recovery_s")),
-    Campaign("frozen", outages.frozen, ("faults.frozen.lost", "faults.frozen.agent_deadline_misses")),
+    Campaign(
+        "router-down",
+        outages.router_down,
+        ("faults.router_down.lost", "faults.router_down.recovery_s", "faults.router_down.batches"),
+    ),
+    Campaign(
+        "frozen",
+        outages.frozen,
+        ("faults.frozen.lost", "faults.frozen.agent_deadline_misses", "faults.frozen.batches"),
+    ),
     Campaign(
         "away",
         away.run,
@@ -87,24 +96,39 @@ CAMPAIGNS: Final = (
         ),
     ),
     Campaign("alerts", alerts.run, ("faults.alerts.missing_after_reconnect", "faults.alerts.standing")),
-    Campaign("leaving", outages.leaving, ("faults.leaving.longest_s", "faults.leaving.acknowledged_lost")),
-    Campaign("disk-full", outages.disk_full, ("faults.disk_full.false_acks", "faults.disk_full.recovered")),
+    Campaign(
+        "leaving",
+        outages.leaving,
+        ("faults.leaving.longest_s", "faults.leaving.acknowledged_lost", "faults.leaving.acknowledged"),
+    ),
+    Campaign(
+        "disk-full",
+        outages.disk_full,
+        ("faults.disk_full.false_acks", "faults.disk_full.recovered", "faults.disk_full.waiting"),
+    ),
     Campaign(
         "disk",
         disk.run,
         (
             *("faults.disk.false_acks", "faults.disk.stuck"),
-            *("faults.disk.times_full", "faults.disk.jobs_run"),
+            *("faults.disk.times_full", "faults.disk.jobs_run", "faults.disk.room_made"),
         ),
     ),
-    Campaign("security", security.run, ("faults.security.breaches",)),
-    Campaign("fuzz", fuzz.run, ("faults.fuzz.crashes", "faults.fuzz.admitted_out_of_range", "faults.fuzz.honest_lost")),
+    Campaign("security", security.run, ("faults.security.breaches", "faults.security.attempts")),
+    Campaign(
+        "fuzz",
+        fuzz.run,
+        (
+            *("faults.fuzz.crashes", "faults.fuzz.admitted_out_of_range", "faults.fuzz.honest_lost"),
+            *("faults.fuzz.refused", "faults.fuzz.answered", "faults.fuzz.pasts"),
+        ),
+    ),
     Campaign(
         "insider",
         insider.run,
         (
             *("faults.insider.alerts_alone", "faults.insider.mb_per_hour", "faults.insider.honest_delay_s"),
-            *("faults.insider.messages", "faults.insider.honest_lost"),
+            *("faults.insider.messages", "faults.insider.honest_lost", "faults.insider.replayed"),
         ),
     ),
     Campaign(
@@ -112,5 +136,10 @@ CAMPAIGNS: Final = (
         queries.run,
         ("faults.query.light_p99_ms", "faults.query.heavy_answers", "faults.query.light_answers"),
     ),
-    Campaign("flood", flood.run, ("faults.flood.honest_delay_s", "faults.flood.map_difference")),
+    Campaign(
+        "flood",
+        flood.run,
+        ("faults.flood.honest_delay_s", "faults.flood.map_difference", "faults.flood.rate"),
+    ),
+    Campaign("soak", soak.run, soak.OWES, in_quick=False),  # what grows shows only in half an hour
 )

@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 
-from fleet_service.archive import reading
+from fleet_service.archive import layout, reading
 from fleet_service.archive.pseudonyms import Pseudonyms
 from schemas.wire import Kind
 
 HOUR_NS = 3_600_000_000_000
+ROW = ["vehicle", "boot", "region", "seq", "row"]
 Name = tuple[str, int, int, int]  # vehicle, boot, region, seq
 
 
@@ -52,6 +54,10 @@ class Told(NamedTuple):
         waits = [self.settled.get(name, float("inf")) - since for name, (_, at) in self.stored.items() if at <= since]
         return max(waits, default=0.0)
 
+    def stored_between(self, begin: float, end: float) -> int:
+        """Batches that were stored between two times [s]."""
+        return sum(begin <= at <= end for _, at in self.stored.values())
+
 
 def told(journals: Iterable[Path]) -> Told:
     """Read the journals of all generators."""
@@ -73,6 +79,7 @@ def take(journals: Iterable[Path], archive: Path) -> Census:
     """Compare the journals with the whole archive."""
     stored, settled = told(journals)
     held, doubled, rows = _archived(archive, {name[:2] for name in stored})
+    doubled = max(doubled, _doubled_outside(archive))
     missing = {name for name, (records, _) in stored.items() if held.get(name, 0) < records}
     return Census(
         len(stored), len(settled.keys() & stored.keys()), len(missing & settled.keys()), len(missing), doubled, rows,
@@ -80,14 +87,22 @@ def take(journals: Iterable[Path], archive: Path) -> Census:
     )  # fmt: skip
 
 
+def _doubled_outside(archive: Path) -> int:
+    """Rows that are there again for who knows nothing of us, and reads the compacted files as they lie."""
+    paths = list(layout.compacted(archive, Kind.OBSERVATION))
+    whole = [pq.read_table(path, columns=ROW, partitioning=None) for path in paths]
+    return sum(t.num_rows for t in whole) - (
+        pa.concat_tables(whole).group_by(ROW).aggregate([]).num_rows if whole else 0
+    )
+
+
 def _archived(archive: Path, starts: set[tuple[str, int]]) -> tuple[dict[Name, int], int, int]:
     """Distinct rows of every archived batch, by starts (vehicle, boot); rows that are there again; all rows."""
-    columns = ["vehicle", "boot", "region", "seq", "row"]
-    tables = list(reading.read(archive, Kind.OBSERVATION, columns))
+    tables = list(reading.read(archive, Kind.OBSERVATION, ROW))
     if not tables:
         return {}, 0, 0
     whole = pa.concat_tables(tables)
-    found = whole.group_by(columns[:-1]).aggregate([("row", "count_distinct")]).to_pydict()
+    found = whole.group_by(ROW[:-1]).aggregate([("row", "count_distinct")]).to_pydict()
     pseudonyms, now = Pseudonyms(archive / "keys"), time.time_ns()
     start_of = {
         (pseudonyms.of(vehicle, now - ago), pseudonyms.boot(vehicle, boot, now - ago)): (vehicle, boot)

@@ -57,6 +57,10 @@ class Machine:
         """A service's clock on it."""
         return SteadyClock(seen, lambda: self.true + self.off, lambda: self.true)
 
+    def jumped(self, clock: SteadyClock) -> bool:
+        """Whether a service's clock is far from the true time, or says that the system's is."""
+        return max(abs(clock.now() - self.true), abs(clock.lag())) > YEAR // 2
+
 
 @dataclass
 class Found:
@@ -68,6 +72,7 @@ class Found:
     retired: int = 0
     lost: int = 0
     alerts_lost: int = 0
+    jumps: int = 0
 
 
 def run(site: Site) -> list[Figure]:
@@ -83,6 +88,7 @@ def run(site: Site) -> list[Figure]:
         figure("faults.clocks.retired", found.retired + found.lost),
         figure("faults.clocks.alerts_lost", found.alerts_lost),
         figure("faults.clocks.sent", found.sent),
+        figure("faults.clocks.jumps", found.jumps),
     ]
 
 
@@ -112,10 +118,12 @@ def _one(root: Path, case: Case, found: Found, seconds: int) -> None:
             if not case.at_start:
                 machine.off = case.jump
                 drive(engine, clock, seconds)
+                found.jumps += machine.jumped(clock)
                 _retire(root, engine, clock)
                 machine.off = 0
                 drive(engine, clock, seconds)
             if case.at_start and off:
+                found.jumps += machine.jumped(clock)
                 _retire(root, engine, clock)
                 machine.off = 0
                 drive(engine, clock, seconds)

@@ -71,6 +71,7 @@ class History:
         self.random, self.folder = random.Random(number), folder
         self.acknowledged: set[Batch] = set()
         self.sent: list[Batch] = []
+        self.at_stake = 0  # batches that were acknowledged before a power loss
 
     def violations(self) -> list[str]:
         """What was wrong in it."""
@@ -87,6 +88,7 @@ class History:
             with disk.mounted(), suppress(PowerLoss):
                 self._live(live, last)
             if not last:
+                self.at_stake = len(self.acknowledged)
                 live = self.folder / f"life-{life + 1}"
                 disk.image(live)
             found += [f"life {life}: {problem}" for problem in self._problems(live, last)]
@@ -153,11 +155,22 @@ class History:
 
 def history(number: int) -> list[str]:
     """Violations of one history of the log."""
+    return _lived(number)[0]
+
+
+def _lived(number: int) -> tuple[list[str], int]:
+    """As `history`, and how many batches were acknowledged before a power loss."""
     folder = Path(tempfile.mkdtemp(prefix="crash-", dir=_memory()))
+    one = History(number, folder)
     try:
-        return History(number, folder).violations()
+        return one.violations(), one.at_stake
     finally:
         shutil.rmtree(folder)
+
+
+def _stored(number: int) -> tuple[list[str], int]:
+    """The same of the outbox, where nothing is acknowledged."""
+    return spool_history(number), 0
 
 
 def _memory() -> str | None:
@@ -168,17 +181,18 @@ def _memory() -> str | None:
 def run(site: Site) -> list[Figure]:
     """5 000 histories of the log and 500 of the outbox; in a quick run, a hundred and ten."""
     logs, outboxes = site.of(5000, 100), site.of(500, 10)
-    first, bad = site.seed * 1_000_000, 0
+    first, bad, acknowledged = site.seed * 1_000_000, 0, 0
     with ProcessPoolExecutor(mp_context=get_context("spawn"), initializer=_quiet) as pool:
-        for kind, one, count in (("log", history, logs), ("spool", spool_history, outboxes)):
-            for number, found in enumerate(pool.map(one, range(first, first + count), chunksize=10)):
-                bad += bool(found)
+        for kind, one, count in (("log", _lived, logs), ("spool", _stored, outboxes)):
+            for number, (found, safe) in enumerate(pool.map(one, range(first, first + count), chunksize=10)):
+                bad, acknowledged = bad + bool(found), acknowledged + safe
                 for problem in found[:3]:
                     site.say(f"{kind} history {first + number}: {problem}")
                 if (number + 1) % 500 == 0:
                     site.say(f"{number + 1} histories of the {kind}, {bad} with a violation so far")
     return [
         figure("faults.crash_model.violations", bad),
+        figure("faults.crash_model.acknowledged", acknowledged),
         Figure("faults.crash_model.histories", logs + outboxes, "histories"),
     ]
 

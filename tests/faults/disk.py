@@ -2,7 +2,8 @@
 
 Where this process may mount, it is a tmpfs of some megabytes; elsewhere every call by which log, upkeep and outbox make
 or move a file fails with ENOSPC. While it is full nothing may be acknowledged that is not there, jobs go on in turn,
-and with room again everything is acknowledged and nothing hangs.
+and with room again everything is acknowledged and nothing hangs. At last it is full with days that retention removes,
+and whose roll-ups are to be made before: what was set aside is room enough for that.
 """
 
 from __future__ import annotations
@@ -17,13 +18,15 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Final
+from unittest.mock import patch
 
 from edge_agent.publish.batching import Draft
 from edge_agent.publish.outbox import Outbox
-from fleet_service.app.clock import SteadyClock
+from fleet_service.app.clock import SteadyClock, TimeNow
 from fleet_service.app.engine import Engine
 from fleet_service.app.jobs import Upkeep, archive_jobs
-from fleet_service.archive import reading
+from fleet_service.archive import reading, reserve
+from fleet_service.archive.retention import LEAST_DAYS
 from fleet_service.ingest.inbox import Message
 from schemas import wire
 from schemas.config import ServiceConfig
@@ -32,11 +35,14 @@ from schemas.thresholds import NS
 from schemas.wire import Kind
 from tests.faults.bars import figure
 from tests.faults.frame import Site
+from tests.faults.kill import begin_with_old_rows, old_days
 from tests.fleet_service.examples import batch, key
 
 SIZE_MB: Final = 24
 VEHICLES: Final = 5
-CONFIG: Final = ServiceConfig(compact_s=0.3, checkpoint_s=0.3, snapshot_s=0.3)
+CONFIG: Final = ServiceConfig(compact_s=0.3, checkpoint_s=0.3, snapshot_s=0.3, raw_days=LEAST_DAYS)
+RESERVE_MB: Final = 2  # as much of this disk as 64 MB are of a real one
+RUNS: Final = ("compaction_runs", "checkpoint_runs")
 STUCK_S: Final = 60.0
 
 
@@ -93,7 +99,7 @@ def _refused(*names: str) -> Iterator[None]:
 
 def run(site: Site) -> list[Figure]:
     """Full several times, at other moments of the jobs."""
-    false, stuck, refused, runs = 0, 0, 0, Counter[str]()
+    false, stuck, refused, room, runs = 0, 0, 0, 0, Counter[str]()
     with small_disk(site.folder / "disk") as mounted:
         root = site.folder / "disk" / "archive"
         with closing(Engine(CONFIG, root)) as engine:
@@ -111,15 +117,20 @@ def run(site: Site) -> list[Figure]:
                         false += acknowledged > _rows(root)
                     acknowledged += _until_settled(engine)
                     stuck += engine.unsettled > 0
+                acknowledged += _until_done(engine)
             runs.update({name: n for name, n in engine.counts.items() if name.endswith(("_runs", "_failures"))})
-        false += acknowledged > _rows(root)
+            false += acknowledged > _rows(root)
+            room = _room_made(engine, site.folder / "disk") if mounted else 0
         stuck += not _outbox_recovers(site.folder / "disk", mounted)
     site.say(f"{'mounted' if mounted else 'injected'}; {acknowledged} acknowledged, {dict(runs)}")
     return [
         figure("faults.disk.false_acks", false),
         figure("faults.disk.stuck", stuck + (acknowledged != VEHICLES * seq)),
         figure("faults.disk.times_full", refused),
-        figure("faults.disk.jobs_run", min(runs["compaction_runs"], runs["checkpoint_runs"])),
+        figure("faults.disk.jobs_run", min(runs[name] for name in RUNS)),
+        figure("faults.disk.room_made", room)
+        if mounted
+        else Figure("faults.disk.room_made", 0, "days; nothing was mounted"),
         Figure("faults.disk.mounted", int(mounted), "a real file system"),
     ]
 
@@ -154,8 +165,31 @@ def _until_settled(engine: Engine) -> int:
     return got
 
 
+def _until_done(engine: Engine) -> int:
+    """Wait until each job has gone well once, with room again; returns what was acknowledged meanwhile."""
+    got, deadline = 0, time.monotonic() + STUCK_S
+    while not all(engine.counts[name] for name in RUNS) and time.monotonic() < deadline:
+        got += _acked(engine.flush())
+        threading.Event().wait(0.05)
+    return got
+
+
 def _rows(root: Path) -> int:
     return sum(table.num_rows for table in reading.read(root, Kind.OBSERVATION, ["seq"]))
+
+
+def _room_made(engine: Engine, folder: Path) -> int:
+    """Days that retention removes from a disk that is full."""
+    root = folder / "archive"
+    begin_with_old_rows(root)
+    with patch.multiple(reserve, SIZE=RESERVE_MB << 20, _LEAST_FREE=2 * RESERVE_MB << 20):
+        reserve.keep(root)
+        assert (root / reserve.NAME).exists()
+        jobs = archive_jobs(engine, CONFIG, root, lambda: TimeNow(time.time_ns()))
+        retention, before = next(job for job in jobs if job.name == "retention"), len(old_days(root))
+        with full(folder, mounted=True):
+            retention.work(threading.Event())
+            return before - len(old_days(root))
 
 
 def _outbox_recovers(folder: Path, mounted: bool) -> bool:

@@ -136,7 +136,7 @@ def run(site: Site) -> list[Figure]:
     return [
         figure("faults.flood.honest_delay_s", float(delays.max())),
         figure("faults.flood.map_difference", _difference(table, expected, honest)),
-        Figure("faults.flood.rate", put / seconds, "messages/s"),
+        figure("faults.flood.rate", put / seconds),
         Figure("faults.flood.honest_delay_p50_s", float(np.median(delays)), "s"),
         Figure("faults.flood.calm_delay_s", before, "s"),
         Figure("faults.flood.honest_resent", sum(one.resent for one in honest), "batches"),

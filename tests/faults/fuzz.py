@@ -55,7 +55,7 @@ def run(site: Site) -> list[Figure]:
     began, crashes, answers = time.time_ns(), 0, 0
     mutants = Mutants(site.seed, began)
     engine = Engine(ServiceConfig(), site.folder / "archive")
-    honest = 0
+    honest, pasts = 0, site.of(50, 3)  # that are rebuilt: each takes a process and a second
     for turn in range(count // TURN):
         messages, queries = [], []
         now = mutants.now = began + turn * SECOND
@@ -68,8 +68,8 @@ def run(site: Site) -> list[Figure]:
         messages[len(messages) // 2 : len(messages) // 2] = list(_honest(honest, now))
         crashes += _turn(site, engine, messages, now)
         for asked in queries:
-            failed, answered = _ask(site, engine, asked, now)
-            crashes, answers = crashes + failed, answers + answered
+            failed, answered, past = _ask(site, engine, asked, now, pasts > 0)
+            crashes, answers, pasts = crashes + failed, answers + answered, pasts - past
         if not turn % 200:
             site.say(f"{turn * TURN} malformed, {crashes} crashes, {engine.counts[Kind.OBSERVATION]} rows admitted")
     counts = dict(engine.counts)
@@ -81,9 +81,10 @@ def run(site: Site) -> list[Figure]:
         figure("faults.fuzz.admitted_out_of_range", impossible),
         figure("faults.fuzz.honest_lost", abs(honest * len(HONEST) - found)),
         Figure("faults.fuzz.malformed", count + tiles, "messages, queries and tiles"),
-        Figure("faults.fuzz.refused", sum(n for name, n in counts.items() if name.startswith("refused.")), "messages"),
+        figure("faults.fuzz.refused", sum(n for name, n in counts.items() if name.startswith("refused."))),
         Figure("faults.fuzz.admitted", rows, "rows"),
-        Figure("faults.fuzz.answered", answers, "queries"),
+        figure("faults.fuzz.answered", answers),
+        figure("faults.fuzz.pasts", site.of(50, 3) - pasts),
     ]
 
 
@@ -107,18 +108,21 @@ def _turn(site: Site, engine: Engine, messages: list[Message], now: int) -> int:
     return 0
 
 
-def _ask(site: Site, engine: Engine, asked: dict[str, str], now: int) -> tuple[int, int]:
-    """Whether a query crashed, and whether it was answered."""
+def _ask(site: Site, engine: Engine, asked: dict[str, str], now: int, past: bool) -> tuple[int, int, int]:
+    """Whether a query crashed, was answered, and was of a past that was rebuilt; no past is without `past`."""
+    rebuilt = 0
     try:
         wanted = query.parse(asked)
-        if wanted.at is None:  # a past is a replay of the archive, minutes by now
-            list(engine.answer(wanted, lambda _: True, now))
+        if wanted.at is not None and not past:
+            return 0, 0, 0
+        rebuilt = int(wanted.at is not None)
+        list(engine.answer(wanted, lambda _: True, now))
     except InputError:
-        return 0, 0
+        return 0, 0, 0
     except Exception:  # noqa: BLE001
         site.say(f"{asked}\n{traceback.format_exc()}")
-        return 1, 0
-    return 0, 1
+        return 1, 0, rebuilt
+    return 0, 1, rebuilt
 
 
 def _tiles(site: Site, engine: Engine, now: int) -> tuple[int, int]:

@@ -1,24 +1,32 @@
 """kill -9 of agents, router and service, one or several at once, again and again, under load.
 
-In rounds, each with an archive of its own, so that a restarted service has minutes to read back and not hours. At the
-end of a round everything is left running until all is settled; then the archive is compared with the journals.
+In rounds, each with an archive of its own, so that a restarted service has minutes to read back and not hours. It has
+old rows too, which retention removes amid all this, and is killed as well. At the end of a round everything is left
+running until all is settled; then the archive is compared with the journals.
 """
 
 from __future__ import annotations
 
 import random
+import sys
 import time
 from contextlib import closing
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 
+from fleet_service.analytics import synthetic
 from fleet_service.app.engine import Engine
-from fleet_service.archive.retention import drop_checkpoints
+from fleet_service.archive import layout
+from fleet_service.archive.compaction import compact
+from fleet_service.archive.retention import LEAST_DAYS, drop_checkpoints, due
 from fleet_service.serve.encode import cell_table
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
+from schemas.wire import Kind
 from tests.faults.bars import figure
 from tests.faults.census import Census, take, told
 from tests.faults.frame import Site
@@ -35,25 +43,30 @@ DOWN_S: Final = (0.0, 1.0)  # how long the killed ones stay away
 DRAIN_S: Final = 90.0
 # So short that compaction, checkpoints and snapshots happen many times within the seconds that a service lives.
 PERIODS: Final[dict[str, object]] = {"compact_s": 2.0, "checkpoint_s": 1.5, "snapshot_s": 3.0, "vehicle_kb_s": 250.0}
+OLD: Final = synthetic.SyntheticFleet(4000, 4, vehicles=50)  # rows of January 2026, beyond what retention keeps
+RETIRED_EVERY: Final = 4  # kills
+RETIRING_KILLED: Final = 0.5
 
 
 class Load(NamedTuple):
-    """What was offered amid the kills, and for how long [s]."""
+    """What was offered amid the kills, for how long [s], and whether retention removed a day meanwhile."""
 
     observations: int
     seconds: float
+    retired: bool
 
 
 def run(site: Site) -> list[Figure]:
-    """200 kills in ten rounds; in a quick run, five in one with six agents."""
+    """200 kills in ten rounds; in a quick run, five in one with six agents, and bars that it can reach."""
     random_ = random.Random(site.seed)
     kills, offered, seconds, whole_s, difference, found = 0, 0, 0.0, 0.0, 0.0, []
     upkeep: frozenset[str] = frozenset()
     for number in range(site.of(10, 1)):
         began = time.monotonic()
+        begin_with_old_rows(site.folder / f"round-{number}" / "archive")
         with stage(site.folder / f"round-{number}", segment_s=0.5, **PERIODS) as there:
             census, load = _round(there, site.of(AGENTS, 6), site.of(KILLS_PER_ROUND, 5), random_)
-        upkeep = upkeep.union(_done(there.archive))
+        upkeep = upkeep.union(_done(there.archive), {"retention"} if load.retired else ())
         difference = max(difference, map_difference(there.archive))
         kills += sum(part.starts - 1 for part in there.parts)
         offered, seconds = offered + load.observations, seconds + load.seconds
@@ -66,17 +79,30 @@ def run(site: Site) -> list[Figure]:
         figure("faults.kill.doubled", total["doubled"]),
         figure("faults.kill.unacknowledged_lost_at_end", total["lost"]),
         figure("faults.kill.map_difference", difference),
-        figure("faults.kill.upkeep", len(upkeep)),
-        _shown(site, "faults.kill.kills", kills, "processes killed"),
-        _shown(site, "faults.kill.offered_per_s", offered / seconds, "observations/s amid the kills"),
+        _reached(site, "faults.kill.upkeep", len(upkeep), 2),
+        _reached(site, "faults.kill.kills", kills, 5),
+        _reached(site, "faults.kill.offered_per_s", offered / seconds, 100),
         Figure("faults.kill.whole_per_s", total["observations"] / whole_s, "observations/s, with starts and drains"),
         Figure("faults.kill.observations", total["observations"], "observations"),
     ]
 
 
-def _shown(site: Site, name: str, value: float, unit: str) -> Figure:
-    """A figure with its bar; without it in a quick run, which is smaller."""
-    return Figure(name, value, unit) if site.quick else figure(name, value)
+def _reached(site: Site, name: str, value: float, quick: float) -> Figure:
+    """A figure with its bar, or with the one of a quick run, which is smaller."""
+    found = figure(name, value)
+    return replace(found, bar=quick) if site.quick else found
+
+
+def begin_with_old_rows(archive: Path) -> None:
+    """An archive of old rows, which no service reads again: it has a day of today, too."""
+    synthetic.write(archive, OLD, OLD.rows // 4)
+    compact(archive)
+    (archive / layout.TABLES[Kind.OBSERVATION] / f"date={datetime.now(UTC).date()}").mkdir(exist_ok=True)
+
+
+def old_days(archive: Path) -> list[Path]:
+    """Days that retention removes."""
+    return due(archive, LEAST_DAYS, datetime.now(UTC).date())
 
 
 def _done(archive: Path) -> frozenset[str]:
@@ -108,9 +134,16 @@ def _round(there: Stage, agents: int, kills: int, random_: random.Random) -> tup
         there.load([f"sim-{number:03}"], RATE, seed=number).start()
     for part in there.loads:
         part.line_with("ready: ")
-    killed, began = 0, time.time()
+    words = ["retention", "--archive", str(there.archive), "--raw-days", str(LEAST_DAYS), "--yes"]
+    retention = Part("retention", [sys.executable, "-m", "fleet_service.cli", *words], there.folder)
+    killed, began, old = 0, time.time(), len(old_days(there.archive))
+    assert old
     while killed < kills:
+        if killed % RETIRED_EVERY == 1 and not retention.alive:
+            retention.start()
         time.sleep(random_.uniform(*PAUSE_S))
+        if random_.random() < RETIRING_KILLED:
+            retention.kill()
         victims = _victims(there, random_)
         for part in victims:
             part.kill()
@@ -119,11 +152,15 @@ def _round(there: Stage, agents: int, kills: int, random_: random.Random) -> tup
         for part in victims:
             part.start()
     there.service.line_with("ready: ")
-    end = time.time()
+    end, retired = time.time(), len(old_days(there.archive)) < old
     there.drain(DRAIN_S)
     there.service.stop()
+    retention.kill()
+    retention.start()  # what the kills left of it
+    retention.wait(DRAIN_S)
+    assert not old_days(there.archive), f"retention did not go on after a kill; see {retention.log}"
     amid = sum(records for records, at in told(there.journals).stored.values() if began <= at <= end)
-    return take(there.journals, there.archive), Load(amid, end - began)
+    return take(there.journals, there.archive), Load(amid, end - began, retired)
 
 
 def _victims(there: Stage, random_: random.Random) -> list[Part]:

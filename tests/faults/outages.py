@@ -26,35 +26,42 @@ def router_down(site: Site) -> list[Figure]:
         _agents(there, site.of(5, 2))
         time.sleep(site.of(3, 1))
         there.router.kill()
+        down = time.time()
         time.sleep(down_s)
         there.router.start()
         there.router.line_with("router: ")
         back = time.time()
         census = _at_rest(there)
-        recovery = told(there.journals).longest_wait(back)
+        known = told(there.journals)
+        recovery, amid = known.longest_wait(back), known.stored_between(down, back)
     site.say(f"{census}")
     return [
         figure("faults.router_down.lost", census.lost),
         figure("faults.router_down.recovery_s", recovery),
+        figure("faults.router_down.batches", amid),
         Figure("faults.router_down.seconds", down_s, "s without a router"),
     ]
 
 
 def frozen(site: Site) -> list[Figure]:
     """Router, then service, stopped and continued: agents keep their pace meanwhile, and lose nothing."""
-    frozen_s = site.of(20, 3)
+    frozen_s, spans = site.of(20, 3), []
     with stage(site.folder) as there:
         _agents(there, site.of(3, 1))
         for part in (there.router, there.service):
             time.sleep(site.of(3, 1))
             part.send(signal.SIGSTOP)
+            began = time.time()
             time.sleep(frozen_s)
+            spans.append((began, time.time()))
             part.send(signal.SIGCONT)
         census = _at_rest(there)
+        known = told(there.journals)
         ends = [json.loads(next(line for line in part.lines() if line.startswith("{"))) for part in there.loads]
     site.say(f"{census}; {ends}")
     return [
         figure("faults.frozen.lost", census.lost),
+        figure("faults.frozen.batches", min(known.stored_between(*span) for span in spans)),
         figure("faults.frozen.agent_deadline_misses", sum(end["late_blocks"] for end in ends)),
         Figure("faults.frozen.longest_lag_s", max(end["longest_lag_s"] for end in ends), "s"),
         Figure("faults.frozen.seconds", frozen_s, "s frozen, each"),
@@ -63,7 +70,7 @@ def frozen(site: Site) -> list[Figure]:
 
 def leaving(site: Site) -> list[Figure]:
     """SIGTERM beside a router that runs, and beside a frozen one: agent and service are gone soon, and lose nothing."""
-    longest, lost = 0.0, 0
+    longest, lost, acknowledged = 0.0, 0, 0
     for freeze in (False, True):
         with stage(site.folder / str(freeze)) as there:
             _agents(there, 1)
@@ -76,15 +83,20 @@ def leaving(site: Site) -> list[Figure]:
                 _clean(part)
                 longest = max(longest, time.monotonic() - began)
             there.router.send(signal.SIGCONT)
-            lost += take(there.journals, there.archive).acknowledged_lost
+            census = take(there.journals, there.archive)
+            lost, acknowledged = lost + census.acknowledged_lost, acknowledged + census.settled
     site.say(f"gone after {longest:.1f} s at the most")
-    return [figure("faults.leaving.longest_s", longest), figure("faults.leaving.acknowledged_lost", lost)]
+    return [
+        figure("faults.leaving.longest_s", longest),
+        figure("faults.leaving.acknowledged_lost", lost),
+        figure("faults.leaving.acknowledged", acknowledged),
+    ]
 
 
 def disk_full(site: Site) -> list[Figure]:
     """No file of the service may grow, then none of the agents: nothing false is acknowledged, and all of it later."""
     full_s = site.of(10, 2)
-    false_acks = recovered = 0
+    false_acks = recovered = waiting = 0
     with stage(site.folder) as there:
         _agents(there, 2)
         for parts in ([there.service], there.loads, there.parts[1:]):
@@ -92,7 +104,9 @@ def disk_full(site: Site) -> list[Figure]:
             for part in parts:
                 part.limit_files(0)
             time.sleep(full_s)
-            false_acks += take(there.journals, there.archive).acknowledged_lost
+            census = take(there.journals, there.archive)
+            false_acks += census.acknowledged_lost
+            waiting = max(waiting, census.stored - census.settled)
             for part in parts:
                 part.limit_files(-1)
             recovered += _settles(there)
@@ -101,6 +115,7 @@ def disk_full(site: Site) -> list[Figure]:
     return [
         figure("faults.disk_full.false_acks", false_acks + census.acknowledged_lost),
         figure("faults.disk_full.recovered", recovered if not census.lost else 0),
+        figure("faults.disk_full.waiting", waiting),
         Figure("faults.disk_full.seconds", full_s, "s full, each"),
     ]
 

@@ -20,5 +20,5 @@ def run(site: Site) -> list[Figure]:
                 site.say(f"BREACH: {name}")
     return [
         figure("faults.security.breaches", len(breaches)),
-        Figure("faults.security.attempts", len(ATTEMPTS), "attacks"),
+        figure("faults.security.attempts", len(ATTEMPTS)),
     ]

@@ -22,7 +22,11 @@ PROCESSES, VEHICLES, RATE = 2, 20, 50.0  # 2 000 observations/s
 CELLS_ACROSS: Final = 12  # few, so that every vehicle has soon been everywhere: a map that grows is no leak
 EVERY_S: Final = 5.0
 SETTLED: Final = 1 / 3  # of the time, until buffers, windows and the cells of the map have been filled
-OWES: Final = ("soak.memory_slope_mb_per_10min", "soak.handles_growth")
+MINUTES: Final = 30.0
+OWES: Final = (
+    *("faults.soak.growth_mb", "faults.soak.handles"),
+    *("faults.soak.lost", "faults.soak.observations_per_s"),
+)
 
 
 def memory_mb(part: Part) -> float:
@@ -46,7 +50,7 @@ def slope(times: FloatArray, megabytes: FloatArray) -> float:
     return 10 * float(np.polyfit(np.unique(minute), least, 1)[0]) if len(least) > 1 else float("nan")
 
 
-def run(site: Site, minutes: float) -> list[Figure]:
+def run(site: Site, minutes: float = MINUTES) -> list[Figure]:
     """The steepest slope of memory, and the largest growth of handles, of any process."""
     times: list[float] = []
     seen: dict[str, list[tuple[float, int]]] = {}
@@ -74,19 +78,19 @@ def run(site: Site, minutes: float) -> list[Figure]:
         grown[name] = float(np.median(kept[-third:, 1]) - np.median(kept[:third, 1]))
     site.say(f"{slopes}; {grown}; {census}")
     return [
-        figure("soak.memory_slope_mb_per_10min", max(slopes.values())),
-        figure("soak.handles_growth", max(grown.values())),
-        *(Figure(f"soak.{name}_slope", slope, "MB per 10 min") for name, slope in slopes.items()),
-        Figure("soak.minutes", minutes, "minutes"),
-        Figure("soak.observations_per_s", census.observations / (minutes * 60), "observations/s"),
-        Figure("soak.lost", census.lost + census.doubled, "batches or rows", 0),
+        figure("faults.soak.growth_mb", max(slopes.values())),
+        figure("faults.soak.handles", max(grown.values())),
+        figure("faults.soak.lost", census.lost + census.doubled),
+        figure("faults.soak.observations_per_s", census.observations / (minutes * 60)),
+        *(Figure(f"faults.soak.{name}_growth_mb", slope, "MB per 10 min") for name, slope in slopes.items()),
+        Figure("faults.soak.minutes", minutes, "minutes"),
     ]
 
 
 def main() -> int:
     """Run; 0 if every bar holds."""
     parser = argparse.ArgumentParser(prog="tests.faults.soak", description="A steady load; does anything grow?")
-    parser.add_argument("--minutes", type=float, default=30.0, help="how long (default 30)")
+    parser.add_argument("--minutes", type=float, default=MINUTES, help="how long (default 30)")
     parser.add_argument("--out", type=Path, default=Path(".faults/soak"), help="figures go there")
     args = parser.parse_args()
     campaign = Campaign("soak", partial(run, minutes=args.minutes), OWES)

@@ -53,7 +53,7 @@ def run(site: Site) -> list[Figure]:
             site.say(f"{tried} damages, {lost} rows lost or doubled")
     return [
         figure("faults.truncation.lost_rows", lost),
-        Figure("faults.truncation.damages", tried, "segments cut or changed"),
+        figure("faults.truncation.damages", tried),
     ]
 
 

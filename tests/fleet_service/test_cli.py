@@ -157,6 +157,9 @@ def test_run_and_watch_as_processes_from_start_to_signal(
             assert process.stderr is not None
             assert process.stderr.read() == ""
         assert "status: 4 observations" in run.stdout.read()
+    modes = {path: path.stat().st_mode for path in (tmp_path / "archive").rglob("*")}
+    assert any(path.suffix == ".parquet" for path in modes)
+    assert [path for path, mode in modes.items() if mode & 0o027] == [], "readable by others, or written by the group"
 
 
 HANGS = """
@@ -168,7 +171,7 @@ service.archive_jobs = lambda *_: [Job("hangs", .001, lambda _: print("hangs", f
 {more}
 sys.exit(main(sys.argv[1:]))
 """
-BREAKS = "service.Service._shut_down = lambda self, session: [][0]"
+BREAKS = "service.Service._shut_down = lambda self, *_: [][0]"
 
 
 @pytest.mark.parametrize(("more", "code"), [("", 0), (BREAKS, 1)])

@@ -13,6 +13,7 @@ import importlib.util
 import json
 import shutil
 import signal
+import subprocess
 import sys
 import time
 from hashlib import blake2b
@@ -26,6 +27,7 @@ import zenoh
 from cryptography import x509
 
 from fleet_service.cli import COMMANDS, main
+from fleet_service.lab import campaign
 from schemas import grid, wire
 from schemas.config import ZenohSettings
 from schemas.runtime.commandline import Command
@@ -118,8 +120,17 @@ SHOWN_BELOW: Final = {
         "--connect",
         "--config",
     },
+    "hand-over": {"region", "--to", "--connect", "--config"},  # shards/test_moving.py
     "watch": {"--bbox", "--connect", "--config", "--alerts", "--json", "--webhook"},
 }
+# command -> the modules in which these options are given, beside this one
+GIVEN_IN: Final[dict[str, tuple[str, ...]]] = {
+    "retention": ("../test_commands",), "forget": ("../test_commands", "archive/test_retention", "app/test_copy"),
+    "completion": ("../test_commands",), "certs": ("enrolment/test_certificates",), "run": (),
+    "export": ("client/test_datex", "archive/test_iceberg"), "roads": ("analytics/roads/test_join",),
+    "analyze": ("analytics/roads/test_contract",), "query": (), "watch": ("test_alerts",),
+    "page": ("page/test_server",), "hand-over": ("shards/test_moving",),
+}  # fmt: skip
 # A campaign takes minutes: tests/fleet_service/lab/test_evaluate.py runs it small.
 CAMPAIGN: Final = {"--out", "--quick", "--skip-end-to-end", "--end-to-end"}
 
@@ -180,6 +191,42 @@ def test_every_option_of_every_command_is_in_a_table() -> None:
     for command in COMMANDS:
         shown = set(CHANGES.get(command.name, {})) | SHOWN_BELOW.get(command.name, set())
         assert options(command) == (CAMPAIGN if command.name == "evaluate" else shown), command
+
+
+@pytest.mark.parametrize("command", SHOWN_BELOW)
+def test_the_tests_that_show_an_option_give_it_to_the_command(command: str) -> None:
+    """That is read, not run: in their modules, or below the tables of this one."""
+    own = Path(__file__)
+    texts = [(own.parent / f"{name}.py").read_text() for name in GIVEN_IN[command]]
+    text = "".join([*texts, own.read_text().partition("class Done")[2]])
+    named = {option: (f'"{option}"', f"{option.strip('-').replace('-', '_')}=") for option in SHOWN_BELOW[command]}
+    missing = [option for option, ways in named.items() if option[0] == "-" and not any(way in text for way in ways)]
+    assert missing == []
+    assert all(option in text for option in named if option[0] != "-")
+
+
+def test_a_standby_without_a_copy_to_follow_is_refused(tmp_path: Path, router: ZenohSettings) -> None:
+    config = tmp_path / "config.json"
+    config.write_text(json.dumps({"zenoh": router.model_dump()}))
+    words = ["run", "--config", str(config), "--archive", str(tmp_path / "a"), "--standby"]
+    ended = subprocess.run([sys.executable, "-m", "fleet_service.cli", *words], capture_output=True, text=True)
+    assert ended.returncode == 2
+    assert "error: standby: needs archive.copy" in ended.stderr
+
+
+def test_the_end_to_end_part_of_a_campaign_is_left_out_or_run_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    seen: list[tuple[bool, bool, bool]] = []
+
+    def note(folder: Path, quick: bool, drives: object, log_line: object, *, alone: bool) -> list[object]:
+        seen.append((quick, bool(drives), alone))
+        return []
+
+    monkeypatch.setattr(campaign, "run", note)
+    for more in ([], ["--skip-end-to-end"], ["--end-to-end"]):
+        assert main(["evaluate", "--out", str(tmp_path), "--quick", *more]) == 0
+    assert seen == [(True, True, False), (True, False, False), (True, True, True)]
 
 
 @pytest.mark.parametrize(("command", "option"), [(c, o) for c, changes in CHANGES.items() for o in changes])

@@ -6,8 +6,15 @@ A page quotes a figure as a link whose label is the figure's name; the definitio
 
     [demo.map.coverage90]: deploy/figures/demo.json "{:.0%}"
 
-What misses its bar is bold. `make figures` takes what the campaigns' last whole runs left, and writes all pages anew:
+What misses its bar is bold. A table that a campaign's report has stands whole, and nobody types in it:
+
+    <!-- edge: papers -->
+    ...
+    <!-- end -->
+
+`make figures` takes what the campaigns' last whole runs left, and writes all pages anew:
 python -m tests.usability.kept [NAME=FILE ...], where FILE is a campaign's figures.json from elsewhere.
+Kept is what has a bar, what a page quotes, and what its tables are made from.
 """
 
 from __future__ import annotations
@@ -17,9 +24,14 @@ import json
 import math
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from edge_agent.lab.evaluation import printed, report
+from edge_agent.lab.tuning import study_report
+from fleet_service.lab import fading
+from schemas.runtime.figures import Figure
 from tests.house import ROOT
 
 FOLDER: Final = ROOT / "deploy" / "figures"
@@ -46,10 +58,46 @@ CAMPAIGNS: Final = {
         "edge-agent evaluate --only inputs --recorded tests/data/rav4.blf --out .evaluation/inputs",
         ".evaluation/inputs", "edge-agent evaluate --only inputs",
     ),
+    "ahead": Campaign(
+        "edge-agent evaluate --only ahead --out .evaluation/ahead", ".evaluation/ahead",
+        "edge-agent evaluate --only ahead",
+    ),
+    "listening": Campaign(
+        "python -m deploy.listening --out .evaluation/listening", ".evaluation/listening", "deploy.listening"
+    ),
     "fleet": Campaign("fleet-service evaluate --out .evaluation/fleet", ".evaluation/fleet", "fusion"),
+    "study": Campaign(
+        "edge-agent tune --study .evaluation/study", ".evaluation/study", "edge-agent tune --study"
+    ),
+    "analytics": Campaign("make analytics-bench", ".analytics", "analytics"),
 }  # fmt: skip
 
+
+class Table(NamedTuple):
+    """A table of a campaign's report: the names of the figures that it needs, and how it is made from them."""
+
+    names: re.Pattern[str]
+    made: Callable[[dict[str, float]], str]
+
+
+TABLES: Final = {
+    "edge: papers": Table(re.compile(f"({'|'.join(map(re.escape, printed.names()))})$"), report.table),
+    "edge: world": Table(re.compile(r"world\."), report.world),
+    "edge: faults": Table(
+        re.compile(r"faults\..*\.(told|finite|coverage90|aco-fckf\.(width|rmse_vx|rmse_vy))$"), report.faults
+    ),
+    "fleet: stays dry": Table(re.compile(re.escape(fading.PREFIX)), fading.table),
+    "study: held out": Table(
+        re.compile(r"tuning\.(?!convergence)"),
+        lambda values: study_report.markdown([Figure(name, value, "") for name, value in values.items()]).rstrip(),
+    ),
+}
+
+_BLOCK: Final = re.compile(r"<!-- (\w+: [\w ]+) -->\n(.*?)<!-- end -->", re.DOTALL)
 _DEFINITION: Final = re.compile(r'^\[([\w.-]+)\]: (\S*figures/(\w+)\.json) "(\{:[^}]*\}[^"]*)"$', re.MULTILINE)
+_TABLE: Final = re.compile(r"^(\|.*\|)\n\|[ :|-]+\|\n((?:\|.*\|\n?)+)", re.MULTILINE)
+_QUOTED: Final = re.compile(r"\[[^\]\[]*\]\[[\w.-]+\]|`[^`]*`")
+_NUMBER: Final = re.compile(r"(?<![\w.])\.?\d")
 Rows = dict[str, dict[str, Any]]
 
 
@@ -111,8 +159,10 @@ def _read(name: str) -> list[dict[str, Any]]:
 
 def stale() -> list[str]:
     """Quotations that say another number than the file, or that no file has."""
-    found = []
-    for quote in (quote for page in pages() for quote in quotes(page)):
+    texts = {page: page.read_text(encoding="utf-8") for page in pages()}
+    found = [f"{page.relative_to(ROOT)}: a table is not that of the kept figures; make figures"
+             for page, text in texts.items() if tables(text) != text]  # fmt: skip
+    for quote in (quote for page in texts for quote in quotes(page)):
         where, row = f"{quote.page.relative_to(ROOT)}: {quote.name}", kept(quote.file).get(quote.name)
         if row is None:
             found.append(f"{where} is not in {FOLDER.relative_to(ROOT)}/{quote.file}.json; {_how(quote.file)}")
@@ -121,6 +171,25 @@ def stale() -> list[str]:
         else:
             found += [f"{where} is {written(quote, row)}, not {said}" for said in quote.said
                       if said != written(quote, row)]  # fmt: skip
+    return found
+
+
+def by_hand() -> list[str]:
+    """Figures that somebody typed: a number that is no quotation in a column `measured` or `value`, or anywhere
+    but in the first column and the last of a table that ends with `bar`."""
+    found = []
+    for page in pages():
+        text = _BLOCK.sub("", page.read_text(encoding="utf-8"))
+        for head, rows in _TABLE.findall(text):
+            titles = [title.strip() for title in head.strip("|").split("|")]
+            judged = [
+                number for number, title in enumerate(titles)
+                if title in ("measured", "value") or (titles[-1] == "bar" and 0 < number < len(titles) - 1)
+            ]  # fmt: skip
+            for row in rows.splitlines():
+                cells = row.strip("|").split("|")
+                typed = [cells[number].strip() for number in judged if _NUMBER.search(_QUOTED.sub("", cells[number]))]
+                found += [f"{page.relative_to(ROOT)}: {cells[0].strip()}: {cell}" for cell in typed]
     return found
 
 
@@ -146,7 +215,7 @@ def take(name: str, left: Path) -> str:
         return f"{name}: as it was; {left} is older"
     runs[commit] = {key: header[key] for key in ("date", "machine", "seeds")}
     rows = [row for row in rows if runs[before.get(row["name"], {}).get("commit", commit)]["date"] <= header["date"]]
-    newer = {row["name"]: {**row, "commit": commit} for row in rows}
+    newer = {row["name"]: {**row, "commit": commit} for row in filter(_wanted(name), rows)}
     found = before | newer
     used = {row["commit"] for row in found.values()}
     about = {"campaign": campaign.title, "command": campaign.command, "runs": {c: runs[c] for c in runs if c in used}}
@@ -159,6 +228,24 @@ def take(name: str, left: Path) -> str:
     return f"{name}: {len(newer)} figures of {commit}{dirty}, {changed} new or changed"
 
 
+def _wanted(name: str) -> Callable[[dict[str, Any]], bool]:
+    """Which figures of a file are worth keeping: what has a bar, and what a page shows."""
+    quoted = {quote.name for page in pages() for quote in quotes(page) if quote.file == name}
+    shown = [table.names for title, table in TABLES.items() if title.startswith(f"{name}: ")]
+    return lambda row: row["bar"] is not None or row["name"] in quoted or any(one.match(row["name"]) for one in shown)
+
+
+def tables(text: str) -> str:
+    """A page with the tables of campaigns as their kept figures have them; where none are kept, as it was."""
+
+    def made(block: re.Match[str]) -> str:
+        name, _, _ = block[1].partition(": ")
+        values = {key: math.nan if row["value"] is None else row["value"] for key, row in kept(name).items()}
+        return f"<!-- {block[1]} -->\n{TABLES[block[1]].made(values)}\n<!-- end -->" if values else block[0]
+
+    return _BLOCK.sub(made, text)
+
+
 def renew() -> list[str]:
     """Write all quotations anew; names of the pages that changed."""
     changed = []
@@ -168,6 +255,7 @@ def renew() -> list[str]:
             row = kept(quote.file).get(quote.name)
             if row is not None:
                 text = _mark(quote.name).sub(lambda _, q=quote, r=row: written(q, r), text)  # type: ignore[misc]
+        text = tables(text)
         if text != before:
             page.write_text(text, encoding="utf-8")
             changed.append(str(page.relative_to(ROOT)))

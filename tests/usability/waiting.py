@@ -2,44 +2,69 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pty
 import select
+import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
+from deploy.router import open_router
+
 LONGEST_S: Final = 400.0
 COMMANDS: Final = (
+    ["edge-agent", "simulate", "slalom", "--out", "{d}/s.parquet", "--vehicle-out", "{d}/s.json"],
+    ["edge-agent", "check", "{d}/log.parquet", "--vehicle", "{d}/car.json", "--out", "{d}/c.html"],
+    ["fleet-service", "compact", "--archive", "{a}"],
     ["edge-agent", "replay", "{d}/log.parquet", "--vehicle", "{d}/car.json", "--out", "{d}/e.parquet"],
     ["fleet-service", "analyze", "worst", "--archive", "{a}", "--out", "{d}/w.html"],
     ["fleet-service", "export", "map", "--archive", "{a}", "--out", "{d}/m.parquet"],
 )
+# what goes on until a signal, and the word with which its waiting is over
+LASTING: Final = (
+    (["fleet-service", "run", "--config", "{d}/lasting.json", "--archive", "{d}/lasting"], b"ready: "),
+    (["edge-agent", "run", "--config", "{d}/lasting-agent.json"], b"metrics: "),
+)
 
 
-def longest(command: list[str], cache: Path) -> float:
-    """The longest time between two signs of life of a command on a terminal, its begin and its end counted [s]."""
+def longest(command: list[str], cache: Path, ready: bytes | None = None) -> float:
+    """The longest time between two signs of life of a command on a terminal, its begin and its end counted [s].
+
+    One that is `ready` with a word is interrupted there, and its end does not count.
+    """
     here, there = pty.openpty()
     environment = {**os.environ, "XDG_CACHE_HOME": str(cache), "TERM": "xterm"}
     environment.pop("NUMBA_CACHE_DIR", None)
-    last, worst = time.monotonic(), 0.0
+    last, worst, said = time.monotonic(), 0.0, b""
     began = last
     program = [str(Path(sys.executable).parent / command[0]), *command[1:]]
     with subprocess.Popen(program, stdin=there, stdout=there, stderr=there, env=environment) as process:
         os.close(there)
         while time.monotonic() - began < LONGEST_S:
-            ready, _, _ = select.select([here], [], [], 0.1)
+            waiting, _, _ = select.select([here], [], [], 0.1)
             try:
-                heard = bool(ready and os.read(here, 65536))
+                heard = os.read(here, 65536) if waiting else b""
             except OSError:  # it has left
                 break
             if heard:
                 worst, last = max(worst, time.monotonic() - last), time.monotonic()
+            said += heard
+            if ready is not None and ready in said:
+                process.send_signal(signal.SIGINT)
+                break
+        whole = max(worst, time.monotonic() - last)
+        while ready is not None and process.poll() is None:  # what it says in leaving is taken, that it may leave
+            if select.select([here], [], [], 0.1)[0]:
+                with suppress(OSError):
+                    os.read(here, 65536)
         process.wait(60)
         os.close(here)
-    return max(worst, time.monotonic() - last)
+    return whole
 
 
 def silent_seconds(folder: Path, archive: Path) -> dict[str, float]:
@@ -48,4 +73,13 @@ def silent_seconds(folder: Path, archive: Path) -> dict[str, float]:
     for command in COMMANDS:
         words = [word.format(d=folder, a=archive) for word in command]
         found[" ".join(command[:2])] = longest(words, folder / "cache")
+    router, endpoints = open_router(listen="tcp/127.0.0.1:0")
+    connection = {"zenoh": {"connect": endpoints}}
+    (folder / "lasting.json").write_text(json.dumps(connection))
+    agent = {**connection, "spool": str(folder / "lasting.sqlite"), "metrics_port": 0}
+    (folder / "lasting-agent.json").write_text(json.dumps(agent))
+    with router:
+        for command, ready in LASTING:
+            words = [word.format(d=folder) for word in command]
+            found[" ".join(command[:2])] = longest(words, folder / "cache", ready)
     return found

@@ -6,6 +6,7 @@ import contextlib
 import io
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -14,12 +15,24 @@ import edge_agent.cli
 from edge_agent.lab.evaluation.planted import PLANTED, Recorded, drives
 from schemas.signals import CHANNELS
 
+TONNES: Final = "mass in tonnes"
+WRONG: Final = (  # those that gave sure ice, or the wrong place, in silence once, and three more
+    "steering in deg", "steering wheel", "both in g", "wheels in km/h", "a_y flipped", "yaw rate in deg/s", TONNES,
+    "latitude and longitude", "compass for yaw", "time in ms", "wheels in rpm", "a_x flipped",
+)  # fmt: skip
+
 
 def unnoticed(folder: Path, names: Sequence[str], seed: int) -> list[str]:
     """Names of mistakes of which `edge-agent replay` says nothing; the sound drive must be passed in silence."""
     drive = drives(1, seed, rough=False)[0]
     out = [] if not _said(folder, drive) else ["the sound drive is suspected"]
-    return out + [name for name in names if not _said(folder, PLANTED[name].spoil(drive))]
+    return out + [name for name in names if not _said(folder, _spoilt(name, drive))]
+
+
+def _spoilt(name: str, drive: Recorded) -> Recorded:
+    if name != TONNES:
+        return PLANTED[name].spoil(drive)
+    return drive._replace(vehicle=drive.vehicle.model_copy(update={"mass": drive.vehicle.mass / 1000.0}))
 
 
 def _said(folder: Path, drive: Recorded) -> bool:

@@ -66,11 +66,11 @@ def update_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, 
     Writes its innovation and its theoretical variance without the inflation.
     """
     constants, nominal, features, node = design.constants, memory.nominal, scratch.features, scratch.node
-    mean, root, side_mu = memory.mean[j], scratch.root[j], design.sides.mu[j]
+    mean, root = memory.mean[j], scratch.root[j]
     innovation, theoretical = scratch.innovation[j], scratch.theoretical[j]
     node.gained.x, node.gained.y = gained_velocity(features.gain, mean)
-    price = linearize(memory.row, design, side_mu, mean, features, node)
-    spread(memory.row, design, side_mu, mean, root, features, node)
+    price = linearize(memory, design, scratch, j)
+    spread(memory, design, scratch, j)
     across = inflation * doubted_noise(memory.trust, constants) / features.novelty
     plain = square = 0.0
     for r in range(ROWS):
@@ -96,19 +96,13 @@ def update_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, 
 
 
 @compiled
-def linearize(
-    row: FloatArray,
-    design: MixtureDesign,
-    side_mu: FloatArray,
-    mean: FloatArray,
-    features: BlockFeatures,
-    node: NodeWorkspace,
-) -> float:
-    """Fill node.derivative, leave node.force as at the mean, and return the price of sliding.
+def linearize(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> float:
+    """Fill node.derivative of node j, leave node.force as at the mean, and return the price of sliding.
 
     Leak and offset of a_y move the same forces, so that one derivative tells the other.
     """
-    constants, curve = design.constants, design.curve
+    constants, curve, side_mu = design.constants, design.curve, design.sides.mu[j]
+    row, mean, features, node = memory.row, memory.mean[j], scratch.features, scratch.node
     price, all_torques = 0.0, True
     for wheel in range(4):
         all_torques = all_torques and features.force_unit[wheel] == 0.0
@@ -132,7 +126,7 @@ def linearize(
             node.point[state] -= step
             for r in range(ROWS):
                 out[r] = (out[r] - node.residual[r]) / step
-    _by_wheel_speeds(row, design, side_mu, mean, features, node)
+    _by_wheel_speeds(memory, design, scratch, j)
     derivative = node.derivative
     for r in range(ROWS):
         axle = r // 2 if r < 4 else r - 4
@@ -145,18 +139,13 @@ def linearize(
 
 
 @compiled
-def _by_wheel_speeds(
-    row: FloatArray,
-    design: MixtureDesign,
-    side_mu: FloatArray,
-    mean: FloatArray,
-    features: BlockFeatures,
-    node: NodeWorkspace,
-) -> None:
+def _by_wheel_speeds(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> None:
     """Derivatives by the radii and by the lag of the wheel speeds: the row of a wheel sees its own speed.
 
     All radii are moved at once, for they bend the rows of the axles by next to nothing; node.force is as at the mean.
     """
+    row, mean, side_mu = memory.row, memory.mean[j], design.sides.mu[j]
+    features, node = scratch.features, scratch.node
     step = design.nominal.std[NodeState.RADIUS]
     for wheel in range(4):
         node.point[NodeState.RADIUS + wheel] = mean[NodeState.RADIUS + wheel] + step
@@ -209,20 +198,13 @@ def unfelt(slope: float) -> float:
 
 
 @compiled
-def spread(
-    row: FloatArray,
-    design: MixtureDesign,
-    side_mu: FloatArray,
-    mean: FloatArray,
-    root: FloatArray,
-    features: BlockFeatures,
-    node: NodeWorkspace,
-) -> None:
+def spread(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, j: int) -> None:
     """Fill node.deviation (A), node.residual with the predicted rows and node.nonlinearity with its variance.
 
-    root is lower triangular.
+    scratch.root[j] is lower triangular.
     """
-    scale = math.sqrt(CURVED)
+    row, mean, root, side_mu = memory.row, memory.mean[j], scratch.root[j], design.sides.mu[j]
+    features, node, scale = scratch.features, scratch.node, math.sqrt(CURVED)
     for r in range(ROWS):
         node.residual[r] = node.nonlinearity[r] = 0.0
     for column in range(CURVED):

@@ -66,61 +66,64 @@ class Diagnosis:
 
 def diagnose(t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: FloatArray | None = None) -> Diagnosis:
     """Examine a log: times t (T,) [s], signals (T, 18), and the receiver's speed (T,) [m/s] where it was recorded."""
-    said = Diagnosis()
-    t, slow = _seconds(t, said)
+    diagnosis = Diagnosis()
+    t, slow = _seconds(t, diagnosis)
     if slow:
-        return said
+        return diagnosis
     signals = signals.copy()
-    _jumps(signals, said)
+    _jumps(signals, diagnosis)
     drive = prepare(t, signals, vehicle, ground)
     if _axes_exchanged(drive):
-        said.findings.append(Finding("ax", "exchanged with ay", "a_x follows v·r and a_y the wheels' acceleration"))
+        words = "a_x follows v·r and a_y the wheels' acceleration"
+        diagnosis.findings.append(Finding("ax", "exchanged with ay", words))
         signals[:, [S.AX, S.AY]] = signals[:, [S.AY, S.AX]]
         drive = prepare(t, signals, vehicle, ground)
     if exchanged(t, signals, drive):
         words = "the fixes go as fast as the wheels only when latitude and longitude are exchanged"
-        said.findings.append(Finding("latitude", "exchanged with longitude", words))
+        diagnosis.findings.append(Finding("latitude", "exchanged with longitude", words))
         signals[:, [S.LATITUDE, S.LONGITUDE]] = signals[:, [S.LONGITUDE, S.LATITUDE]]
         drive = prepare(t, signals, vehicle, ground)
     found = fits(drive)
     verdict = explain(found, vehicle)
-    said.fits, said.drive = found, drive
-    _scales(verdict, found, said)
+    diagnosis.fits, diagnosis.drive = found, drive
+    _scales(verdict, found, diagnosis)
     scaled = any(fault is not None for fault in verdict.faults.values())  # offsets and radii in wrong units say nothing
     late = clocks(found)
     for device, (seconds, margin) in late.items():
         if margin < CLOCK_SETTLED:
-            said.unknown.append(f"clock of the {device}")
+            diagnosis.unknown.append(f"clock of the {device}")
         else:
             words = f"the clock of the {device} is {seconds:+.2f} s late"
-            said.findings.append(Finding(device, "clock", words, delay_s=seconds, confidence=margin))
-    said.findings += yaw_findings(signals, drive)
+            diagnosis.findings.append(Finding(device, "clock", words, delay_s=seconds, confidence=margin))
+    diagnosis.findings += yaw_findings(signals, drive)
     if not scaled:
-        said.findings += _radii(drive, vehicle) + _offsets(drive, found)
+        diagnosis.findings += _radii(drive, vehicle) + _offsets(drive, found)
     for quantity, channel in CHANNELS_OF.items():
-        if any(finding.channel == channel for finding in said.findings):
+        if any(finding.channel == channel for finding in diagnosis.findings):
             continue
-        (said.sound if verdict.settled(quantity) else said.unknown).append(channel)
-    if np.isfinite(signals[:, S.LATITUDE]).any() and not any(f.channel in ("latitude", "yaw") for f in said.findings):
-        (said.sound if found["ground"].known else said.unknown).append("latitude")
-    return said
+        (diagnosis.sound if verdict.settled(quantity) else diagnosis.unknown).append(channel)
+    found_wrong = {finding.channel for finding in diagnosis.findings}
+    if np.isfinite(signals[:, S.LATITUDE]).any() and not found_wrong & {"latitude", "yaw"}:
+        (diagnosis.sound if found["ground"].known else diagnosis.unknown).append("latitude")
+    return diagnosis
 
 
-def _seconds(t: FloatArray, said: Diagnosis) -> tuple[FloatArray, bool]:
+def _seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
     """Times in seconds, and whether they are too few to say anything."""
     step = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
     if step > 0.0 and not 1.0 / FASTEST_HZ <= step <= 1.0 / SLOWEST_HZ:
         for unit, factor in (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("minutes", 60.0)):
             if 1.0 / FASTEST_HZ <= step * factor <= 1.0 / SLOWEST_HZ:
                 words = f"a sample every {step:g}: are these {unit}?"
-                said.findings.append(Finding("t", unit, words, scale=factor))
+                diagnosis.findings.append(Finding("t", unit, words, scale=factor))
                 return t * factor, False
-        said.findings.append(Finding("t", "rate", f"a sample every {step:g} s; friction needs {SLOWEST_HZ:g} a second"))
+        words = f"a sample every {step:g} s; friction needs {SLOWEST_HZ:g} a second"
+        diagnosis.findings.append(Finding("t", "rate", words))
         return t, True
     return t, False
 
 
-def _jumps(signals: FloatArray, said: Diagnosis) -> None:
+def _jumps(signals: FloatArray, diagnosis: Diagnosis) -> None:
     """Status bits above a wheel's number: readings far off the other three, and back."""
     wheels = signals[:, S.OMEGA : S.OMEGA + 4]
     good = np.isfinite(wheels).all(axis=1)
@@ -135,7 +138,7 @@ def _jumps(signals: FloatArray, said: Diagnosis) -> None:
         if off.mean() > JUMPS:
             sizes = np.unique(np.round(above[off] / max(fast, 1e-9), 1))
             words = f"{off.mean():.0%} of its readings lie far off the other wheels, {len(sizes)} steps: status bits?"
-            said.findings.append(Finding(f"omega_{wheel}", "status bits", words))
+            diagnosis.findings.append(Finding(f"omega_{wheel}", "status bits", words))
             signals[rows[off], S.OMEGA + i] = np.nan
 
 
@@ -163,7 +166,7 @@ WORDS: Final = {
 ASKED: Final = {"ax": "longitudinal", "ay": "lateral", "delta": "steering", "sides": "axle", "place": "turning"}
 
 
-def _scales(verdict: Verdict, found: dict[str, Fit], said: Diagnosis) -> None:
+def _scales(verdict: Verdict, found: dict[str, Fit], diagnosis: Diagnosis) -> None:
     for quantity, fault in verdict.faults.items():
         if fault is None or quantity == "place" or not verdict.settled(quantity):
             continue
@@ -172,7 +175,7 @@ def _scales(verdict: Verdict, found: dict[str, Fit], said: Diagnosis) -> None:
             gain=gain, wheels=fault.factor, lateral=found["lateral"].gain, axle=found["axle"].gain
         )
         channel = CHANNELS_OF.get(quantity, "omega")
-        said.findings.append(
+        diagnosis.findings.append(
             Finding(
                 channel, fault.name, f"{words}: {fault.name}?", 1.0 / fault.factor, confidence=verdict.margins[quantity]
             )

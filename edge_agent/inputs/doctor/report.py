@@ -29,22 +29,22 @@ STYLE: Final = (
 )
 
 
-def lines(said: Diagnosis) -> list[str]:
+def lines(diagnosis: Diagnosis) -> list[str]:
     """What was found, a line each."""
-    lines = [f"{'FAULT':<8} {f.channel:<10} {f.kind:<24} {f.words}" for f in said.findings]
-    lines += [f"{'unknown':<8} {channel:<10} nothing in this drive tells" for channel in said.unknown]
-    return [*lines, *(f"{'sound':<8} {channel}" for channel in said.sound)]
+    lines = [f"{'FAULT':<8} {f.channel:<10} {f.kind:<24} {f.words}" for f in diagnosis.findings]
+    lines += [f"{'unknown':<8} {channel:<10} nothing in this drive tells" for channel in diagnosis.unknown]
+    return [*lines, *(f"{'sound':<8} {channel}" for channel in diagnosis.sound)]
 
 
-def document(said: Diagnosis) -> dict[str, object]:
+def document(diagnosis: Diagnosis) -> dict[str, object]:
     """What was found, for a program: scale, offset and delay mend a channel, in this order."""
     return {
-        "passed": said.passed, "advice": advice(said), "sound": said.sound, "unknown": said.unknown,
+        "passed": diagnosis.passed, "advice": advice(diagnosis), "sound": diagnosis.sound, "unknown": diagnosis.unknown,
         "findings": [
-            {name: _finite(value) for name, value in asdict(finding).items()} for finding in said.findings
+            {name: _finite(value) for name, value in asdict(finding).items()} for finding in diagnosis.findings
         ],
         "identities": {
-            name: {what: _finite(getattr(fit, what)) for what in SHOWN} for name, fit in said.fits.items()
+            name: {what: _finite(getattr(fit, what)) for what in SHOWN} for name, fit in diagnosis.fits.items()
         },
     }  # fmt: skip
 
@@ -53,25 +53,27 @@ def _finite(value: object) -> object:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def advice(said: Diagnosis) -> str:
+def advice(diagnosis: Diagnosis) -> str:
     """One line: whether the log may be published, and what to do if not."""
-    if said.passed:
+    if diagnosis.passed:
         return "passed: units, signs, clocks and offsets agree with each other"
-    if said.findings:
+    if diagnosis.findings:
         return "not passed: correct the profile (--fix writes it), import again"
     return "not passed: drive half a minute with turns and some braking, or vouch for it with --trust"
 
 
-def page(said: Diagnosis, title: str) -> str:
+def page(diagnosis: Diagnosis, title: str) -> str:
     """A page of HTML: verdict, findings, and each identity as a plot."""
-    rows = [f"<tr class='bad'><td>{escape(f.channel)}<td>{escape(f.kind)}<td>{escape(f.words)}" for f in said.findings]
-    rows += [f"<tr><td>{escape(channel)}<td>unknown<td>nothing in this drive tells" for channel in said.unknown]
-    rows += [f"<tr><td>{escape(channel)}<td>sound<td>" for channel in said.sound]
-    plots = "".join(_figure(name, fit) for name, fit in said.fits.items() if len(fit.right))
+    rows = [
+        f"<tr class='bad'><td>{escape(f.channel)}<td>{escape(f.kind)}<td>{escape(f.words)}" for f in diagnosis.findings
+    ]
+    rows += [f"<tr><td>{escape(channel)}<td>unknown<td>nothing in this drive tells" for channel in diagnosis.unknown]
+    rows += [f"<tr><td>{escape(channel)}<td>sound<td>" for channel in diagnosis.sound]
+    plots = "".join(_figure(name, fit) for name, fit in diagnosis.fits.items() if len(fit.right))
     return (
         f"<!doctype html><meta charset='utf-8'><title>{escape(title)}</title><style>{STYLE}</style>"
-        f"<h1>{escape(title)}</h1><p>{escape(advice(said))}</p>"
-        f"<table><tr><th>channel<th>finding<th>evidence{''.join(rows)}</table>{_table(said.fits)}{plots}\n"
+        f"<h1>{escape(title)}</h1><p>{escape(advice(diagnosis))}</p>"
+        f"<table><tr><th>channel<th>finding<th>evidence{''.join(rows)}</table>{_table(diagnosis.fits)}{plots}\n"
     )
 
 

@@ -35,6 +35,7 @@ ALERTED: Final = 0.3  # what lies below has P(slippery) > 0.9 on such a map, and
 NEAR_SLIPPERY: Final = 0.45  # a stretch may begin in a cell that is half ice
 BESIDE_M: Final = 3.5
 BESIDE_HZ: Final = 10.0
+LEAST_CAME, LEAST_KM = 100, 1000.0  # fewer hold no bar of .99, or of 1 in 1000 km: they would by chance
 START_NS: Final = 1_800_000_000 * NS
 
 
@@ -84,9 +85,9 @@ def figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Fi
         km = counts.metres / 1e3
         out += [
             Figure(f"ahead.warned_share{ending}", counts.warned / counts.came if counts.came else float("nan"), "",
-                   0.99 if routed else None, "more"),
+                   0.99 if routed and counts.came >= LEAST_CAME else None, "more"),
             Figure(f"ahead.false_per_1000km{ending}", 1e3 * counts.false / km if km else float("nan"), "",
-                   1 if routed else None),
+                   1 if routed and km >= LEAST_KM else None),
             Figure(f"ahead.approaches{ending}", counts.came, "to alerted stretches"),
             Figure(f"ahead.driven_km{ending}", km, "km"),
         ]  # fmt: skip

@@ -40,7 +40,7 @@ FAKE_M: Final = 22.0  # half of a fake stretch
 
 
 @dataclass
-class Heading:
+class FilterTrace:
     """What N filters said at each of T blocks: place (T, N), own and visit (T, N, 32), truth (T, N)."""
 
     place: IntArray
@@ -57,17 +57,17 @@ def figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Fi
     nats = 0.0
     for seed in seeds:
         fleet = SimulatedFleet(f"hills-{seed}", vehicles, seed, RATE_HZ, rough=0.5)
-        said = record(fleet, seconds)
+        trace = record(fleet, seconds)
         scenario, now = fleet.scenario, START_NS
         rng = np.random.default_rng(seed)
         true_map = heard(places_of(scenario, seconds), now, rng)
         old_map = heard(places_of(scenario, BEFORE_S), now, rng)
         fake_map = heard(_with_fake_ice(scenario, seconds, rng), now, rng)
-        errors.append(entry_errors(said, true_map, now))
+        errors.append(entry_errors(trace, true_map, now))
         # where the old map says grip and there is ice; where the fake one says ice and there is grip
         for name, wrong in (("ice", old_map), ("dry", fake_map)):
-            delays[name] += arrivals(said, wrong, true_map, now)
-        nats = max(nats, published_change(fleet, said, seconds))
+            delays[name] += arrivals(trace, wrong, true_map, now)
+        nats = max(nats, published_change(fleet, trace, seconds))
     with_, without = np.concatenate(errors).T
     out = [
         Figure("prior.entry_error_ratio", float(with_.mean() / without.mean()), "", 0.5),
@@ -82,7 +82,7 @@ def figures(seeds: Sequence[int], seconds: float, vehicles: int = 24) -> list[Fi
     return [*out, Figure("prior.evidence_nats", nats, "nat", 0.5)]
 
 
-def record(fleet: SimulatedFleet, seconds: float, prior: HeardMap | None = None) -> Heading:
+def record(fleet: SimulatedFleet, seconds: float, prior: HeardMap | None = None) -> FilterTrace:
     """Drive, and note what the filters say; with a `prior`, as a car does that hears that map."""
     vehicles = len(fleet.vehicles)
     config = AgentConfig()
@@ -103,37 +103,37 @@ def record(fleet: SimulatedFleet, seconds: float, prior: HeardMap | None = None)
             informed.step(pipeline.places, *beliefs, told)
         columns.append((pipeline.places, *beliefs, fleet.truth.mu_wheel[-1].mean(axis=1)))
     place, own, visit, truth = (np.stack(column) for column in zip(*columns, strict=True))
-    return Heading(place, own, visit, truth, published)
+    return FilterTrace(place, own, visit, truth, published)
 
 
-def entry_errors(said: Heading, known: HeardMap, now: int) -> FloatArray:
+def entry_errors(trace: FilterTrace, known: HeardMap, now: int) -> FloatArray:
     """|error| of the median within FIRST_S of entering a cell that the map knows, (n, 2): with the map and without."""
-    told, alone = with_map(said, known, now), _medians(np.exp(said.own))
-    since = _since_entry(said.place)
-    first = (since * BLOCK / RATE_HZ < FIRST_S) & np.isin(said.place, known.keys())
+    told, alone = with_map(trace, known, now), _medians(np.exp(trace.own))
+    since = _since_entry(trace.place)
+    first = (since * BLOCK / RATE_HZ < FIRST_S) & np.isin(trace.place, known.keys())
     first[: int(RATE_HZ / BLOCK * 5.0)] = False  # the first seconds of a drive are nobody's entry
-    return np.column_stack([np.abs(one - said.truth)[first] for one in (told, alone)])
+    return np.column_stack([np.abs(one - trace.truth)[first] for one in (told, alone)])
 
 
-def arrivals(said: Heading, wrong: HeardMap, right: HeardMap, now: int) -> list[tuple[float, float]]:
+def arrivals(trace: FilterTrace, wrong: HeardMap, right: HeardMap, now: int) -> list[tuple[float, float]]:
     """Seconds from where a map is wrong until |μ - truth| <= ARRIVED, with it and without; the stay, if never."""
-    differ = _differ(said.place, wrong, right, now)
-    told, alone = with_map(said, wrong, now), _medians(np.exp(said.own))
+    differ = _differ(trace.place, wrong, right, now)
+    told, alone = with_map(trace, wrong, now), _medians(np.exp(trace.own))
     out = []
-    for k in range(said.place.shape[1]):
+    for k in range(trace.place.shape[1]):
         edges = np.flatnonzero(np.diff(np.concatenate([[False], differ[:, k], [False]]).astype(np.int8)))
         for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
             if last - first < RATE_HZ / BLOCK:  # less than a second there
                 continue
             pair = []
             for one in (told, alone):
-                near = np.abs(one[first:last, k] - said.truth[first:last, k]) <= ARRIVED
+                near = np.abs(one[first:last, k] - trace.truth[first:last, k]) <= ARRIVED
                 pair.append((int(near.argmax()) if near.any() else last - first) * BLOCK / RATE_HZ)
             out.append((pair[0], pair[1]))
     return out
 
 
-def published_change(fleet: SimulatedFleet, said: Heading, seconds: float) -> float:
+def published_change(fleet: SimulatedFleet, trace: FilterTrace, seconds: float) -> float:
     """Largest change [nat] of a published likelihood where the cars hear a map that is wrong everywhere."""
     seed = int(fleet.scenario.name.split("-")[1])
     again = SimulatedFleet(fleet.scenario, len(fleet.vehicles), seed, RATE_HZ, rough=0.5)
@@ -141,20 +141,20 @@ def published_change(fleet: SimulatedFleet, said: Heading, seconds: float) -> fl
     lie = places_of(fleet.scenario, 0.0)
     heard_lie = heard(lie._replace(mu=np.where(lie.mu < 0.4, 0.9, 0.15)), START_NS)
     other = record(again, short, heard_lie).published
-    count = min(len(other), len(said.published))
+    count = min(len(other), len(trace.published))
     if not count:
         return float("nan")
-    pairs = (np.frombuffer(b"".join(rows[:count]), np.uint8).astype(np.float64) for rows in (other, said.published))
+    pairs = (np.frombuffer(b"".join(rows[:count]), np.uint8).astype(np.float64) for rows in (other, trace.published))
     a, b = pairs
     return float(np.abs(a - b).max()) / mugrid.STEPS_PER_NAT
 
 
-def with_map(said: Heading, known: HeardMap, now: int) -> FloatArray:
+def with_map(trace: FilterTrace, known: HeardMap, now: int) -> FloatArray:
     """Median of what would be believed with a map, (T, N)."""
-    prior, out = MapPrior(said.place.shape[1]), np.empty(said.place.shape)
-    for t, place in enumerate(said.place):
+    prior, out = MapPrior(trace.place.shape[1]), np.empty(trace.place.shape)
+    for t, place in enumerate(trace.place):
         told = {k: _belief(known, int(place[k]), now) for k in prior.enters(place)}
-        out[t] = mugrid.quantiles(prior.step(place, said.own[t], said.visit[t], told), 0.5)
+        out[t] = mugrid.quantiles(prior.step(place, trace.own[t], trace.visit[t], told), 0.5)
     return out
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from dataclasses import dataclass, field
 from typing import Any, Self
 
@@ -44,7 +45,10 @@ def tile_payload(key: IntArray, friction: float | FloatArray, now: int, **change
 
 @dataclass
 class MadeUpService:
-    """Serves places of known friction (`mu` by cell * 4 + sector), and alerts that stand; notes what it was asked."""
+    """Serves places of known friction (`mu` by cell * 4 + sector), and alerts that stand; notes what it was asked.
+
+    They were observed at `now`. With `kept` it answers with the tile as it was made then, as a store of messages would.
+    """
 
     settings: ZenohSettings
     now: int
@@ -52,6 +56,7 @@ class MadeUpService:
     standing: list[Alert] = field(default_factory=list)
     asked: list[str] = field(default_factory=list)
     lock: threading.Lock = field(default_factory=threading.Lock)
+    kept: bool = False
 
     def __enter__(self) -> Self:
         session = open_session(self.settings)
@@ -69,6 +74,11 @@ class MadeUpService:
         tile = int(grid.tile_of(alert.cell))
         self.session.put(keys.alert_key(tile), wire.encode_alert(alert), encoding=wire.ALERT_ENCODING)
 
+    def tile(self, key: IntArray, mu: FloatArray) -> bytes:
+        """What it answers for places of a tile."""
+        age = 1.0 if self.kept else 1.0 + (time.time_ns() - self.now) / NS
+        return tile_payload(key, mu, self.now, age_s=np.full(len(key), age))
+
     def _answer(self, asked: zenoh.Query) -> None:
         with asked:
             self.asked.append(str(asked.selector))
@@ -77,7 +87,7 @@ class MadeUpService:
                 inside = key if box is None else key[grid.touches(box, grid.bounds(key // grid.SECTORS))]
                 if len(inside) and asked.key_expr.intersects(zenoh.KeyExpr(keys.map_key(tile))):
                     mu = np.array([self.mu[k] for k in inside.tolist()])
-                    asked.reply(keys.map_key(tile), tile_payload(inside, mu, self.now), encoding=wire.ARROW)
+                    asked.reply(keys.map_key(tile), self.tile(inside, mu), encoding=wire.ARROW)
 
     def _stand(self, asked: zenoh.Query) -> None:
         with asked:

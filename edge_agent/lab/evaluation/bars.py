@@ -11,10 +11,10 @@ import numpy as np
 from edge_agent.lab.evaluation import worth
 from edge_agent.lab.evaluation.campaign import DEFAULT, Results
 from edge_agent.lab.evaluation.measures import COMPONENTS, bounds
-from edge_agent.lab.evaluation.real_world import SURFACES
 from edge_agent.lab.evaluation.reliability import LEVELS, shares
 from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
+from schemas.thresholds import SURFACES
 
 PRIOR_WIDTH: Final = 0.9 * 1.15  # of the 90 % interval of the uniform prior
 

@@ -154,8 +154,8 @@ def figures(folder: Path, seed: int, recorded: Path | None, seconds: int = DRIVE
     largest, formats = same_estimates(folder, seed, seconds)
     return [
         Figure("inputs.decode_errors", float(wrong), "values", 0.0),
-        Figure("inputs.decoded", float(compared), "values"),
+        Figure("inputs.decoded", float(compared), "values", 60_000.0, "more"),
         Figure("inputs.import_s", import_s(folder), "s", 1.5),
         Figure("inputs.same_estimates", largest, "1", 1e-6),
-        Figure("inputs.formats", float(formats), "formats"),
+        Figure("inputs.formats", float(formats), "formats", 6.0, "more"),
     ]

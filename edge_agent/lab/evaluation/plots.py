@@ -13,11 +13,12 @@ from edge_agent.app.tuned_memberships import shipped
 from edge_agent.estimators import TUNED
 from edge_agent.lab.evaluation.campaign import DEFAULT, PlottedDrive, Results
 from edge_agent.lab.evaluation.measures import bounds, nees
-from edge_agent.lab.evaluation.real_world import SURFACES, RealWorldResults
+from edge_agent.lab.evaluation.real_world import RealWorldResults
 from edge_agent.lab.evaluation.scenarios import OTHERS, PAPERS, VEHICLES
 from schemas.runtime.figures import Figure
 from schemas.runtime.palette import ESTIMATORS, TRUTH, line_of
 from schemas.signals import Health, S
+from schemas.thresholds import SURFACES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -64,13 +65,13 @@ def _scenario(scenario: str, drives: dict[str, PlottedDrive], seed: int, path: P
         axis.set_ylabel(label)
     axes[3].plot(t, first.batch.mu[:, 0], **_true(), label="true, mean of the wheels")
     for estimator, drive in drives.items():
-        said, style = drive.reported, _line(estimator)
-        axes[3].plot(t, said.mu[:, 0], **style)
+        reported, style = drive.reported, _line(estimator)
+        axes[3].plot(t, reported.mu[:, 0], **style)
         if estimator == DEFAULT or len(drives) == 1:
             band = {"color": style["color"], "alpha": 0.2, "lw": 0, "label": f"90 % band of {estimator}"}
-            axes[3].fill_between(t, said.mu_lower[:, 0], said.mu_upper[:, 0], **band)
-        axes[4].plot(t, said.adaptation[:, 0], **style)
-        axes[5].semilogy(t, nees(drive.batch, said).mean(axis=1), **style)
+            axes[3].fill_between(t, reported.mu_lower[:, 0], reported.mu_upper[:, 0], **band)
+        axes[4].plot(t, reported.adaptation[:, 0], **style)
+        axes[5].semilogy(t, nees(drive.batch, reported).mean(axis=1), **style)
     axes[3].set(ylabel="μ and its 90 % band", ylim=(0.0, 1.25))
     axes[4].set(ylabel="factor on R")
     ends = bounds("nees", first.batch.t.shape[1])

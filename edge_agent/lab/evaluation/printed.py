@@ -89,6 +89,14 @@ OWN: Final = {
 }  # fmt: skip
 DEFAULT: Final = "aco-fckf"
 
+
+def names() -> list[str]:
+    """Names of the figures that stand beside what the papers print, with their spreads."""
+    found = [name.replace("ESTIMATOR", estimator) for row in PRINTED for name in (row.same, row.real) if name
+             for estimator in ((OWN[row.paper], DEFAULT) if "ESTIMATOR" in name else ("",))]  # fmt: skip
+    return [f"{name}{end}" for name in found for end in ("", ".sd")]
+
+
 WHY_NOT: Final = """\
 Where a printed figure is not reproducible, and why:
 

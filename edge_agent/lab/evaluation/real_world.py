@@ -32,9 +32,8 @@ from schemas.errors import InputError
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import BoolArray, FloatArray
 from schemas.signals import Health, S, per_wheel
-from schemas.thresholds import EXCITED_SHARE, GRAVITY, SLIPPERY_MU, UTILISED_WINDOW_S, Z_95
+from schemas.thresholds import EXCITED_SHARE, GRAVITY, SLIPPERY_MU, SURFACES, UTILISED_WINDOW_S, Z_95
 
-SURFACES: Final = {"ice": (0.0, 0.2), "snow": (0.2, 0.45), "wet": (0.45, 0.75), "dry": (0.75, 2.0)}
 LOST_M_S: Final = 1.0
 MISS: Final = 20.0  # of the interval score of Gneiting and Raftery (2007) at 90 %
 PRIOR: Final = (LOWER + 0.05 * (UPPER - LOWER), UPPER - 0.05 * (UPPER - LOWER))  # 90 % of it

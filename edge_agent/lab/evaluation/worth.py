@@ -23,11 +23,12 @@ from edge_agent.dynamics.parameters import parameter_table
 from edge_agent.estimators.friction_mixture.bank import mixture_bank
 from edge_agent.estimators.friction_mixture.design import design_of
 from edge_agent.lab.evaluation.batch import DriveSet, joined
-from edge_agent.lab.evaluation.real_world import SURFACES, interval_score, town
+from edge_agent.lab.evaluation.real_world import interval_score, town
 from edge_agent.lab.simulation import PRESETS, simulate_manoeuvre
 from edge_agent.lab.simulation.relief import ROADS
 from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
+from schemas.thresholds import SURFACES
 
 ESTIMATOR: Final = "aco-fckf"
 CARS, TOWN_S, DRIVE_S, SEEDS = 8, 60.0, 8.0, 5

@@ -162,7 +162,7 @@ def crashes(folder: Path, kills: int = KILLS) -> tuple[list[str], int]:
         words += ["--config", str(config), "--trust", *(["--dbc", str(dbc)] if dbc else [])]
         if kind == "gpsd":  # positions beside a bus
             words += ["--source", addresses("can")[1]]
-        command = [sys.executable, "-c", "import sys; from edge_agent.cli import main; sys.exit(main(sys.argv[1:]))"]
+        command = [sys.executable, "-m", "edge_agent.cli"]
         agent = subprocess.Popen([*command, *words], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True)
         missed = [] if _shows(agent, port, source, silent=True, patience_s=START_S) else ["no source at the start"]
         for kill in range(kills):
@@ -176,10 +176,10 @@ def crashes(folder: Path, kills: int = KILLS) -> tuple[list[str], int]:
             if not _shows(agent, port, source, silent=True):
                 missed.append(f"loss {kill + 1}")
         agent.terminate()
-        said, _ = agent.communicate(timeout=PATIENCE_S)
-        if missed or agent.returncode or not said.strip().endswith("}"):
+        output, _ = agent.communicate(timeout=PATIENCE_S)
+        if missed or agent.returncode or not output.strip().endswith("}"):
             unseen = f"did not see {', '.join(missed)}" if missed else "saw all"
-            bad.append(f"{kind}: the agent {unseen}, ended with {agent.returncode} and said {said[-200:]!r}")
+            bad.append(f"{kind}: the agent {unseen}, ended with {agent.returncode} and said {output[-200:]!r}")
     return bad, losses
 
 
@@ -214,12 +214,12 @@ def figures(folder: Path, seconds: float, kills: int = KILLS) -> list[Figure]:
         missing, sent = lost(kind, folder, seconds)
         found += [
             Figure(f"live.{kind}.samples_lost", float(missing), "samples", 0.0),
-            Figure(f"live.{kind}.samples", float(sent), "samples"),
+            Figure(f"live.{kind}.samples", float(sent), "samples", 6_000.0, "more"),
         ]
     bad, tries = crashes(folder, kills)
     for reason in bad:
         print(reason, file=sys.stderr)
     return [
         *found, Figure("live.source_loss.crashes", float(len(bad)), "crashes", 0.0),
-        Figure("live.source_loss.losses", float(tries), "losses"),
+        Figure("live.source_loss.losses", float(tries), "losses", 12.0, "more"),
     ]  # fmt: skip

@@ -13,8 +13,7 @@ from fleet_service.analytics.options import Options
 from fleet_service.analytics.past_map import visited_cells
 from fleet_service.archive import layout
 from fleet_service.fusion import Fusion
-from fleet_service.ingest.weather import archived
-from fleet_service.replay.rebuild import Since, replay
+from fleet_service.replay.rebuild import Since, replay, weathered
 from schemas import tables
 from schemas.errors import InputError
 from schemas.thresholds import NS
@@ -34,9 +33,8 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
     if options.step_s is not None and not LEAST_STEP_S <= options.step_s < math.inf:
         raise InputError("step", f"{options.step_s:g} s is no step", "give the seconds between two frames, e.g. 600")
     at = options.at if options.at is not None else engine.part.until
-    fusion = Fusion(options.lateness_s)
     last = at if options.step_s is None else max(at, engine.part.until)
-    fusion.update_weather(archived(engine.root, received_until=last))
+    fusion = weathered(engine.root, options.lateness_s, last)
     if options.step_s is None:
         rows = 0
         for updated in replay(engine.root, fusion, Since(until=at, box=engine.part.bbox)):

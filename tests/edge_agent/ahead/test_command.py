@@ -15,7 +15,7 @@ from edge_agent.lab.simulation.scenarios import scenario_named
 from schemas import grid
 from schemas.wire import Alert
 from tests.edge_agent.ahead.roads import alert
-from tests.edge_agent.service import Router
+from tests.edge_agent.service import Router, Service
 
 WORDS = ["run", "--scenario", "test", "--estimator", "ckf", "--name", "car-one", "--duration", "6"]
 
@@ -45,7 +45,7 @@ def test_a_car_that_listens_prints_its_warnings_and_heeds_its_route(
     latitude, longitude = scenario.to_latlon(corners[:, 0], corners[:, 1])
     route = tmp_path / "way.geojson"
     route.write_text(json.dumps({"type": "LineString", "coordinates": np.column_stack([longitude, latitude]).tolist()}))
-    with MadeUpService(router.settings, now, standing=everywhere_slippery(now)):
+    with MadeUpService(router.settings, now, standing=everywhere_slippery(now)), Service(router):
         assert main([*WORDS, *settings(tmp_path, router), "--ahead", "--route", str(route)]) == 0
     *lines, last = capsys.readouterr().out.splitlines()
     warnings = [one for line in lines if (one := json.loads(line)).get("event") == "warning"]
@@ -68,7 +68,7 @@ def test_of_a_fleet_the_share_that_is_warned_hears_and_the_others_do_not(
 ) -> None:
     now = time.time_ns()
     words = ["fleet", "--scenario", "test", "--estimator", "ckf", "--vehicles", "4", "--duration", "6"]
-    with MadeUpService(router.settings, now, standing=everywhere_slippery(now)):
+    with MadeUpService(router.settings, now, standing=everywhere_slippery(now)), Service(router):
         assert main([*words, *settings(tmp_path, router), "--warned", "0.5"]) == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     warned = {one["vehicle"] for one in lines if one.get("event") == "warning"}

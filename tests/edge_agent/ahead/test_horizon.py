@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from edge_agent.ahead import known
+from edge_agent.ahead.asking import FURTHER_M, Asked
 from edge_agent.ahead.horizon import (
     COMFORT,
     SIGHT_M,
@@ -18,7 +19,7 @@ from edge_agent.ahead.horizon import (
     safe_speed,
 )
 from edge_agent.ahead.known import ALERT_HELD_S, BORROWED, CHANGE_S, HELD_S, OTHER_WAY, HeardMap, belief_of
-from edge_agent.ahead.path import NONE, GivenRoute, corridor
+from edge_agent.ahead.path import NONE, GivenRoute, Pose, corridor
 from edge_agent.ahead.roads import ways_on
 from schemas import grid, mugrid
 from schemas.thresholds import GRAVITY, NS
@@ -129,6 +130,18 @@ def test_a_part_of_a_tile_replaces_only_what_it_speaks_of() -> None:
     assert found.mu[3:] == pytest.approx(0.8, abs=0.03)
 
 
+def test_an_older_tile_takes_nothing_from_a_newer_one() -> None:
+    keys, cache = keys_on(100.0), HeardMap()
+    cache.take(1, cells(keys[:3], 0.2, at=NOW + NS), NOW + NS)
+    cache.take(1, cells(keys, 0.8), NOW + NS)
+    found = cache.look_up(keys, NOW + NS)
+    assert found.mu[:3] == pytest.approx(0.2, abs=0.03)
+    assert found.mu[3:] == pytest.approx(0.8, abs=0.03)
+    cache.take(2, cells(keys[:0], 0.8), NOW)
+    cache.forget(NOW + NS)
+    assert cache.cells == len(keys), "a tile without cells is none"
+
+
 def test_alerts_that_no_longer_stand_are_forgotten_with_the_tile_that_says_so() -> None:
     cache, keys = HeardMap(), keys_on()
     tile = int(grid.tile_of(keys[3] // grid.SECTORS))
@@ -153,6 +166,31 @@ def test_the_map_shows_the_road_around_a_bend_and_both_ways_at_a_fork() -> None:
     assert len(forked) == 2
     assert set(on.tolist()) & set(forked[0].places[:, 0].tolist()), "straight on comes first"
     assert ways_on(pose, up[4:], 250.0) == [], "no road here"
+
+
+def test_a_car_without_a_route_knows_the_road_some_way_ahead_all_the_time() -> None:
+    """It has heard only of what it asked for, and what lies behind that it must ask for before it comes there."""
+    road, cache, asked, known_m = keys_on(1500.0), HeardMap(), Asked(), []
+    latitude, longitude = line(1500.0)
+    length = horizon_length(HOME.speed)
+    for second in range(80):
+        k = int(second * HOME.speed)
+        pose = Pose(float(latitude[k]), float(longitude[k]), HOME.yaw, HOME.speed, NOW + second * NS)
+        ways = ways_on(pose, cache.keys(), length + FURTHER_M) or [corridor(pose, length)]
+        horizon = look_ahead(ways[0].near(length), cache, pose.time)
+        known_m.append(int((horizon.basis == known.MEASURED).sum()))
+        for box in asked.wanting(ways[0], pose, length):
+            heard = cells(road[grid.touches(box, grid.bounds(road // grid.SECTORS))], 0.8, at=pose.time)
+            cache.take(1, heard, pose.time)
+    assert min(known_m[1:]) > 100
+
+
+def test_behind_the_last_place_of_a_road_nothing_is_known() -> None:
+    (way,) = ways_on(HOME, keys_on(60.0), 400.0)
+    horizon = look_ahead(way, told([cells(keys_on(60.0), 0.8)]), NOW)
+    assert len(way.distance) > 180
+    assert horizon.basis[:50].all()
+    assert not horizon.basis[85:].any()
 
 
 def test_the_other_carriageway_is_no_way_on() -> None:
@@ -195,6 +233,10 @@ def test_an_alert_of_who_comes_the_other_way_warns_until_somebody_finds_grip_on_
     tile = int(grid.tile_of(road[2] // grid.SECTORS))
     cache.take(tile, cells(road[2:3], 0.8, at=NOW - NS), NOW)
     assert look_ahead(path, cache, NOW + NS).slippery.sum() == seen.slippery.sum(), "grip that was found before"
+    cache.take(tile, cells(road[2:3], 0.3, basis=known.BOUND, at=NOW + NS), NOW)
+    assert look_ahead(path, cache, NOW + NS).slippery.sum() == seen.slippery.sum(), "who rolled over it found none"
+    cache.take(tile, cells(road[2:3], 0.6, basis=known.BOUND, at=NOW + NS), NOW)
+    assert look_ahead(path, cache, NOW + NS).slippery.sum() < seen.slippery.sum(), "who braked there found enough"
     cache.take(tile, cells(road[2:3], 0.8, at=NOW + NS), NOW)
     assert set((found := look_ahead(path, cache, NOW + NS)).key[found.alerted].tolist()) == {int(road[3])}
     across = corridor(HOME._replace(yaw=HOME.yaw + np.pi / 2), 60.0)

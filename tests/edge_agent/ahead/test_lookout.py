@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from edge_agent.ahead import known
+from edge_agent.ahead import known, lookout
 from edge_agent.ahead.asking import LEAVE_S, MOST_TILES, REFRESH_S, Asked, Tiles
 from edge_agent.ahead.hearing import heard_alert, heard_cells, heard_standing
 from edge_agent.ahead.lookout import Lookout
@@ -19,6 +19,7 @@ from edge_agent.ahead.path import GivenRoute, Path, Pose, corridor
 from edge_agent.lab.ahead.made_up_service import MadeUpService, tile_payload
 from schemas import grid, keys, wire
 from schemas.errors import WireError
+from schemas.numeric import FloatArray, IntArray
 from schemas.runtime.zenoh_session import open_session
 from schemas.thresholds import NS
 from schemas.wire.ahead import AHEAD_ENCODING, GripWarning, Outlook, decode_ahead, encode_ahead
@@ -29,12 +30,14 @@ from tests.waiting import until
 CAR = "car-one"
 ICE = keys_on(110.0, start=70.0)
 NOW = time.time_ns()
+DAY = 86_400 * NS
 
 
 class Driving:
     """A car at the beginning of a road, at 14 m/s by what it says, that looks ahead along it."""
 
     def __init__(self, router: Router) -> None:
+        self.metre = 0.0
         session = open_session(router.settings)
         assert session is not None
         self.session = session
@@ -45,11 +48,11 @@ class Driving:
         self.be()
         self.lookout.start()
 
-    def be(self, metre: int = 0, *, later_s: float = 0.0) -> None:
+    def be(self, *, later_s: float = 0.0) -> None:
         """Say where it is."""
-        latitude, longitude = line()
+        latitude, longitude = line(self.metre + 2.0, start=self.metre)
         now = time.time_ns() + round(later_s * NS)
-        self.lookout.see([Pose(float(latitude[metre]), float(longitude[metre]), HOME.yaw, 14.0, now)])
+        self.lookout.see([Pose(float(latitude[0]), float(longitude[0]), HOME.yaw, 14.0, now)])
 
     def until(self, condition: Callable[[Outlook], object]) -> Outlook:
         """Keep saying where it is until what lies ahead is as wanted."""
@@ -101,6 +104,31 @@ def test_an_alert_ahead_is_a_warning_at_once_and_its_end_too(router: Router, tow
         assert 50.0 < raised.distance_m < 75.0
         town.put(alert(int(ICE[0]), raised=False, time=NOW + NS))
         assert car.next().state == "ended"
+
+
+def test_an_alert_is_told_at_once_and_not_with_the_next_look(
+    router: Router, town: MadeUpService, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lookout, "LOOK_S", 1e6)
+    monkeypatch.setattr(lookout, "STALE_S", 1e6)
+    with driving(router) as car:
+        until(lambda: car.lookout.counts.looks == 2 and any("alert" in asked for asked in town.asked))
+        town.put(alert(int(ICE[0]), time=NOW))
+        assert car.next().state == "raised"
+        assert car.lookout.counts.looks == 3
+
+
+def test_alerts_that_stand_are_asked_for_when_the_car_comes_to_their_tile(router: Router, town: MadeUpService) -> None:
+    town.standing = [alert(int(key), time=NOW) for key in keys_on(2600.0, start=2560.0)]
+    with driving(router) as car:
+        ears = car.lookout.counts.ears[CAR]
+        car.until(lambda _: car.lookout.counts.looks > 1)
+        before = set(ears.tiles)
+        assert not ears.counts["alerts"] + car.lookout.counts.warnings
+        car.metre = 2500.0
+        raised = car.next()
+        assert (raised.state, raised.way) == ("raised", "corridor"), "it has left its route"
+        assert set(ears.tiles) - before
 
 
 def test_ice_that_was_found_before_the_car_came_is_asked_for(router: Router, town: MadeUpService) -> None:
@@ -182,13 +210,31 @@ def test_without_a_link_the_horizon_fades_to_unknown_and_the_car_looks_on(router
         router.start()
 
 
-def test_a_map_of_yesterday_says_how_old_it_is(router: Router) -> None:
-    day = 86_400 * NS
-    with MadeUpService(router.settings, time.time_ns() - day) as town:
+def test_what_was_observed_yesterday_says_how_old_it_is(router: Router) -> None:
+    with MadeUpService(router.settings, time.time_ns() - DAY) as town:
         town.mu = {int(key): 0.85 for key in keys_on()}
         with driving(router) as car:
             seen = car.until(lambda seen: (seen.runs.basis == known.MEASURED).any())
             assert np.nanmin(seen.runs.age_s) == pytest.approx(86_400.0, rel=0.01)
+
+
+def test_a_map_of_yesterday_neither_warns_nor_advises_and_takes_nothing_from_that_of_today(router: Router) -> None:
+    """Of ice that lay there yesterday, and of the road before it that was dry; then of today the other way round."""
+    yesterday = {int(key): 0.85 for key in keys_on()} | {int(key): 0.15 for key in ICE}
+    with driving(router) as car:
+        with MadeUpService(router.settings, time.time_ns() - DAY, yesterday, kept=True):
+            car.until(lambda _: car.lookout.counts.heard("cells") > 10)
+            looks = car.lookout.counts.looks
+            seen = car.until(lambda _: car.lookout.counts.looks > looks + 1)
+            assert not seen.runs.basis.any(), "nobody knows what it is like today"
+            assert np.isnan(seen.runs.safe_speed).all()
+            assert not seen.warnings
+        ears = car.lookout.counts.ears[CAR]
+        now, key = time.time_ns(), keys.map_key(TILE)
+        for when, mu in ((now, 0.15), (now - DAY, 0.85)):
+            with ears.looking():
+                ears.known.take(*heard_cells(key, tile_payload(HERE, mu, when), now), now)
+        assert car.next().mu == pytest.approx(0.15, abs=0.03)
 
 
 def test_where_it_is_the_car_believes_its_filter_and_the_map(router: Router, town: MadeUpService) -> None:
@@ -207,7 +253,7 @@ def test_where_it_is_the_car_believes_its_filter_and_the_map(router: Router, tow
         assert seen.here[2] > 0.7, "a map may be wrong"
 
 
-def test_a_hostile_tile_is_refused_counted_and_changes_nothing(router: Router, town: MadeUpService) -> None:
+def test_a_hostile_alert_is_refused_counted_and_changes_nothing(router: Router, town: MadeUpService) -> None:
     town.mu = {int(key): 0.15 for key in ICE}
     with driving(router) as car:
         assert car.next().state == "raised"
@@ -234,9 +280,13 @@ LIES = {
     "nobody": {"vehicles": ONE * 0},
     "tomorrow": {"last_time": np.full(len(HERE), NOW + 86_400 * NS)},
     "another basis": {"basis": ["surely"] * len(HERE)},
+    "older than the world": {"age_s": ONE * np.inf},
     "a bound with a value": {"basis": ["bound"] * len(HERE)},
     "the same place twice": {"cell": np.repeat(HERE[:1] // grid.SECTORS, len(HERE))},
 }
+
+
+NOISE = (b"", b"\x00" * 100, b"\xff" * 10_000, tile_payload(HERE, 0.2, NOW)[:-40])
 
 
 @pytest.mark.parametrize("lie", LIES)
@@ -247,12 +297,38 @@ def test_a_tile_that_is_not_possible_is_not_believed(lie: str) -> None:
         heard_cells(key, tile_payload(HERE, 0.2, NOW, **LIES[lie]), NOW)
 
 
-@pytest.mark.parametrize("payload", [b"", b"\x00" * 100, b"\xff" * 10_000, tile_payload(HERE, 0.2, NOW)[:-40]])
+@pytest.mark.parametrize("payload", NOISE)
 def test_bytes_that_are_no_tile_are_refused(payload: bytes) -> None:
     with pytest.raises(WireError):
         heard_cells(keys.map_key(TILE), payload, NOW)
     with pytest.raises(WireError):
         heard_cells(keys.alert_key(TILE), tile_payload(HERE, 0.2, NOW), NOW)
+
+
+class Liar(MadeUpService):
+    """Answers for the map with one thing after the other that cannot be, and with a tile of no cells."""
+
+    said = 0
+
+    def tile(self, key: IntArray, mu: FloatArray) -> bytes:
+        self.said += 1
+        lies = [tile_payload(HERE, 0.2, NOW, **lie) for lie in LIES.values()]
+        return [*lies, *NOISE, tile_payload(HERE[:0], 0.2, NOW)][self.said % (len(LIES) + len(NOISE) + 1)]
+
+
+def test_hostile_tiles_are_refused_and_counted_and_the_car_hears_of_ice_all_the_same(router: Router) -> None:
+    every = len(LIES) + len(NOISE) + 1
+    with Liar(router.settings, time.time_ns(), {int(key): 0.85 for key in keys_on()}) as liar, driving(router) as car:
+        later_s = 0.0
+        while liar.said < every:  # a piece is asked for again when it is old
+            said, later_s = liar.said, later_s + REFRESH_S + 1.0
+            car.be(later_s=later_s)
+            until(lambda said=said: liar.said > said)  # type: ignore[misc]
+        until(lambda: car.lookout.counts.values()["heard_refused"] >= every - 1)
+        assert not car.lookout.counts.heard("cells")
+        liar.put(alert(int(ICE[0]), time=time.time_ns()))
+        assert car.next().state == "raised"
+        assert not car.lookout.counts.failures
 
 
 def test_alerts_that_are_not_possible_are_refused() -> None:

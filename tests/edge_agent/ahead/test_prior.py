@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edge_agent.ahead.known import belief_of
+from edge_agent.ahead.known import BOUND, HELD_S, belief_of
 from edge_agent.ahead.prior import MOST, NOWHERE, SHARE, MapPrior
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.inputs.block import Block
@@ -15,6 +15,8 @@ from edge_agent.observe.pipeline import Pipeline
 from schemas import mugrid
 from schemas.config import AgentConfig
 from schemas.numeric import FloatArray
+from schemas.thresholds import NS
+from tests.edge_agent.ahead.roads import NOW, cells, keys_on, told
 
 FLAT = np.zeros((1, mugrid.BINS))
 
@@ -53,6 +55,20 @@ def test_at_the_border_of_a_cell_that_the_map_knows_its_belief_is_expected() -> 
     assert prior.enters(key(5)) == []
     assert out[0, mugrid.CENTRES < 0.4].sum() > 0.7
     assert mugrid.quantiles(out, 0.95)[0] > 0.8, "what no map can take away"
+
+
+def test_of_an_old_cell_the_map_says_less_and_of_a_bound_nothing() -> None:
+    road = keys_on(100.0)
+    place, shares = int(road[0]), []
+    for age_s in (0.0, 1800.0, 4 * 3600.0):
+        said = cells(road, 0.2, at=NOW - round(age_s * NS))
+        belief = told([said._replace(heard=np.full(len(road), NOW))]).belief(place, NOW)
+        assert belief is not None
+        shares.append(float(belief[mugrid.CENTRES < 0.4].sum()))
+    assert shares[0] > shares[1] + 0.05 > shares[2] + 0.2
+    assert told([cells(road, 0.2)]).belief(place, NOW + round((HELD_S + 1.0) * NS)) is None
+    assert told([cells(road, 0.2, basis=BOUND)]).belief(place, NOW) is None
+    assert told([]).belief(place, NOW) is None
 
 
 def test_a_map_that_is_wrong_is_left_as_fast_as_measurements_come_and_the_next_cells_believe_it_less() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edge_agent.ahead.horizon import MARGIN_M, UNKNOWN_LOWER, look_ahead
-from edge_agent.ahead.known import HeardMap
+from edge_agent.ahead.known import BOUND, HeardMap
 from edge_agent.ahead.path import GivenRoute, Pose, corridor
 from edge_agent.ahead.warnings import ABSENT_S, UPDATE_S, Active, warn
 from schemas.numeric import IntArray
@@ -102,6 +102,16 @@ def test_ice_on_the_other_carriageway_is_none_of_ours() -> None:
 def test_one_vehicle_alone_warns_nobody() -> None:
     lonely = cells(icy(), 0.15, width=0.05)
     assert Car(told([lonely._replace(vehicles=np.ones(len(lonely.key), np.int64))])).drive(450.0) == []
+
+
+def test_an_alert_where_the_map_has_only_a_bound_by_now_is_told_with_its_own_grip() -> None:
+    """Ice fades on the map, before its alert ends: what was a value is a bound then."""
+    cache = told([cells(icy(), 0.1, basis=BOUND)])
+    for key in icy():
+        cache.alert(alert(key, time=NOW - NS), NOW)
+    raised = Car(cache).drive(290.0)[0]
+    assert raised.mu == pytest.approx(0.15, abs=0.03)
+    assert raised.reason == "an alert stands"
 
 
 def test_a_stretch_that_grows_is_an_update_and_one_that_is_cleared_an_end() -> None:

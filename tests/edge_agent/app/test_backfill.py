@@ -9,7 +9,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from edge_agent.app.backfill import Task, backfill, tasks_of
+from edge_agent.app.backfill import Outcome, Task, backfill, tasks_of, tried
 from edge_agent.cli import main
 from schemas.errors import InputError
 from tests.waiting import until
@@ -103,3 +103,25 @@ def test_logs_of_one_name_and_estimates_over_their_log_are_refused(drives: Path,
 def test_several_logs_are_not_published(drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", *map(str, logs(drives)), "--out", str(tmp_path), "--publish"]) == 2
     assert "error: publish: 3 logs into a folder" in capsys.readouterr().err
+
+
+def test_an_engine_is_for_several_logs_and_wants_no_jobs(
+    drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paths, out = [str(path) for path in logs(drives)], ["--out", str(tmp_path / "out")]
+    assert main(["replay", *paths, *out, "--engine", "abacus"]) == 2
+    assert "error: engine: 'abacus' is none" in capsys.readouterr().err
+    assert main(["replay", *paths, *out, "--engine", "spark", "--jobs", "2"]) == 2
+    assert "error: jobs: 2 says nothing to Spark" in capsys.readouterr().err
+    assert main(["replay", paths[0], *out, "--engine", "spark"]) == 2
+    assert "error: engine: one log into one file" in capsys.readouterr().err
+
+
+def test_two_tries_at_one_drive_write_it_once_and_leave_no_draft(drives: Path, tmp_path: Path) -> None:
+    (task, *_) = tasks_of(logs(drives), None, tmp_path)
+    first = tried(task, "ckf", None)
+    content = task.out.read_bytes()
+    assert tried(task, "ckf", None) == first == Outcome(task, 100, None)
+    assert [path.name for path in tmp_path.iterdir()] == [task.out.name]
+    assert task.out.read_bytes() == content
+    assert tried(task._replace(vehicle=tmp_path / "none.json"), "ckf", None).error is not None

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 from collections.abc import Iterator
+from contextlib import closing
+from itertools import count
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from edge_agent.app.live_loop import Progress, drive
+from edge_agent.app.live_loop import STATUS_EVERY_S, Progress, drive
 from edge_agent.estimators import create
 from edge_agent.inputs.block import Block
 from edge_agent.lab.simulation import SimulatedFleet
@@ -133,6 +137,25 @@ def test_the_loop_ends_after_its_duration() -> None:
     fleet = SimulatedFleet("demo", VEHICLES, 1, RATE)
     progress, _, _ = run(blocks(fleet, RATE), fleet, threading.Event(), duration_s=0.3)
     assert 2 <= progress.blocks <= 6
+
+
+@pytest.mark.parametrize("broken", [False, True])
+def test_systemd_gets_signs_of_life_unless_the_thread_that_sends_has_died(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: bool
+) -> None:
+    monkeypatch.setattr(Basket, "broken", broken)
+    with closing(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.setblocking(False)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        fleet, parts = fleet_blocks(3)
+        _, _, reported = run(iter(parts), fleet, threading.Event(), clock=count(0.0, STATUS_EVERY_S).__next__)
+        assert reported
+        if broken:
+            with pytest.raises(BlockingIOError):
+                manager.recv(64)
+        else:
+            assert manager.recv(64) == b"READY=1\nWATCHDOG=1"
 
 
 def test_the_truth_is_that_of_the_cells_the_vehicles_were_in(tmp_path_factory: pytest.TempPathFactory) -> None:

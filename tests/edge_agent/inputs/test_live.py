@@ -193,7 +193,7 @@ def test_a_live_car_is_driven_by_its_bus_and_its_receiver(service: Service, tmp_
     (tmp_path / "agent.json").write_text(json.dumps(config))
     words = ["run", "--source", can, "--source", gpsd, "--profile", name, "--dbc", str(dbc), "--trust"]
     words += ["--vehicle", str(tmp_path / "car.json"), "--config", str(tmp_path / "agent.json"), "--estimator", "ckf"]
-    command = [sys.executable, "-c", "import sys; from edge_agent.cli import main; sys.exit(main(sys.argv[1:]))"]
+    command = [sys.executable, "-m", "edge_agent.cli"]
     agent = subprocess.Popen([*command, *words, "--name", "car-one"], stdout=subprocess.PIPE, text=True)
     with peer("can", bus, 100_000) as one, peer("gpsd", receiver, 100_000, 5.0) as other:
         for running in (one, other):

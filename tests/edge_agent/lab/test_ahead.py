@@ -53,12 +53,12 @@ def test_warnings_are_timed_over_a_real_router() -> None:
 
 def test_a_map_that_is_right_helps_at_entry_and_nothing_of_it_is_published() -> None:
     fleet = SimulatedFleet("hills-100", 2, 100, 100.0, rough=0.5)
-    said = entry.record(fleet, 20.0)
+    trace = entry.record(fleet, 20.0)
     known = heard(places_of(fleet.scenario, 20.0), entry.START_NS)
-    with_, without = entry.entry_errors(said, known, entry.START_NS).mean(axis=0)
+    with_, without = entry.entry_errors(trace, known, entry.START_NS).mean(axis=0)
     assert with_ < without
-    assert entry.published_change(fleet, said, 6.0) == 0.0
-    other = entry.Heading(said.place, said.own, said.visit, said.truth, [bytes(32)] * len(said.published))
+    assert entry.published_change(fleet, trace, 6.0) == 0.0
+    other = entry.FilterTrace(trace.place, trace.own, trace.visit, trace.truth, [bytes(32)] * len(trace.published))
     assert entry.published_change(fleet, other, 6.0) > 1.0 / STEPS_PER_NAT, "a change would be seen"
 
 

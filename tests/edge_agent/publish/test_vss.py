@@ -16,7 +16,7 @@ from edge_agent.publish.vss import BRANCH, RoadFrictionOutput, road_friction
 from schemas import keys
 from schemas.runtime.zenoh_session import configuration
 from schemas.thresholds import NS
-from tests.edge_agent.service import Router
+from tests.edge_agent.service import Router, Service
 from tests.waiting import matched, until
 
 START = 1_800_000_000 * NS
@@ -83,7 +83,8 @@ def test_the_command_prints_lines_of_the_drive(
 ) -> None:
     config = tmp_path / "agent.json"
     config.write_text(json.dumps({"zenoh": router.settings.model_dump(), "spool": str(tmp_path / "spool.sqlite")}))
-    assert main([*WORDS, "--config", str(config)]) == 0
+    with Service(router):
+        assert main([*WORDS, "--config", str(config)]) == 0
     *lines, _ = capsys.readouterr().out.splitlines()
     told = [json.loads(line) for line in lines]
     assert len(told) > 1

@@ -9,6 +9,10 @@ import pyarrow as pa
 
 from fleet_service.analytics.output import ordered
 from fleet_service.analytics.questions import Question
+from fleet_service.analytics.roads.join import joined
+from fleet_service.analytics.roads.network import DirectedLink, RoadNetwork
+from schemas import grid
+from schemas.numeric import IntArray
 
 # Sums are added in another order. Everything else (percentiles, counts, times) is exact in both.
 RELATIVE, ABSOLUTE = 1e-9, 1e-9
@@ -23,7 +27,9 @@ def differs(one: pa.Table, other: pa.Table, question: Question) -> str | None:
     by: list[tuple[str, Literal["ascending", "descending"]]] = [
         (name, "ascending") for name in keys if name in one.schema.names
     ]
-    one, other = (ordered(table, question).sort_by(by) for table in (one, other))
+    one, other = (ordered(table, question) for table in (one, other))
+    if by:
+        one, other = one.sort_by(by), other.sort_by(by)
     for name in one.schema.names:
         a, b = one[name].to_pylist(), other[name].to_pylist()
         if pa.types.is_floating(one[name].type):
@@ -33,3 +39,20 @@ def differs(one: pa.Table, other: pa.Table, question: Question) -> str | None:
         elif a != b:
             return f"{name}: {next((x, y) for x, y in zip(a, b, strict=True) if x != y)}"
     return None
+
+
+def roads_along(cells: IntArray) -> pa.Table:
+    """Links of forty cells along every row of cells, and one where nobody was, as `fleet-service roads` writes them."""
+    x, y = grid.deinterleave(cells)
+    found = []
+    for line in np.unique(y):
+        on = np.sort(np.unique(x[y == line]))
+        for k in range(0, len(on) - 1, 40):
+            ends = grid.interleave(on[[k, min(k + 40, len(on) - 1)]], np.full(2, line))
+            latitude, longitude = grid.centre(ends)
+            found.append(DirectedLink(f"{line}-{k}", "forward", f"road {line}", "primary", latitude, longitude))
+            found.append(
+                DirectedLink(f"{line}-{k}", "backward", f"road {line}", "primary", latitude[::-1], longitude[::-1])
+            )
+    found.append(DirectedLink("nobody", "forward", "", "", np.array([10.0, 10.0]), np.array([10.0, 10.01])))
+    return joined(RoadNetwork(found, {}))

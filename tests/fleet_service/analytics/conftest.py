@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.csv as pacsv
+import pyarrow.parquet as pq
 import pytest
 
 from fleet_service.analytics import synthetic
@@ -25,6 +26,7 @@ from fleet_service.replay.rebuild import Since, replay
 from fleet_service.serve.encode import cell_table
 from schemas.numeric import IntArray
 from schemas.wire import Kind
+from tests.fleet_service.analytics.agreement import roads_along
 
 WORLD = SyntheticFleet(rows=24_000, days=2, vehicles=40, roads=8, length=60, icy=4)
 PART = Extract(START_NS, START_NS + WORLD.days * DAY_S * 10**9)
@@ -75,6 +77,14 @@ def stations(archive: Path) -> Path:
     }  # fmt: skip
     path = archive.parent / "stations.csv"
     pacsv.write_csv(pa.table(columns), path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def links(rows: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The roads of the synthetic archive as links of forty cells, and one where nobody was."""
+    path = tmp_path_factory.mktemp("roads") / "roads.parquet"
+    pq.write_table(roads_along(rows["cell"].to_numpy()), path)
     return path
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 from pathlib import Path
 
@@ -15,7 +16,9 @@ import pytest
 from fleet_service.analytics.questions import QUESTIONS
 from fleet_service.archive import export, geo
 from fleet_service.cli import main
+from schemas import tables
 from tests.fleet_service.examples import CELL
+from tests.house import ROOT
 
 DAYS = ("--from", "2026-01-27", "--to", "2026-01-29")
 
@@ -37,6 +40,18 @@ def test_every_question_prints_a_table_and_says_what_it_reads(
     answer = pq.read_table(out)
     assert lines[0].split() == [f.name for f in answer.schema if not pa.types.is_nested(f.type)]
     assert lines[-1].startswith(f"{answer.num_rows} rows")
+    assert set(answer.column_names) == {"frame"} | MAP if name == "replay" else explained(name)
+
+
+MAP = {field.name for field in tables.MAP_CELL}  # that answers.md explains: tests/deploy/test_docs.py
+
+
+def explained(question: str) -> set[str]:
+    """Columns of an answer that the handbook's page has a meaning for."""
+    page = (ROOT / "deploy" / "docs" / "questions.md").read_text(encoding="utf-8")
+    rows = [line.split("|") for line in page.splitlines() if line.startswith(f"| `{question}` |")]
+    assert all(row[4].strip() for row in rows)
+    return {name for row in rows for name in re.findall(r"`(\w+)`", row[2])}
 
 
 def test_an_answer_with_a_place_becomes_geoparquet_geojson_and_a_map(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -15,6 +13,7 @@ from fleet_service.analytics.rebuilding import Rebuild, Rebuilt, rebuild, rebuil
 from fleet_service.analytics.synthetic import SyntheticFleet
 from schemas.errors import InputError
 from schemas.runtime import spark
+from tests import spark_sessions
 from tests.fleet_service.analytics.border import UNTIL, contents, fill
 
 pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("ignore")]
@@ -25,12 +24,8 @@ WORLD = SyntheticFleet(rows=4_000, days=1, vehicles=30, roads=6, length=60, icy=
 
 @pytest.fixture(scope="module")
 def session() -> Iterator[Any]:
-    """Spark on two cores that tries a task three times, as clusters do and a plain local one does not."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYSPARK_SUBMIT_ARGS", "--master local[2,3] pyspark-shell")
-        found = spark.session()
+    with spark_sessions.cores(2) as found:
         yield found
-        found.stop()
 
 
 @pytest.fixture(scope="module")
@@ -57,21 +52,12 @@ def test_a_task_whose_process_is_killed_after_it_wrote_counts_once(
 ) -> None:
     out, tries = tmp_path / "out", tmp_path / "tries"
     out.mkdir()
-    tries.mkdir()
-    wanted = Rebuild(archive, out, UNTIL)
-
-    def killed_at_first(zone: int) -> Rebuilt:
-        done = rebuilt(wanted, zone)
-        if not (tries / str(zone)).exists():
-            (tries / str(zone)).touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        return done
-
+    dying = spark_sessions.killed_at_first(partial(rebuilt, Rebuild(archive, out, UNTIL)), str, tries)
     zones = zones_of(archive)
-    told = spark.spread(session, zones, killed_at_first)
+    told = spark.spread(session, zones, dying)
     assert {path.name for path in tries.iterdir()} == {str(zone) for zone in zones}, "none was killed"
     (tmp_path / "local").mkdir()
-    assert told == list(rebuild(wanted._replace(out=tmp_path / "local")))
+    assert told == list(rebuild(Rebuild(archive, tmp_path / "local", UNTIL)))
     assert contents(out) == contents(tmp_path / "local")
 
 

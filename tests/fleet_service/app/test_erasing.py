@@ -131,7 +131,10 @@ def answered(engine: Engine, root: Path) -> None:
 
 
 def test_a_month_is_forgotten_beside_a_service(tmp_path: Path) -> None:
-    with closing(filled(tmp_path, *OTHERS)) as engine:
+    with closing(filled(tmp_path, *OTHERS[1:])) as engine:
+        sent = sent_by("sim-001", 1)
+        engine.ingest([Message(Kind.OBSERVATION, key("sim-001"), wire.encode(sent), "")], time.time_ns())
+        engine.flush()
         before = Pseudonyms(tmp_path / "keys").of("sim-001", time.time_ns())
         question = requests.ask(tmp_path, Erasure(MONTH))
         answered(engine, tmp_path)
@@ -139,6 +142,9 @@ def test_a_month_is_forgotten_beside_a_service(tmp_path: Path) -> None:
         assert engine.fusion.size
         assert not any(stream.vehicle for stream in engine._streams)
         assert Pseudonyms(tmp_path / "keys").of("sim-001", time.time_ns()) != before
+        again = wire.encode(sent)
+        engine.ingest([Message(Kind.OBSERVATION, key("sim-001"), again, "")], time.time_ns())
+        assert engine.counts["refused.erased"] == 1, "nobody could tell that it was there before"
 
 
 def test_a_question_that_cannot_be_done_is_answered_and_taken_away(tmp_path: Path) -> None:

@@ -76,6 +76,18 @@ def test_a_job_that_fails_in_a_way_nobody_foresaw_ends_no_other_and_is_a_trouble
     with Upkeep(jobs, counts, lambda _: None) as upkeep:
         until(lambda: len(turns) > 5 and counts["broken_failures"] > 5)
         assert upkeep.troubles()[0].startswith("broken failed ")
+        assert not upkeep.ended
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_upkeep_that_has_died_is_known_and_told() -> None:
+    def work(stop: threading.Event) -> str | None:
+        raise KeyboardInterrupt
+
+    with Upkeep([Job("fatal", 0.001, work)], Counter(), lambda _: None) as upkeep:
+        until(lambda: upkeep.ended)
+        assert upkeep.troubles()[-1] == "upkeep has ended; start the service again"
+    assert not upkeep.ended, "it was stopped"
 
 
 def test_a_copy_of_a_days_folder_is_none_of_the_archive(tmp_path: Path) -> None:

@@ -82,10 +82,11 @@ def test_each_trouble_is_told(tmp_path: Path) -> None:
     well = Pulse(turn_age_s=0.1, queued=3, routers=1, clock_lag_s=0.0)
     assert metrics.troubles(engine, well, config) == []
     engine.failing = True
-    ill = Pulse(turn_age_s=60.0, queued=99, routers=0, clock_lag_s=0.0)
+    ill = Pulse(turn_age_s=60.0, queued=99, routers=0, clock_lag_s=0.0, answer_s=60.0)
     assert metrics.troubles(engine, ill, config) == [
         "no router is connected",
         "the worker has done nothing for 60 s",
+        "a tile of an answer is being made for 60 s",
         "segments cannot be written",
         "the queue is full",
     ]

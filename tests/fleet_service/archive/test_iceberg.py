@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sqlite3
+from contextlib import closing
 from datetime import timedelta
 from pathlib import Path
 
@@ -118,6 +120,16 @@ def test_readers_elsewhere_are_told_of_the_mirror(tmp_path: Path, capsys: pytest
     assert all(path.startswith(there.as_uri()) for path in paths)
     with pytest.raises(InputError, match="^catalog: this archive is registered at "):
         iceberg.register(root, iceberg.Place(uri(root), "other", root.as_uri()))
+
+
+def test_the_namespace_is_the_one_that_is_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = tmp_path / "archive"
+    fill(root, 1, 50)
+    compact(root)
+    exported(root, capsys, "--namespace", "north")
+    with closing(sqlite3.connect(tmp_path / "tables.db")) as catalogue:
+        found = {name for (name,) in catalogue.execute("select table_namespace from iceberg_tables")}
+    assert found == {"north"}
 
 
 def test_two_archives_share_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,9 +23,11 @@ from fleet_service.ingest.inbox import Message
 from schemas import grid, wire
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
-from schemas.wire import Kind
+from schemas.thresholds import NS as SECOND
+from schemas.wire import Batch, Kind
 from tests.fleet_service.archive.rows import START, fill, identities, rows_of
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, batch, key
+from tests.fleet_service.replay.test_checkpoints import keep
 
 DATE = layout.date_of(20_000)
 MONTH = f"{DATE:%Y-%m}"
@@ -105,6 +107,53 @@ def test_a_destroyed_key_makes_the_way_back_to_a_name_unknown(tmp_path: Path) ->
     before = Pseudonyms(tmp_path / "keys").of("sim-003", START)
     assert main(["forget", "--archive", str(tmp_path), "--period", MONTH]) == 0
     assert Pseudonyms(tmp_path / "keys").of("sim-003", START) != before
+
+
+NOON = int(datetime(2026, 1, 31, 12, tzinfo=UTC).timestamp()) * SECOND
+DAY = 86_400 * SECOND
+ERASED = "time: its month was erased; delete it"
+
+
+def told(engine: Engine, sent: Batch, now: int) -> list[str]:
+    """What the sender of a batch is told, once a segment is written."""
+    engine.ingest([Message(sent.kind, key(sent.vehicle), wire.encode(sent), "")], now)
+    streams = [stream for _, data in engine.flush() for stream in wire.decode_ack(data)[1]]
+    assert all(stream.durable in ((), ((sent.seq, sent.seq),)) for stream in streams)
+    return [*("durable" for one in streams if one.durable), *(why for one in streams for *_, why in one.rejected)]
+
+
+def rows_kept(root: Path) -> int:
+    return sum(table.num_rows for table in reading.read(root, Kind.OBSERVATION, ["vehicle"]))
+
+
+def test_what_was_measured_in_a_forgotten_month_does_not_come_in_again_over_restarts(tmp_path: Path) -> None:
+    """Nobody can tell any more that a batch was there before; a spool may hold it, for its acknowledgement was lost."""
+    old, away, after = batch("car-001", 1, NOON, [0.8]), batch("car-002", 1, NOON - DAY, [0.8]), NOON + 3 * DAY
+    later = batch("car-001", 2, after, [0.8])
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        assert told(engine, old, after + SECOND) == ["durable"]
+        assert told(engine, later, after + SECOND) == ["durable"]
+    assert main(["forget", "--archive", str(tmp_path), "--period", "2026-01", "--yes"]) == 0
+    for _ in range(2):  # replayed from the log, then from a checkpoint
+        with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+            assert told(engine, old, after + SECOND) == [ERASED], "settled, or its car would send it for ever"
+            assert told(engine, away, after + SECOND) == [ERASED], "of that month, and never there"
+            assert told(engine, later, after + SECOND) == ["durable"]
+            assert (engine.counts["refused.erased"], engine.counts["duplicates"]) == (2, 1)
+            assert rows_kept(tmp_path) == 2
+            assert engine.fusion.live.visits[: engine.fusion.size].sum() == 2
+            keep(engine, tmp_path)
+    assert not list((tmp_path / "keys").glob("2026-01.key"))
+
+
+def test_of_a_month_that_goes_on_all_is_forgotten_until_the_newest_there_is(tmp_path: Path) -> None:
+    seen, new = batch("car-001", 1, NOON - DAY, [0.8]), batch("car-001", 2, NOON, [0.8])
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        assert told(engine, seen, NOON) == ["durable"]
+    assert main(["forget", "--archive", str(tmp_path), "--period", "2026-01", "--yes"]) == 0
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        assert [told(engine, one, NOON) for one in (seen, new)] == [[ERASED], ["durable"]]
+    assert rows_kept(tmp_path) == 2
 
 
 @pytest.mark.parametrize(("period", "problem"), [("2026-13", "is no month"), ("1999-01", "has no key of 1999-01")])

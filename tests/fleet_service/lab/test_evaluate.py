@@ -39,7 +39,8 @@ def test_a_quick_campaign_writes_every_figure_with_its_bar_the_table_and_the_plo
     missing = {name for name in bars.BARS if found[name]["value"] is None}
     assert missing >= {"fusion.whole_way.coverage90", "fusion.whole_way.rmse", "fusion.whole_way.level.rmse"}
     assert all(
-        name.startswith(("fusion.whole_way", "fusion.false", "fusion.missed", "fusion.clean")) for name in missing
+        name.startswith(("fusion.whole_way", "fusion.resampled", "fusion.false", "fusion.missed", "fusion.clean"))
+        for name in missing
     )
     assert not any(found[name]["holds"] for name in missing)
     assert found["fusion.replay.max_difference"]["holds"]
@@ -52,7 +53,7 @@ def test_a_quick_campaign_writes_every_figure_with_its_bar_the_table_and_the_plo
 def test_end_to_end_alone_lists_its_figures_and_no_others(tmp_path: Path) -> None:
     found = campaign.run(tmp_path, True, {}, lambda _line: None, alone=True)
     names = {figure.name for figure in found}
-    assert names == {name for name in bars.BARS if name.startswith("fusion.whole_way")}
+    assert names == {name for name in bars.BARS if name.startswith(campaign.END_TO_END)}
     assert "fusion.whole_way.hills.coverage90" in names
     assert not any(figure.holds for figure in found)
     assert [world.rough for world in campaign.drives_end_to_end(quick=True)] == [0.0, 0.5, *[0.5] * 5]

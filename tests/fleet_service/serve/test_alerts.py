@@ -8,10 +8,12 @@ import pytest
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.belief import SLIPPERY_SHARE
 from fleet_service.fusion.store.records import ICE
-from fleet_service.serve.alerts import RAISE_ABOVE, Alerts
+from fleet_service.serve.alerts import LIKELY, RAISE_ABOVE, Alerts
+from schemas import grid
 from tests.fleet_service.examples import CELL, SECOND, START, at_least, belief, observations, slippery, value
 
 HOUR = 3600 * SECOND
+COLUMN, ROW = (int(part[0]) for part in grid.deinterleave(np.array([CELL])))
 
 
 def icy(vehicles: list[int]) -> tuple[Fusion, Alerts, list[bool]]:
@@ -92,6 +94,24 @@ def test_what_many_called_dry_takes_four_sources_however_sure_the_belief_is() ->
     fusion, under = called(0.85, range(20), 0.2, range(5, 11))
     assert slippery(belief(fusion)) > 0.9
     assert under == [False, False, False, True, True, True]
+
+
+@pytest.mark.parametrize(("drivers", "found", "raised"), [(4, 0, False), (4, 1, False), (4, 2, True), (6, 2, False)])
+def test_neighbours_confirm_two_who_found_ice_where_their_reports_outweigh_what_was(
+    drivers: int, found: int, raised: bool
+) -> None:
+    fusion, (before, here, behind) = Fusion(120.0), grid.interleave(COLUMN + np.arange(-1, 2), np.full(3, ROW)).tolist()
+    for cell in (before, here, behind):  # of a road where more grip was used than ice has
+        seconds = 20.0 * np.arange(drivers)
+        fusion.update(observations(seconds, np.arange(drivers), at_least(np.full(drivers, 0.5)), cell))
+    for cell, vehicles in ((before, 4), (behind, 4), (here, found)):
+        seconds = 150.0 + 20.0 * np.arange(vehicles)
+        fusion.update(observations(seconds, 50 + np.arange(vehicles), value([0.2] * vehicles), cell))
+    slots = fusion.slots_of(np.array([here]), np.array([0]))
+    own, believed = float(fusion.slippery(slots)[0]), float(fusion.believed(slots)[0] @ SLIPPERY_SHARE)
+    assert own < 0.5
+    assert believed > RAISE_ABOVE or not found
+    assert bool(Alerts(fusion).updated(slots)) is raised is (own > LIKELY and found == 2)
 
 
 def test_bounds_clear_an_alert_when_only_a_dry_road_gives_so_much_grip() -> None:

@@ -100,13 +100,16 @@ def test_who_asks_for_little_does_not_wait_for_who_asks_for_much(session: zenoh.
             assert light_came.wait(30.0)
         yield TILE, b"a tile"
 
-    queryable = session.declare_queryable(key, MapQueryable(Answering(size, answer), counts), complete=True)
+    replies = MapQueryable(Answering(size, answer), counts)
+    queryable = session.declare_queryable(key, replies, complete=True)
     querier = session.declare_querier(key)
     matched(querier)
     heavy = session.get(f"{key}?min_vehicles=2", timeout=60.0)
     assert texts(session, key) == ["a tile"]
+    until(lambda: replies.hangs_s > 0.0)  # as long as it takes: who looks after the service sees it
     light_came.set()
     assert [reply.ok.payload.to_string() for reply in heavy if reply.ok] == ["a tile"]
+    until(lambda: replies.hangs_s == 0.0)
     querier.undeclare()
     queryable.undeclare()
 

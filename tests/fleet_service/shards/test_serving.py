@@ -6,7 +6,8 @@ import json
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,10 @@ import numpy as np
 import pytest
 import zenoh
 
+from fleet_service.app.service import Service
 from fleet_service.cli import main
 from fleet_service.client import map_client, watching
-from fleet_service.shards.serving import rivals, serving
+from fleet_service.shards.serving import claimed, rivals, serving
 from schemas import grid, keys, query, regions, wire
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
@@ -37,6 +39,12 @@ LATITUDE = (SOUTH + NORTH) / 2
 ROUTE = "|".join(f"{longitude:.6f},{LATITUDE:.6f}" for longitude in (EAST + 0.03, EAST - 0.03, WEST - 0.03))
 LONGITUDES = (WEST - 0.02, WEST - 0.01, WEST + 0.01, WEST + 0.02, EAST - 0.02, EAST - 0.01, EAST + 0.01, EAST + 0.02)
 CARS = 3
+
+
+@pytest.fixture(autouse=True)
+def nobody(session: zenoh.Session) -> None:
+    """Begin with no token: the router may hear of the end of the test before after that test."""
+    until(lambda: not tokens.standing(session))
 
 
 def visits(vehicle: str) -> list[Batch]:
@@ -127,17 +135,126 @@ def test_answers_over_three_services_are_whole_in_order_and_say_what_is_missing(
 
 def test_a_second_service_of_a_region_refuses_to_start(router: ZenohSettings, tmp_path: Path) -> None:
     wide = NAMES[1].rpartition("/")[0] + "/*"
-    with running(router, tmp_path / "one", name="first", regions=[wide]):
-        for name in ("first", "second"):  # also one of the same name, on another machine
-            with (
-                pytest.raises(InputError, match=f"{NAMES[1].rpartition('/')[0]}.* is served by first already"),
-                zenoh_session(router) as other,
-                serving(other, name, NAMES[1:2], threading.Event()),
-            ):
-                pass
-    with zenoh_session(router) as other, serving(other, "second", NAMES[1:2], threading.Event()) as mine:
-        assert tokens.standing(other) == set(mine)
+
+    def refused(name: str) -> None:
+        with (
+            pytest.raises(InputError, match=f"{NAMES[1].rpartition('/')[0]}.* is served by first already"),
+            zenoh_session(router) as other,
+            claimed(other, name, NAMES[1:2], threading.Event()),
+        ):
+            pass
+
+    with running(router, tmp_path / "one", name="first", regions=[wide]), ThreadPoolExecutor() as both:
+        list(both.map(refused, ("first", "second")))  # also one of the same name, on another machine
+    with zenoh_session(router) as other, claimed(other, "second", NAMES[1:2], threading.Event()) as mine:
+        assert tokens.standing(other) == set()
+        with (
+            pytest.raises(InputError, match="served by second already"),
+            zenoh_session(router) as third,
+            claimed(third, "third", NAMES[1:2], threading.Event()),
+        ):
+            pass
+        with serving(other, mine):
+            assert tokens.standing(other) == set(mine)
         assert rivals(mine, tokens.standing(other)) == []
+
+
+def test_a_region_is_said_to_be_served_only_while_all_that_is_asked_is_answered(
+    router: ZenohSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+    answering = Service._declared
+
+    @contextmanager
+    def looked(service: Service, session: zenoh.Session) -> Iterator[None]:
+        with answering(service, session):
+            seen.append(tokens.standing(session))
+            yield
+            until(lambda: not tokens.standing(session))
+            seen.append(set())
+
+    monkeypatch.setattr(Service, "_declared", looked)
+    with running(router, tmp_path / "one", name="first", regions=NAMES[:1]), zenoh_session(router) as other:
+        assert {token.service for token in tokens.standing(other)} == {"first"}
+    assert seen == [set(), set()]
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_who_comes_while_it_is_asked_may_not_have_been_asked(
+    router: ZenohSettings, monkeypatch: pytest.MonkeyPatch, late: bool
+) -> None:
+    inside = f"{WEST + 0.001},{SOUTH + 0.001},{EAST - 0.001},{NORTH - 0.001}"
+    with zenoh_session(router) as other, zenoh_session(router) as third:
+        mine = frozenset({keys.Served(NAMES[1], "late", "1f")})
+        coming = serving(other, mine)
+
+        def come(*_: object) -> bool:
+            coming.__enter__()
+            until(lambda: tokens.standing(third) == mine)
+            return True
+
+        with monkeypatch.context() as meanwhile:
+            meanwhile.setattr(map_client, "replies", lambda *_: iter([] if late else [come()][1:]))
+            meanwhile.setattr(map_client, "is_served", come)
+            answer = ask(router, bbox=inside)
+        assert (answer.gap is None, answer.served) == (False, False)
+        coming.__exit__(None, None, None)
+
+
+def test_who_is_found_after_it_was_asked_is_asked_again(
+    router: ZenohSettings, session: zenoh.Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its queryables are there, and the token that tells its regions is on the way."""
+    monkeypatch.setattr("fleet_service.app.service.serving_regions", lambda *_: nullcontext())
+    with running(router, tmp_path / "one", name="first", regions=NAMES[1:2]) as service:
+        drive_one(session, service)
+        asked, first = map_client.replies, [True]
+
+        def replies(*given: Any) -> Iterator[tuple[str, bytes]]:  # noqa: ANN401
+            found = [] if first.pop() else list(asked(*given))
+            first.append(False)
+            return iter(found)
+
+        monkeypatch.setattr(map_client, "replies", replies)
+        answer = ask(router, bbox=f"{WEST + 0.001},{SOUTH + 0.001},{EAST - 0.001},{NORTH - 0.001}")
+        assert answer.table is not None
+        assert answer.table.num_rows > 0
+
+
+def drive_one(session: zenoh.Session, service: Running) -> None:
+    """A car's batches of the middle region."""
+    own = [made for made in visits("sim-000") if made.region == REGIONS[1]]
+    for made in own:
+        session.put(keys.observation_key(made.region, made.vehicle), wire.encode(made),
+                    encoding=wire.ENCODING[made.kind])  # fmt: skip
+    until(lambda: service.service.engine.counts[Kind.OBSERVATION] == len(own))
+
+
+@pytest.mark.parametrize("comes_back", [False, True])
+def test_who_goes_while_it_is_asked_may_have_been_asked_in_place_of_who_followed_it(
+    router: ZenohSettings, monkeypatch: pytest.MonkeyPatch, comes_back: bool
+) -> None:
+    inside = f"{WEST + 0.001},{SOUTH + 0.001},{EAST - 0.001},{NORTH - 0.001}"
+    frozen, follows = (frozenset({keys.Served(NAMES[1], name, "1f")}) for name in ("frozen", "follows"))
+    with zenoh_session(router) as other, zenoh_session(router) as third, serving(other, follows):
+        held, again = serving(other, frozen), serving(other, frozen)
+        held.__enter__()
+        until(lambda: len(tokens.standing(third)) == 2)
+
+        def replies(*_: object) -> Iterator[tuple[str, bytes]]:
+            held.__exit__(None, None, None)
+            until(lambda: len(tokens.standing(third)) == 1)
+            if comes_back:  # a frozen one wakes
+                again.__enter__()
+                until(lambda: len(tokens.standing(third)) == 2)
+            return iter(())
+
+        with monkeypatch.context() as meanwhile:
+            meanwhile.setattr(map_client, "replies", replies)
+            assert ask(router, bbox=inside).gap is not None
+        assert ask(router, bbox=inside).gap is None
+        if comes_back:
+            again.__exit__(None, None, None)
 
 
 @contextmanager

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import zenoh
 
-from fleet_service.archive import segments
+from fleet_service.archive import compaction, segments
 from fleet_service.archive.bucket import CopyError, ObjectBucket
 from fleet_service.archive.compaction import compact
 from fleet_service.archive.copies import Copy
@@ -28,6 +30,7 @@ from tests.fleet_service.app.test_kill import archived, identities
 from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.archive.rows import identities as rows_in
 from tests.fleet_service.archive.rows import rows_of
+from tests.schemas.runtime.test_metrics import fetch
 from tests.standbys import Host, hosts, restored
 from tests.waiting import until
 
@@ -40,6 +43,7 @@ def bucket(tmp_path: Path) -> Iterator[BucketServer]:
 
 
 RESEND_S = 1.0
+LEASE_S = 4.0  # of who is no process: a request may take a quarter of it
 
 
 def frozen(host: Host) -> None:
@@ -76,11 +80,11 @@ def test_a_standby_goes_on_with_all_that_was_acknowledged(
         until(driven(fleet, during), PATIENCE_S)
         if how == "frozen":
             one.part.send(signal.SIGCONT)
-        one.to_bucket.mend()
         one.to_router.mend()
-        if how not in {"killed", "stopped"}:
+        if how not in {"killed", "stopped"}:  # cut from the bucket, it hears of its successor by the token
             assert one.part.wait(PATIENCE_S) == 1
             assert one.said("followed: ")
+        one.to_bucket.mend()
         one.part.start()  # and is the standby from now on, whose folder becomes what the bucket is
         one.part.line_with("standby: ")
         two.part.stop()
@@ -139,14 +143,19 @@ def test_of_two_standbys_one_takes_over_and_the_other_waits_for_it(
 class Machine:
     """A folder whose service is no process, so that it can be stopped between any two steps."""
 
-    def __init__(self, root: Path, bucket: BucketServer, name: str = "shard-0") -> None:
+    def __init__(
+        self, root: Path, bucket: BucketServer, say: Callable[[str], None] = print, *, standby: bool = True
+    ) -> None:
         root.mkdir(exist_ok=True)
         self.root = root
-        self.config = ServiceConfig.model_validate({"name": name, "lease_s": 1.0, "archive": bucket.settings})
-        held = hold(self.config, root, threading.Event(), print)
+        told = {"standby": standby, "lease_s": LEASE_S, "archive": bucket.settings}
+        self.config = ServiceConfig.model_validate(told)
+        there = (lambda: True, lambda _: False, lambda: None)  # it reaches a router, and no token stands
+        signs = there if standby else None
+        held = hold(self.config, root, threading.Event(), say, signs)
         assert held is not None
         self.holding: Holding = held
-        self.log: SegmentLog[int] = SegmentLog(root, name, held.copy, held.epoch)
+        self.log: SegmentLog[int] = SegmentLog(root, self.config.name, held.copy, held.epoch)
 
     @property
     def copy(self) -> Copy:
@@ -222,10 +231,93 @@ def test_a_folder_that_was_served_without_its_bucket_is_not_made_what_the_bucket
     assert len(rows_in(one.root, Kind.OBSERVATION)) == 5
 
 
+def test_a_compaction_that_outlived_its_service_is_waited_for(
+    bucket: BucketServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = Machine(tmp_path / "one", bucket)
+    one.write(0)
+    with monkeypatch.context() as killed:  # between the disk and the bucket
+        killed.setattr(one.copy, "settle", lambda _: None)
+        one.write(1)
+    has_read, goes_on, place = threading.Event(), threading.Event(), compaction._place
+
+    def placed(*args: Any) -> int:  # noqa: ANN401
+        has_read.set()
+        goes_on.wait()
+        return place(*args)
+
+    monkeypatch.setattr(compaction, "_place", placed)
+    still = threading.Thread(target=compact, args=(one.root,))
+    still.start()
+    has_read.wait()
+    one.freeze()
+    one.log.close()
+    assert one.holding.lease is not None
+    one.holding.lease.lost = True  # it gives nothing free
+    one.holding.close()
+    two = Machine(tmp_path / "two", bucket)
+    assert len(rows_in(two.root, Kind.OBSERVATION)) == 5
+    two.close()
+    lines: list[str] = []
+    back: list[Machine] = []
+    start = threading.Thread(target=lambda: back.append(Machine(one.root, bucket, say=lines.append)))
+    start.start()
+    until(lambda: any("is being compacted" in line for line in lines))
+    goes_on.set()
+    for thread in (still, start):
+        thread.join(PATIENCE_S)
+    back[0].copy.follow()
+    for root in (one.root, restored(tmp_path / "new", bucket)):
+        assert len(rows_in(root, Kind.OBSERVATION)) == 5
+    back[0].close()
+
+
+def test_who_starts_while_the_bucket_is_away_says_so_and_ends_or_waits_as_a_standby(
+    bucket: BucketServer, tmp_path: Path
+) -> None:
+    bucket.stop()
+    with pytest.raises(InputError, match="cannot be used .* see that it is reached"):
+        Machine(tmp_path / "one", bucket, standby=False)
+    lines: list[str] = []
+    made: list[Machine] = []
+    start = threading.Thread(target=lambda: made.append(Machine(tmp_path / "two", bucket, lines.append)), daemon=True)
+    start.start()
+    until(lambda: any(line.startswith("standby: the copy cannot be reached") for line in lines))
+    bucket.start()
+    start.join(PATIENCE_S)
+    made[0].write(0)
+    made[0].close()
+
+
+def test_a_standby_is_ready_for_systemd_gives_signs_of_life_and_shows_that_it_does_not_serve(
+    router: ZenohSettings, bucket: BucketServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    holder = Machine(tmp_path / "one", bucket)
+    with (
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as told,
+        hosts(tmp_path, ["two"], router.connect[0], bucket, metrics_port=0) as (two,),
+    ):
+        told.bind(str(tmp_path / "notify"))
+        told.settimeout(PATIENCE_S)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        monkeypatch.setenv("WATCHDOG_USEC", "1000000")
+        two.part.start()
+        address = two.part.line_with("standby: shard-0 ").rpartition(", ")[2]
+        for _ in range(3):
+            assert told.recv(100) == b"READY=1\nWATCHDOG=1"
+        assert 'gripmap_serves{regions="*/*/*"} 0.0' in fetch(f"{address}/metrics")[2].splitlines()
+        assert fetch(f"{address}/healthz")[0] == 200
+        holder.close()
+        two.part.line_with("ready: ")
+        lines = fetch(f"{two.part.line_with('ready: ').rpartition(', ')[2]}/metrics")[2].splitlines()
+        assert 'gripmap_serves{regions="*/*/*"} 1.0' in lines
+        assert two.part.stop() == 0
+
+
 def test_a_lease_that_lives_is_not_taken_by_who_is_no_standby(bucket: BucketServer, tmp_path: Path) -> None:
     one = Machine(tmp_path / "one", bucket)
     with pytest.raises(InputError, match="is served by shard-0"):
-        Machine(tmp_path / "two", bucket)
+        Machine(tmp_path / "two", bucket, standby=False)
     one.close()
     Machine(tmp_path / "two", bucket).close()  # it was given free
 
@@ -249,12 +341,14 @@ def test_one_of_many_takes_a_lease(bucket: BucketServer) -> None:
     assert taken == [True, False, False]
 
 
+@pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="this system does not count while it is suspended")
 @pytest.mark.parametrize("lease_s", [4.0, 40.0])
 def test_half_a_lease_after_a_renewal_began_nothing_is_acknowledged_any_more(
     bucket: BucketServer, monkeypatch: pytest.MonkeyPatch, lease_s: float
 ) -> None:
     now = [100.0]
-    clock = SimpleNamespace(monotonic=lambda: now[0], time=time.time)
+    # The clock that stands still while a machine is suspended is not asked.
+    clock = SimpleNamespace(monotonic=lambda: 0.0, clock_gettime=lambda _: now[0], time=time.time)
     monkeypatch.setattr("fleet_service.shards.lease.time", clock)
     lease = Lease("one", ObjectBucket(bucket.url, bucket.store, 5.0), "shard-0", lease_s)
     fresh = [lease.fresh]

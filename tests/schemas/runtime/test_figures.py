@@ -6,6 +6,7 @@ import json
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from schemas.runtime.figures import Figure, commit, markdown, write
@@ -60,3 +61,9 @@ def test_the_file_starts_with_a_header_and_says_what_does_not_hold(tmp_path: Pat
     assert (good["value"], good["holds"]) == (1.0, True)
     assert (bad["value"], bad["holds"]) == (None, False)
     assert "DOES NOT HOLD" in markdown(figures)
+
+
+def test_a_value_of_numpy_is_written_like_any_other(tmp_path: Path) -> None:
+    found = [Figure("a", np.float64(0.5), "", 1.0), Figure("b", np.float64(0.5), "", (0.6, 1.0), "within")]
+    write(tmp_path / "figures.json", "demo", [1], found)
+    assert [row["holds"] for row in json.loads((tmp_path / "figures.json").read_text())[1:]] == [True, False]

@@ -36,6 +36,9 @@ def run(folder: Path, factor: str, before: str = "") -> str:
         (folder / "schemas").symlink_to(source, target_is_directory=True)
     environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
     environment |= {"XDG_CACHE_HOME": str(folder / "cache"), "PYTHONPATH": str(folder)}
+    environment |= {
+        "PYTHONDONTWRITEBYTECODE": "1"
+    }  # Python's own cache takes two texts of one second and length for one
     words = [sys.executable, "-c", f"{before}from kernels.outer import outer; print(outer(1.0))"]
     return subprocess.run(words, env=environment, cwd=folder, capture_output=True, text=True, check=True).stdout.strip()
 

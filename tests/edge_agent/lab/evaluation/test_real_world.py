@@ -9,13 +9,13 @@ from edge_agent.estimators import Estimates
 from edge_agent.estimators.estimates import ONE_FRICTION, Column
 from edge_agent.lab.evaluation import oracle, real_world
 from edge_agent.lab.evaluation.batch import DriveSet, realistic
-from edge_agent.lab.evaluation.real_world import PRIOR, SURFACES, Tally
+from edge_agent.lab.evaluation.real_world import PRIOR, Tally
 from edge_agent.lab.evaluation.scenarios import PAPERS
 from edge_agent.lab.seeds import FIGURES
 from edge_agent.lab.tuning import objectives, study
 from schemas.numeric import FloatArray
 from schemas.signals import Health, S
-from schemas.thresholds import GRAVITY
+from schemas.thresholds import GRAVITY, SURFACES
 
 
 @pytest.fixture(scope="module")

@@ -24,10 +24,7 @@ from fleet_service.analytics.questions.contract import (
     breach,
     slots,
 )
-from fleet_service.analytics.roads.join import joined
-from fleet_service.analytics.roads.network import DirectedLink, RoadNetwork
 from fleet_service.cli import main
-from schemas import grid
 from schemas.errors import InputError
 
 Ask = Callable[..., pa.Table]
@@ -77,26 +74,6 @@ def test_the_interval_of_a_slot_covers_the_truth_as_often_as_it_says() -> None:
         found = slots(table)
         hits.append(float(((found["lower"] <= truth) & (truth <= found["upper"])).mean()))
     assert min(hits) > 0.88, hits
-
-
-@pytest.fixture(scope="module")
-def links(rows: pd.DataFrame, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The roads of the synthetic archive as links of forty cells, and one where nobody was."""
-    x, y = grid.deinterleave(rows["cell"].to_numpy())
-    found = []
-    for line in np.unique(y):
-        on = np.sort(np.unique(x[y == line]))
-        for k in range(0, len(on) - 1, 40):
-            ends = grid.interleave(on[[k, min(k + 40, len(on) - 1)]], np.full(2, line))
-            latitude, longitude = grid.centre(ends)
-            found.append(DirectedLink(f"{line}-{k}", "forward", f"road {line}", "primary", latitude, longitude))
-            found.append(
-                DirectedLink(f"{line}-{k}", "backward", f"road {line}", "primary", latitude[::-1], longitude[::-1])
-            )
-    found.append(DirectedLink("nobody", "forward", "", "", np.array([10.0, 10.0]), np.array([10.0, 10.01])))
-    path = tmp_path_factory.mktemp("roads") / "roads.parquet"
-    pq.write_table(joined(RoadNetwork(found, {})), path)
-    return path
 
 
 def test_each_link_that_froze_is_told_and_no_other(asked: Ask, links: Path, rows: pd.DataFrame) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -113,3 +114,16 @@ def test_the_command_writes_what_the_question_reads(tmp_path: Path, capsys: pyte
     (tmp_path / "other.parquet").write_bytes(b"x")
     with pytest.raises(InputError, match="roads"):
         read_roads(tmp_path / "other.parquet")
+
+
+def test_id_and_name_of_lines_are_those_of_the_columns_that_are_given(tmp_path: Path) -> None:
+    (south, west), (north, east) = place(0, 0), place(200, 0)
+    line = {"type": "LineString", "coordinates": [[west, south], [east, north]]}
+    columns = {"id": "1", "name": "First", "nr": "E6", "street": "Avenue"}
+    feature = {"type": "Feature", "properties": columns, "geometry": line}
+    lines, out = tmp_path / "lines.geojson", tmp_path / "roads.parquet"
+    lines.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    for more, link, name in (([], "1", "First"), (["--id", "nr", "--name", "street"], "E6", "Avenue")):
+        assert main(["roads", str(lines), "--out", str(out), *more]) == 0
+        found = pq.read_table(out)
+        assert (set(found["link"].to_pylist()), set(found["name"].to_pylist())) == ({link}, {name})

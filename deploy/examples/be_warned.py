@@ -1,0 +1,45 @@
+"""Be warned: a car hears the map in front of it over its own session, and calls back with each warning.
+
+python deploy/examples/be_warned.py tcp/127.0.0.1:7447 57.7 11.97
+"""
+
+from __future__ import annotations
+
+import queue
+import sys
+import time
+
+import zenoh
+
+import edge_agent
+
+SPEED = 14.0  # [m/s]
+
+
+def main(endpoint: str, latitude: float, longitude: float, yaw: float = 0.0, within_s: float = 60.0) -> str:
+    """Look ahead from a place (yaw: radians from east) and print what comes; returns the first warning, or nothing."""
+    warnings: queue.Queue[str] = queue.Queue()
+    lookout = edge_agent.Lookout(["my-car"], lambda name, warning: warnings.put(f"{name}: {warning.line()}"))
+    config = zenoh.Config.from_json5(f'{{"mode": "client", "connect": {{"endpoints": ["{endpoint}"]}}}}')
+    with zenoh.open(config) as session:
+        lookout.attach("my-car", session)
+        lookout.start()
+        warned = ""
+        until = time.monotonic() + within_s
+        while not warned and time.monotonic() < until:
+            lookout.see([edge_agent.Pose(latitude, longitude, yaw, SPEED, time.time_ns())])  # where the car is now
+            try:
+                warned = warnings.get(timeout=0.1)
+            except queue.Empty:
+                continue
+        outlook = lookout.outlook("my-car")
+        lookout.close()
+    if outlook is not None:
+        known = int((outlook.runs.basis > 0).sum())
+        print(f"ahead on {outlook.way}: {known} of {len(outlook.runs.basis)} stretches are known")
+    print(warned or "nothing slippery is known ahead")
+    return warned
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], *map(float, sys.argv[2:]))

@@ -1,0 +1,82 @@
+"""Months that were forgotten: what was measured in them is not let in again.
+
+    keys/2026-01.UNTIL.erased   empty; of that month, what was measured before UNTIL [ns]
+
+Without the month's key nobody can tell which batches are there already, so that one which is sent again would count
+twice. UNTIL is the end of the month, or in a month that goes on the newest that the archive holds: no clock decides.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from datetime import date, timedelta
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from fleet_service.archive.layout import DAY_NS
+from schemas.errors import InputError
+from schemas.numeric import BoolArray, IntArray
+from schemas.runtime.durable import sync_directory
+from schemas.tables import US_STEP
+
+_NAME: Final = re.compile(r"(\d{4}-\d{2})\.(\d{1,19})\.erased")
+_EPOCH: Final = date(1970, 1, 1)
+
+
+class Span(NamedTuple):
+    """Times [ns] from `begin` on and before `until`."""
+
+    begin: int
+    until: int
+
+
+def first_day(month: str) -> date:
+    """First day of a month (2026-01).
+
+    Raises:
+        InputError: it is none.
+    """
+    try:
+        return date.fromisoformat(f"{month}-01")
+    except ValueError as error:
+        raise InputError("period", f"{month!r} is no month", "give one like 2026-01") from error
+
+
+def span_of(month: str) -> Span:
+    """A whole month.
+
+    Raises:
+        InputError: as `first_day`.
+    """
+    first = first_day(month)
+    following = (first.replace(day=28) + timedelta(days=4)).replace(day=1)
+    return Span((first - _EPOCH).days * DAY_NS, (following - _EPOCH).days * DAY_NS)
+
+
+def note(folder: Path, month: str, newest: int) -> None:
+    """Let nothing of a month in again that was measured until `newest` [ns], the newest that the archive holds; durable
+    when it returns.
+
+    Raises:
+        OSError: the disk is full or broken.
+    """
+    until = min(newest + US_STEP, span_of(month).until)  # the archive keeps times in whole steps
+    (folder / f"{month}.{max(until, 0)}.erased").touch(0o600)
+    sync_directory(folder)
+
+
+def read(folder: Path) -> list[Span]:
+    """What is not let in again."""
+    found = [_NAME.fullmatch(path.name) for path in sorted(folder.glob("*.erased"))]
+    return [Span(span_of(name[1]).begin, int(name[2])) for name in found if name is not None]
+
+
+def within(spans: Sequence[Span], time: IntArray) -> BoolArray:
+    """Which times (n,) [ns] lie in one of the spans."""
+    out = np.zeros(len(time), bool)
+    for begin, until in spans:
+        out |= (time >= begin) & (time < until)
+    return out

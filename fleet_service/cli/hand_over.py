@@ -1,0 +1,33 @@
+"""`fleet-service hand-over`: a region goes from the service that has it to one that stands by."""
+
+from __future__ import annotations
+
+import argparse
+import re
+
+from fleet_service.cli.common import add_connection
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("region", metavar="REGION", help="as services are given it, e.g. 1202/310/*")
+    parser.add_argument("--to", metavar="NAME", required=True, help="the standby that is to serve it")
+    add_connection(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Hand over, and say how long nobody served it."""
+    from fleet_service.client import map_client
+    from fleet_service.shards.moving import hand_over
+    from schemas.config import REGION_PATTERN
+    from schemas.errors import InputError
+
+    if not re.fullmatch(REGION_PATTERN, arguments.region):
+        raise InputError("region", f"{arguments.region!r} is none", "give chunks of 4, 3 and 3 digits, or * for all")
+    with map_client.joined(map_client.settings(arguments.connect, arguments.config)) as session:
+        moved = hand_over(session, arguments.region, arguments.to, print)
+    if moved is None:
+        print(f"{arguments.to} serves {arguments.region} already")
+    else:
+        print(f"{arguments.to} serves {arguments.region}; nobody did for {moved.pause_s:.1f} s")
+    return 0

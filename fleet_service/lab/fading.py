@@ -1,0 +1,87 @@
+"""How long a dry road stays dry on the map: what a planner may assume so long after the last pass. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.random import Generator
+
+from fleet_service.fusion import Fusion, observations_of
+from fleet_service.fusion.weather import Reports
+from fleet_service.lab import agent
+from fleet_service.lab.agent import Errors, Passes
+from fleet_service.lab.drive import CELL, LATENESS_S, rows_of
+from fleet_service.lab.town import START, Visits
+from schemas import grid, mugrid
+from schemas.numeric import FloatArray
+from schemas.thresholds import GRAVITY, NS
+
+PREFIX: Final = "fusion.stays_dry"
+DRY, PASSES, CARS, HOUR_S = 0.85, 60, 40, 3600.0
+AFTER_MIN: Final = (0, 5, 15, 30, 60, 120, 180, 360)  # [min] after the hour of the passes
+
+
+class WeatherSince(NamedTuple):
+    """Weather that is reported each hour, from the last pass on [°C, mm/h]."""
+
+    temperature: float
+    precipitation: float
+
+
+WEATHER: Final[dict[str, WeatherSince | None]] = {
+    "unknown": None, "mild_dry": WeatherSince(8.0, 0.0), "mild_rain": WeatherSince(8.0, 1.0),
+    "freezing": WeatherSince(-1.0, 0.0),
+}  # fmt: skip
+TITLES: Final = {
+    "unknown": "unknown", "mild_dry": "8 °C, dry", "mild_rain": "8 °C, rain", "freezing": "−1 °C, dry or wet",
+}  # fmt: skip
+
+
+def measure(seeds: range) -> dict[str, float]:
+    """Lower end of the interval, mean of the seeds, by weather and minutes."""
+    return {
+        f"{PREFIX}.{name}.min{minutes}": float(lower)
+        for name, known in WEATHER.items()
+        for minutes, lower in zip(
+            AFTER_MIN, np.mean([lower_ends(np.random.default_rng([seed, 23]), known) for seed in seeds], axis=0),
+            strict=True,
+        )
+    }  # fmt: skip
+
+
+def lower_ends(rng: Generator, known: WeatherSince | None) -> FloatArray:
+    """Lower end at each of AFTER_MIN, after excited passes over a dry road for an hour."""
+    seconds, who = np.sort(rng.random(PASSES)) * HOUR_S, rng.integers(0, CARS, PASSES)
+    mu, nothing, excited = np.full(PASSES, DRY), np.zeros(PASSES, np.int64), np.ones(PASSES, bool)
+    passes = Passes(who, mu, np.zeros(PASSES), rng.uniform(0.6, 1.0, PASSES), rng.normal(size=PASSES), nothing, excited)
+    reports = agent.report(rng, Errors.draw(rng, CARS), passes)
+    fusion = Fusion(LATENESS_S)
+    if known is not None:
+        fusion.update_weather(_reports(known))
+    fusion.update(observations_of(rows_of(Visits(seconds, who, nothing, mu, excited, reports)), who))
+    slot = fusion.slots_of(CELL[:1], np.zeros(1, np.int64))
+    at = [START + int((HOUR_S + 60.0 * minutes) * NS) for minutes in AFTER_MIN]
+    return np.array([mugrid.quantiles(fusion.beliefs(slot, moment), 0.05)[0] for moment in at])
+
+
+def _reports(known: WeatherSince) -> Reports:
+    hours = 1 + np.arange(1 + AFTER_MIN[-1] // 60)
+    n = len(hours)
+    temperature = np.full(n, known.temperature)
+    return Reports(
+        np.repeat(grid.region_of(CELL[:1]), n), START + hours * 3600 * NS, temperature, temperature,
+        np.full(n, known.precipitation), np.full((n, mugrid.BINS), np.nan),
+    )  # fmt: skip
+
+
+def table(values: Mapping[str, float]) -> str:
+    """Lower end, and the deceleration [m/s²] that it bears, by weather and time."""
+    times = [f"{minutes} min" if minutes < 60 else f"{minutes // 60} h" for minutes in AFTER_MIN]
+    lines = [f"| weather | {' | '.join(['at once', *times[1:]])} |", f"|{'---|' * (1 + len(times))}"]
+    for name, title in TITLES.items():
+        lower = [values[f"{PREFIX}.{name}.min{minutes}"] for minutes in AFTER_MIN]
+        cells = [f"{mu:.2f}".removeprefix("0") + f", {GRAVITY * mu:.1f}" for mu in lower]
+        lines.append(f"| {title} | {' | '.join(cells)} |")
+    return "\n".join(lines)

@@ -1,0 +1,97 @@
+"""Handing a region over, live: who serves it leaves in good order, and its lease goes to the standby that is named.
+
+ask                                      the service
+get gripmap/v1/shard/SERVICE?to=NAME ──► sees that NAME stands by for its regions, and says so
+watches the tokens                       checkpoint, copied; then as at any stop: flush, acknowledge, undeclare
+                                         lease given free for NAME, which takes it, restores, declares
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Sequence
+from typing import Final, NamedTuple
+
+import zenoh
+
+from schemas import keys, regions
+from schemas.config import NAME_PATTERN
+from schemas.errors import InputError
+from schemas.runtime import tokens
+
+ANSWER_S: Final = 10.0
+MOVED_S: Final = 300.0  # a compaction that is under way is waited for
+LOOK_S: Final = 0.05
+FIX: Final = "start it with --standby, the same settings and a name of its own"
+
+
+class Moved(NamedTuple):
+    """From which service, and for how long nobody served the region [s]."""
+
+    service: str
+    pause_s: float
+
+
+def asked(query: zenoh.Query, session: zenoh.Session, served: Sequence[str]) -> str | None:
+    """Answer who asks a service to hand over; returns to whom, None where it cannot be done.
+
+    Args:
+        query: as `hand_over` puts it.
+        session: of the service.
+        served: its region expressions.
+    """
+    with query:
+        to = str(query.parameters).removeprefix("to=")
+        waiting = {token.region for token in tokens.standing(session, keys.WAITS) if token.service == to}
+        if re.fullmatch(NAME_PATTERN, to) is None or waiting != set(served):
+            other = f"stands by for {', '.join(sorted(waiting))}" if waiting else f"no {to[:63]!r} stands by"
+            query.reply_err(f"to: {other}, not for {', '.join(served)}; {FIX}".encode())
+            return None
+        query.reply(query.key_expr, ",".join(served).encode())
+        return to
+
+
+def hand_over(session: zenoh.Session, region: str, to: str, say: Callable[[str], None]) -> Moved | None:
+    """Have a region's service hand over; None if it is served by that one already.
+
+    Args:
+        session: of whoever may ask a service.
+        region: key expression.
+        to: name of the standby.
+        say: takes a line when there is something new.
+
+    Raises:
+        InputError: nobody serves it, or no such standby waits, or it did not come to it.
+    """
+    with tokens.watched(session) as there:
+        service = _server(there, region)
+        if service is None:
+            raise InputError("region", f"nobody serves {region}", "see `fleet-service watch`")
+        if service == to:
+            return None
+        say(f"{service} hands over {_ask(session, service, to)}")
+        end, gone = time.monotonic() + MOVED_S, 0.0
+        while (now := _server(there, region)) != to:
+            gone = gone or (time.monotonic() if now is None else 0.0)
+            if time.monotonic() > end or now not in (None, service):
+                raise InputError("to", f"{to} does not serve {region}, but {now or 'nobody'} does", "see their logs")
+            time.sleep(LOOK_S)
+        return Moved(service, time.monotonic() - (gone or time.monotonic()))
+
+
+def _server(there: tokens.Watched, region: str) -> str | None:
+    return next((token.service for token in there.here if regions.covers(token.region, region)), None)
+
+
+def _ask(session: zenoh.Session, service: str, to: str) -> str:
+    """The regions that go."""
+    for reply in session.get(f"{keys.shard_key(service)}?to={to}", timeout=ANSWER_S):
+        if reply.ok is not None:
+            return reply.ok.payload.to_string().replace(",", ", ")
+        problem = reply.err.payload.to_string() if reply.err else ""
+        field, _, rest = problem.partition(": ")
+        problem, _, fix = rest.partition("; ")
+        if fix:
+            raise InputError(field, problem, fix)
+    raise InputError("region", f"{service} does not answer", "ask with a certificate of a service")

@@ -1,0 +1,93 @@
+"""Drives and zones that Spark spreads, beside the same ones done here; `make batch-bench` counts what differs."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from edge_agent.app.backfill import Task, backfill, backfill_on_spark, tasks_of, tried
+from edge_agent.cli import main as edge_agent
+from fleet_service.analytics.rebuilding import Rebuild, rebuild, rebuilt, zones_of
+from fleet_service.analytics.synthetic import SyntheticFleet
+from schemas.runtime import spark
+from tests import spark_sessions
+from tests.fleet_service.analytics.border import UNTIL, difference, fill, rebuilt_map
+
+SEEDS: Final = (101, 102, 103, 104)
+WORLD: Final = SyntheticFleet(rows=40_000, days=1, vehicles=60, roads=8, length=60, icy=4, seed=101)
+ESTIMATOR: Final = "aco-fckf"
+DRIVE_S: Final = 120.0
+COPIES: Final = 6  # of each drive: some ten seconds of work on one core, beside which Spark's own tenths are little
+ROUNDS: Final = 3
+
+
+def drives(folder: Path) -> list[Path]:
+    """Signal logs, each with its vehicle file, made with the seeds."""
+    folder.mkdir()
+    for seed in SEEDS:
+        files = ["--out", str(folder / f"d{seed}.parquet"), "--vehicle-out", str(folder / f"d{seed}.json")]
+        if edge_agent(["simulate", "slalom", "--duration", str(DRIVE_S), "--seed", str(seed), *files]) != 0:
+            raise RuntimeError("no drive was simulated")
+    return sorted(folder.glob("*.parquet"))
+
+
+def replay_difference(logs: Sequence[Path], folder: Path) -> float:
+    """Files of estimates that are not, byte for byte, those of this machine, though each task was killed once."""
+    here, there, tries = folder / "here", folder / "there", folder / "tries"
+    there.mkdir(parents=True)
+    work = partial(tried, estimator=ESTIMATOR, memberships=None)
+    with spark_sessions.cores(2) as session:
+        dying = spark_sessions.killed_at_first(work, lambda task: task.log.name, tries)
+        told = spark.spread(session, tasks_of(logs, None, there), dying)
+    ours = list(backfill(tasks_of(logs, None, here), ESTIMATOR, 1))
+    if len(list(tries.iterdir())) != len(logs) or any(outcome.error for outcome in (*told, *ours)):
+        raise RuntimeError("a drive was not estimated, or its task was not killed")
+    names = {path.name for folder in (here, there) for path in folder.iterdir()}
+    return float(sum(_content(here / name) != _content(there / name) for name in names))
+
+
+def rebuild_difference(folder: Path) -> float:
+    """The largest difference of a number of two rebuilt maps, one here and one on Spark with each task killed once."""
+    archive, here, there, tries = (folder / name for name in ("archive", "here", "there", "tries"))
+    fill(archive, WORLD)
+    here.mkdir()
+    there.mkdir()
+    zones = zones_of(archive)
+    with spark_sessions.cores(2) as session:
+        spark.spread(
+            session, zones, spark_sessions.killed_at_first(partial(rebuilt, Rebuild(archive, there, UNTIL)), str, tries)
+        )
+    if sum(zone.cells for zone in rebuild(Rebuild(archive, here, UNTIL))) == 0 or len(list(tries.iterdir())) != len(
+        zones
+    ):
+        raise RuntimeError("no cell was rebuilt, or a task was not killed")
+    return difference(rebuilt_map(here), rebuilt_map(there))
+
+
+def replay_scaling(logs: Sequence[Path], folder: Path) -> float:
+    """Drives per second on two local cores over those on one: median of rounds in turn, with workers that are warm."""
+    tasks = [
+        Task(log, log.with_suffix(".json"), folder / f"{log.stem}-{copy}.parquet")
+        for copy in range(COPIES)
+        for log in logs
+    ]
+    return statistics.median(_spent(tasks, 1) / _spent(tasks, 2) for _ in range(ROUNDS))
+
+
+def _spent(tasks: Sequence[Task], cores: int) -> float:
+    with spark_sessions.cores(cores):
+        for _ in range(2):  # each worker starts and loads the kernels in the first
+            began = time.perf_counter()
+            outcomes = list(backfill_on_spark(tasks, ESTIMATOR))
+            spent = time.perf_counter() - began
+    if any(outcome.error for outcome in outcomes):
+        raise RuntimeError("a drive was not estimated")
+    return spent
+
+
+def _content(path: Path) -> bytes | None:
+    return path.read_bytes() if path.exists() else None

@@ -1,0 +1,48 @@
+"""The town that listens: what it hears it does not say again, and its figures mean what they say."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from deploy import listening
+from deploy.listening import Drive, ListeningTown, measured
+from edge_agent.lab.simulation.listeners import WarnedDrivers
+
+
+def test_a_town_that_hears_its_own_map_makes_the_same_map_bit_for_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of drivers who do not react to it, for who drives otherwise measures otherwise."""
+    monkeypatch.setattr(listening, "ASKED_S", 4.0)
+    hearing, deaf = (ListeningTown("test", 12, 3, listening=hears, rough=0.0) for hears in (True, False))
+    hearing.drivers = WarnedDrivers(hearing.fleet, 0.0)
+    with_, without = hearing.run(40.0), deaf.run(40.0)
+    assert hearing.heard.alerts
+    assert len(with_.told_error) > 50, "cells that the map knew, and that it told"
+    assert not deaf.heard.cells
+    assert with_.visits == without.visits > 500
+    slots = np.arange(hearing.fusion.size)
+    one, other = (town.fusion.beliefs(slots, town._now()) for town in (hearing, deaf))
+    assert np.array_equal(one, other)
+    assert with_.inside == without.inside
+    assert with_.passed == without.passed != set()
+
+
+def test_the_figures_count_vehicles_that_slid_and_cells_that_are_covered() -> None:
+    with_ = [Drive({(1, 1)}, {(1, 1), (2, 1), (3, 1)}, 3.0, [True] * 90 + [False] * 10, 900, 2, 4, [(0.1, 0.2)])]
+    without = [Drive({(1, 1), (1, 2), (2, 1)}, {(1, 1), (1, 2), (2, 1)}, 4.0, [True] * 95 + [False] * 5, 800)]
+    found = {figure.name: figure for figure in measured(with_, without)}
+    assert found["ahead.lost_grip_ratio"].value == 0.5, "one vehicle of two, however often"
+    assert found["ahead.lost_grip.without"].value == 3
+    assert found["ahead.alert_passes"].value == 4.0
+    assert found["prior.map_loop"].value == pytest.approx(0.05)
+    assert not found["prior.map_loop"].holds
+    assert found["prior.entry_error_ratio.town"].value == 0.5
+
+
+def test_where_nothing_happened_no_bar_holds() -> None:
+    found = {figure.name: figure for figure in measured([Drive()], [Drive()])}
+    for name in ("ahead.lost_grip_ratio", "prior.map_loop"):
+        assert math.isnan(found[name].value)
+        assert not found[name].holds

@@ -1,0 +1,182 @@
+"""`python -m tests.faults.cluster [--failovers 100] [--out DIR] [--seed N]`: services that follow each other, again and
+again, under load: killed, frozen, cut off, amid a compaction, amid of copying, with two that wait, and one that wakes.
+
+At the end each machine, and one that begins with an empty disk, is to hold all that was acknowledged, once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import statistics
+import time
+from collections import defaultdict
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from deploy.router import open_router
+from fleet_service.archive import reading
+from schemas.config import ServiceConfig, ZenohSettings
+from schemas.runtime import figures
+from schemas.runtime.figures import Figure
+from schemas.wire import Kind
+from tests.benchmarks.cluster import cluster as ack_p50_s
+from tests.buckets import bucket_server
+from tests.faults.bars import figure
+from tests.faults.census import Census, take
+from tests.faults.cluster_service import COMPACTING, COPYING
+from tests.faults.cluster_stage import (
+    PATIENCE_S,
+    TWO,
+    WAKES,
+    WAYS,
+    Asking,
+    Failover,
+    Journals,
+    Machines,
+    drained,
+    loads,
+    populate,
+)
+from tests.faults.frame import Campaign, Site, conduct, leave
+from tests.standbys import hosts, restored
+from tests.waiting import until
+
+FULL: Final = 100  # failovers
+LEASE_S: Final = ServiceConfig().lease_s
+PROCESSES, VEHICLES, RATE = 2, 6, 25.0  # 300 observations/s
+EVERY: Final = 8  # failovers; in the middle and at the end of them the region is handed over
+HOLD_S: Final = (1.0, 5.0)  # in which all goes well, between two failovers
+# Often, so that the few seconds in which a service lives have some of each; a snapshot costs a second.
+PERIODS: Final[dict[str, object]] = {"compact_s": 5.0, "checkpoint_s": 4.0, "snapshot_s": 20.0, "segment_s": 0.25}
+KILLED: Final = ("kill", TWO, COMPACTING, COPYING)
+FROZEN: Final = ("freeze", WAKES)
+NAMED: Final = {way: way.replace(" ", "_") for way in WAYS}
+OWES: Final = (
+    "cluster.lost", "cluster.doubled", "cluster.unacknowledged_lost", "cluster.takeover_s.kill",
+    "cluster.takeover_s.freeze", "cluster.failovers", "cluster.cells", "cluster.acknowledged", "cluster.ack_p50_s",
+    "cluster.handover.pause_s", "cluster.handover.map_difference", "cluster.handovers",
+    "cluster.empty_disk.rows_missing", "cluster.empty_disk.rows", "cluster.silent_regions", "cluster.unserved_answers",
+    *(f"cluster.failovers.{name}" for name in NAMED.values()),
+)  # fmt: skip
+
+
+def run(site: Site, failovers: int, lease_s: float) -> list[Figure]:
+    """So many failovers, of all kinds in turn."""
+    random_ = random.Random(site.seed)
+    happened: list[Failover] = []
+    pauses, differences = [], []
+    with ExitStack() as stack:
+        router, (endpoint, *_) = open_router(listen="tcp/127.0.0.1:0")
+        stack.enter_context(router)
+        bucket = stack.enter_context(bucket_server(site.folder / "objects"))
+        module, names = "tests.faults.cluster_service", ["one", "two", "three"]
+        there = stack.enter_context(
+            hosts(site.folder, names, endpoint, bucket, module=module, named=True, lease_s=lease_s, **PERIODS)
+        )
+        box = populate(there[0].root)
+        there[0].part.start()
+        until(lambda: there[0].said("ready: "), PATIENCE_S)
+        cells = int(there[0].part.line_with("ready: ").split(", ")[1].split()[0])
+        site.say(f"{cells} cells")
+        parts = loads(site.folder, endpoint, PROCESSES, VEHICLES, RATE)
+        for part in parts:
+            stack.callback(part.kill)
+        machines, asking = (
+            Machines(there, bucket.place("lease"), lease_s, Journals(part.log for part in parts), random_),
+            Asking(endpoint, box, site.say),
+        )
+        ways, router_of = list(WAYS), ZenohSettings(connect=[endpoint])
+        for number in range(failovers):
+            way = ways[number % len(ways)]
+            machines.ready(2 if way == TWO else 1)
+            time.sleep(random_.uniform(*HOLD_S))
+            found = machines.fail(way)
+            happened += [found] if found else []
+            told = f"{found.way}, {found.seconds:.1f} s" if found else "woke in time"
+            site.say(f"{len(happened)} of {number + 1}: {told}; {asking.unserved} answers say that nobody serves")
+            if number % EVERY == EVERY // 2 - 1:
+                machines.ready(1)
+                pauses.append(machines.pause_s(router_of))
+                site.say(f"handed over, a pause of {pauses[-1]:.1f} s")
+            if number % EVERY == EVERY - 1:
+                machines.ready(1)
+                differences.append(machines.map_difference(router_of, parts))
+                site.say(f"handed over, the map differs by {differences[-1]:g}")
+        asking.end()
+        drained(parts)
+        seen = machines.leave()
+        rows = [rows_of(host.root) for host in seen]
+        census = [take([part.log for part in parts], host.root) for host in seen]
+        empty = restored(site.folder / "empty", bucket)
+        rows.append(rows_of(empty))
+        census.append(take([part.log for part in parts], empty))
+    site.say(f"rows {rows}; {census}")
+    return [*_counted(failovers, happened, census), *_told(happened), *ack_p50_s(),
+            figure("cluster.handover.pause_s", max(pauses, default=float("nan"))),
+            figure("cluster.handover.map_difference", max(differences, default=float("nan"))),
+            _shown(failovers, "cluster.handovers", len(pauses) + len(differences), "hand-overs"),
+            figure("cluster.cells", cells), figure("cluster.silent_regions", asking.silent),
+            figure("cluster.unserved_answers", asking.unserved),
+            figure("cluster.empty_disk.rows_missing", max(rows) - rows[-1]),
+            figure("cluster.empty_disk.rows", rows[-1])]  # fmt: skip
+
+
+def rows_of(root: Path) -> int:
+    """Rows of an archive."""
+    return sum(table.num_rows for table in reading.read(root, Kind.OBSERVATION, ["row"]))
+
+
+def _counted(failovers: int, happened: list[Failover], census: list[Census]) -> list[Figure]:
+    ways = defaultdict(list)
+    for one in happened:
+        ways[one.way].append(one.seconds)
+
+    def longest(kinds: tuple[str, ...]) -> float:
+        return max((seconds for kind in kinds for seconds in ways[kind]), default=float("nan"))
+
+    return [
+        figure("cluster.lost", sum(one.acknowledged_lost for one in census)),
+        figure("cluster.doubled", sum(one.doubled for one in census)),
+        figure("cluster.unacknowledged_lost", sum(one.lost for one in census)),
+        figure("cluster.takeover_s.kill", longest(KILLED)),
+        figure("cluster.takeover_s.freeze", longest(FROZEN)),
+        _shown(failovers, "cluster.failovers", len(happened), "failovers"),
+        _shown(failovers, "cluster.acknowledged", census[0].settled, "batches"),
+        *(_shown(failovers, f"cluster.failovers.{name}", len(ways[way]), "failovers") for way, name in NAMED.items()),
+    ]
+
+
+def _shown(failovers: int, name: str, value: float, unit: str) -> Figure:
+    """With its bar where the whole campaign ran."""
+    return figure(name, value) if failovers >= FULL else Figure(name, value, unit)
+
+
+def _told(happened: list[Failover]) -> list[Figure]:
+    """Without bars: the half of it."""
+    found = []
+    for name, kinds in {"kill": KILLED, "freeze": FROZEN, "cut": ("bucket", "routers")}.items():
+        seconds = [one.seconds for one in happened if one.way in kinds]
+        if seconds:
+            found.append(Figure(f"cluster.takeover_p50_s.{name}", statistics.median(seconds), f"s, of {len(seconds)}"))
+    return found
+
+
+def main() -> int:
+    """Run; 0 if every bar holds."""
+    parser = argparse.ArgumentParser(prog="tests.faults.cluster", description="Services that follow each other.")
+    parser.add_argument("--failovers", type=int, default=FULL, help=f"how many (default {FULL}, half an hour)")
+    parser.add_argument("--lease-s", type=float, default=LEASE_S, help="on a machine that has no time for 5 s")
+    parser.add_argument("--out", type=Path, default=Path(".faults/cluster"), help="figures and what was left")
+    parser.add_argument("--seed", type=int, default=0, help="of everything random (default 0)")
+    args = parser.parse_args()
+    campaign = Campaign("cluster", partial(run, failovers=args.failovers, lease_s=args.lease_s), OWES)
+    found = conduct([campaign], args.out, "cluster", quick=args.failovers < FULL, seed=args.seed)
+    print(figures.markdown(found))
+    return 0 if all(one.holds for one in found) else 1
+
+
+if __name__ == "__main__":
+    leave(main)

@@ -1,0 +1,57 @@
+"""`python -m tests.faults.cluster_service …`: `fleet-service`, which says when it compacts and when it copies, and does
+both often, so that a campaign can meet it amid of them. A line that begins and none that ends is one that was met."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Sequence
+from typing import Final
+
+from fleet_service.app import beside, jobs
+from fleet_service.archive.copies import Copy
+from fleet_service.cli import main
+
+COMPACTING, COPYING = "compacting", "copying"
+BEGINS, ENDS = "begins", "ends"
+FOLLOW_S: Final = 3.0
+
+_run, _follow, _put_there = beside.run, Copy.follow, Copy._put_there
+_copying = threading.local()
+
+
+def _say(sign: str, what: str) -> None:
+    print(f"{what} {sign}", flush=True)
+
+
+def run(
+    what: str, module: str, words: Sequence[str], stop: threading.Event, told: str | None = None
+) -> str | None:  # fmt: skip
+    """As `beside.run`."""
+    _say(BEGINS, COMPACTING)
+    output = _run(what, module, words, stop, told)
+    _say(ENDS, COMPACTING)
+    return output
+
+
+def follow(copy: Copy) -> int:
+    """As `Copy.follow`."""
+    _copying.at = False
+    changed = _follow(copy)
+    if _copying.at:
+        _say(ENDS, COPYING)
+    return changed
+
+
+def put_there(copy: Copy, name: str) -> bool:
+    """As `Copy._put_there`; the first one of a turn says that it begins."""
+    if getattr(_copying, "at", None) is False:
+        _copying.at = True
+        _say(BEGINS, COPYING)
+    return _put_there(copy, name)
+
+
+if __name__ == "__main__":
+    beside.run, Copy.follow, Copy._put_there = run, follow, put_there  # type: ignore[method-assign,assignment]
+    jobs.FOLLOW_S = FOLLOW_S  # type: ignore[misc]
+    sys.exit(main())

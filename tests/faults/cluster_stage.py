@@ -1,0 +1,362 @@
+"""The machines of the cluster campaign: services of one region that follow each other, and how each of them goes.
+
+Three machines, a router, a bucket that a real S3 server keeps, loads that are acknowledged, and somebody who asks for
+the map all the time.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import signal
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_service.analytics import synthetic
+from fleet_service.analytics.synthetic import DAY_S, START_NS, SyntheticFleet
+from fleet_service.archive.compaction import compact
+from fleet_service.archive.layout import CHECKPOINTS
+from fleet_service.archive.segments import Writer
+from fleet_service.client import map_client
+from fleet_service.replay import checkpoints
+from fleet_service.shards import moving
+from schemas.config import ZenohSettings
+from schemas.errors import InputError
+from schemas.thresholds import NS
+from schemas.wire import Kind
+from tests.faults.cluster_service import BEGINS, COMPACTING, COPYING, ENDS
+from tests.faults.processes import Part
+from tests.standbys import Host
+from tests.waiting import until
+
+WORLD: Final = SyntheticFleet(300_000, days=1, roads=300)  # 107 000 cells, visited in the last day
+SIDE: Final = 0.01  # degrees of the box that is asked for
+FROZEN: Final = (0.5, 1.3)  # of the lease's time; then one wakes: it is followed after .6 to 1
+AMID_S: Final = 0.3  # of a compaction or a copying job, after which it is killed at the latest
+WOKE: Final = 3.0  # of the lease's time; one that woke in time has not been followed then
+SETTLED_S: Final = 2.0  # after which all that was sent is in a segment
+PATIENCE_S: Final = 600.0  # a takeover that takes long is a figure, no hang
+
+
+def populate(root: Path) -> str:
+    """An archive with the map of a town, as of today; returns a box of it."""
+    writer = Writer(root, "shard-0")
+    since = time.time_ns() - START_NS - DAY_S * NS - 60 * NS
+    for rows in synthetic.chunks(WORLD):
+        place = [float(rows[name][0]) for name in ("longitude", "latitude")]
+        moved = {name: rows[name] + since for name in ("enter_time", "leave_time", "received_at")}
+        writer.write(Kind.OBSERVATION, rows | moved)
+    writer.sync()
+    compact(root)
+    return ",".join(f"{side:.6f}" for side in (*(at - SIDE for at in place), *(at + SIDE for at in place)))
+
+
+class Journals:
+    """What the loads know to be acknowledged, as it comes."""
+
+    def __init__(self, paths: Iterable[Path]) -> None:
+        self._paths, self._read = list(paths), Counter[Path]()
+        self._times: list[float] = []
+
+    def news(self) -> list[float]:
+        """Times [s] of the acknowledgements since the last call."""
+        found: list[float] = []
+        for path in self._paths:
+            with path.open("rb") as file:
+                file.seek(self._read[path])
+                lines = file.read().rpartition(b"\n")[0].splitlines(keepends=True)
+            self._read[path] += sum(map(len, lines))
+            found += [float(line.split()[-1]) for line in lines if line.startswith(b"- ")]
+        self._times += found
+        return found
+
+    def pause(self, since: float) -> float:
+        """Longest time without an acknowledgement since then [s], as far as was read."""
+        return float(np.diff(sorted(at for at in self._times if at >= since)).max())
+
+    def first_after(self, moment: float) -> float:
+        """Time of the first acknowledgement after a moment; waits for it."""
+        later: list[float] = []
+
+        def there() -> bool:
+            later.extend(at for at in self.news() if at > moment)
+            return bool(later)
+
+        until(there, PATIENCE_S)
+        return min(later)
+
+
+def loads(folder: Path, endpoint: str, processes: int, vehicles: int, rate: float) -> list[Part]:
+    """Generators, started; `rate` observations per second and vehicle."""
+    made = []
+    for number in range(processes):
+        config = folder / f"load-{number}.json"
+        names = [f"sim-{number}{vehicle:02}" for vehicle in range(vehicles)]
+        plan = {"endpoint": endpoint, "names": names, "rate": rate, "outbox": str(folder / f"load-{number}.sqlite")}
+        config.write_text(json.dumps(plan | {"seed": number}))
+        made.append(Part(f"load-{number}", [sys.executable, "-m", "tests.faults.load", str(config)], folder))
+        made[-1].start()
+    for part in made:
+        part.line_with("ready: ")
+    return made
+
+
+class Asking:
+    """Somebody who asks for a box, all the time: what is known of it is told, or that nobody serves it.
+
+    Attributes:
+        whole: answers with all that was known at the beginning.
+        unserved: answers, or errors, that say that something is missing.
+        silent: answers without it that say nothing.
+    """
+
+    PAUSE_S: Final = 0.2
+
+    def __init__(self, endpoint: str, box: str, say: Callable[[str], None]) -> None:
+        self._say = say
+        self._router, self._box = ZenohSettings(connect=[endpoint]), box
+        self.whole = self.unserved = self.silent = 0
+        self._stop = threading.Event()
+        self._known = self._cells()[0]
+        assert len(self._known) > 100, "the box is empty"
+        self._thread = threading.Thread(target=self._ask, daemon=True)
+        self._thread.start()
+
+    def end(self) -> None:
+        """Ask no more."""
+        self._stop.set()
+        self._thread.join(PATIENCE_S)
+
+    def _cells(self) -> tuple[frozenset[tuple[int, int]], bool]:
+        """Cells and sectors of the box, and whether something is said to be missing."""
+        try:
+            answer = map_client.ask(self._router, {"bbox": self._box})
+        except InputError:
+            return frozenset(), True
+        table = answer.table
+        assert table is not None
+        both = [np.asarray(table[name].to_numpy(), np.int64).tolist() for name in ("cell", "sector")]
+        found = frozenset((cell, sector) for cell, sector in zip(*both, strict=True))
+        return found, answer.gap is not None or not answer.served
+
+    def _ask(self) -> None:
+        while not self._stop.wait(self.PAUSE_S):
+            found, missing = self._cells()
+            whole = self._known <= found
+            self.whole += whole
+            self.unserved += missing
+            if not whole and not missing:
+                self.silent += 1
+                self._say(f"{len(self._known - found)} of {len(self._known)} cells are missing, and nothing is said")
+
+
+Go = Callable[[Host, random.Random, float], None]
+
+
+class Way(NamedTuple):
+    """How a service goes, whose lease lasts so long [s], and how it ends: its process gone, the machine whole."""
+
+    go: Go
+    end: Callable[[Host, random.Random], None] = lambda host, _: host.part.kill()
+
+
+def _kill(host: Host, *_: object) -> None:
+    host.part.kill()
+
+
+def _freeze(host: Host, *_: object) -> None:
+    host.part.send(signal.SIGSTOP)
+
+
+def _doze(host: Host, random_: random.Random, lease_s: float) -> None:
+    host.part.send(signal.SIGSTOP)
+    timer = threading.Timer(lease_s * random_.uniform(*FROZEN), lambda: host.part.send(signal.SIGCONT))
+    timer.daemon = True
+    timer.start()
+
+
+def _amid(what: str) -> Go:
+    def go(host: Host, random_: random.Random, _: float) -> None:
+        line = f"{what} {BEGINS}"
+        before = host.part.lines().count(line)
+        until(lambda: host.part.lines().count(line) > before, PATIENCE_S)
+        time.sleep(random_.uniform(0.0, AMID_S))
+        host.part.kill()
+
+    return go
+
+
+def _mended(host: Host, random_: random.Random) -> None:
+    """A link comes back at some time, or not before the service has seen by itself that it was followed."""
+    if random_.random() < 0.5 or host.to_router.is_cut:
+        time.sleep(random_.uniform(0.0, 3.0))
+        host.to_bucket.mend()
+        host.to_router.mend()
+    _followed(host, random_)
+    host.to_bucket.mend()
+
+
+def _followed(host: Host, _: random.Random) -> None:
+    assert host.part.wait(PATIENCE_S) == 1
+    assert host.said("followed: ")
+
+
+TWO: Final = "two standbys"
+WAKES: Final = "wakes"
+WAYS: Final = {
+    "kill": Way(_kill),
+    "freeze": Way(_freeze),
+    "bucket": Way(lambda host, *_: host.to_bucket.cut(), _mended),
+    "routers": Way(lambda host, *_: host.to_router.cut(), _mended),
+    TWO: Way(_kill),
+    WAKES: Way(_doze, _followed),
+    COMPACTING: Way(_amid(COMPACTING)),
+    COPYING: Way(_amid(COPYING)),
+}
+
+
+class Failover(NamedTuple):
+    """What happened: the way, as it turned out, and how long [s] until a vehicle was acknowledged again."""
+
+    way: str
+    seconds: float
+
+
+class Machines:
+    """Of one region: one serves, one waits, others are spare."""
+
+    def __init__(
+        self, hosts: list[Host], leases: Path, lease_s: float, journals: Journals, random_: random.Random
+    ) -> None:
+        self.serving, self._idle = hosts[0], hosts[1:]
+        self._leases, self._lease_s = leases, lease_s
+        self.waiting: list[Host] = []
+        self._journals, self._random = journals, random_
+
+    def ready(self, standbys: int) -> None:
+        """So many wait."""
+        while len(self.waiting) < standbys:
+            host = self._idle.pop(0)
+            host.part.start()
+            self.waiting.append(host)
+        until(lambda: all(_lives(host).said("standby: ") for host in self.waiting), PATIENCE_S)
+
+    def fail(self, name: str) -> Failover | None:
+        """Let the service go; None if nobody had to follow it."""
+        gone, way = self.serving, WAYS[name]
+        terms = self._terms()
+        way.go(gone, self._random, self._lease_s)
+        began = time.time()
+        if name == WAKES:
+            end = time.monotonic() + WOKE * self._lease_s
+            until(lambda: self._terms() > terms or time.monotonic() > end, PATIENCE_S)
+            if self._terms() == terms:
+                return None
+        self._taken()
+        seconds = self._journals.first_after(time.time()) - began
+        way.end(gone, self._random)
+        self._idle.append(gone)
+        hit = name not in (COMPACTING, COPYING) or _was_amid(gone, name)
+        return Failover(name if hit else "kill", seconds)
+
+    def _terms(self) -> int:
+        """How many leases were taken so far."""
+        return sum(1 for _ in self._leases.glob("*.json"))
+
+    def _taken(self) -> None:
+        """One that waited serves; waits for it."""
+        until(self._next, PATIENCE_S)
+        taker = self._next()
+        assert taker is not None
+        self.waiting.remove(taker)
+        self.serving = taker
+
+    def _next(self) -> Host | None:
+        return next((host for host in self.waiting if _lives(host).said("ready: ")), None)
+
+    def hand_over(self, router: ZenohSettings) -> Host:
+        """The service gives its region to the one that waits, and has left then; returns it."""
+        former, to = self.serving, self.waiting[0].root.parent.name
+        with map_client.joined(router) as session:
+            assert moving.hand_over(session, "*/*/*", to, lambda _: None) is not None
+        self._taken()
+        assert former.part.wait(PATIENCE_S) == 0
+        self._idle.append(former)
+        return former
+
+    def pause_s(self, router: ZenohSettings) -> float:
+        """Of a hand-over under load: for how long no vehicle was acknowledged [s]."""
+        began = self._journals.first_after(time.time())
+        self.hand_over(router)
+        self._journals.first_after(time.time())
+        return self._journals.pause(began)
+
+    def map_difference(self, router: ZenohSettings, parts: list[Part]) -> float:
+        """Of a hand-over while nothing is sent: the largest difference of what both know, as their checkpoints have it;
+        infinite where it is no number."""
+        for part in parts:
+            part.send(signal.SIGSTOP)
+        time.sleep(SETTLED_S)
+        former = self.hand_over(router)
+        mine = self.serving.root / CHECKPOINTS
+        last = max(path.name for path in (former.root / CHECKPOINTS).glob("*-*"))
+        until(lambda: any(path.name > last for path in mine.glob("*-*")), PATIENCE_S)
+        both = [checkpoints.load(checkpoints.newest(host.root)[0]) for host in (former, self.serving)]
+        for part in parts:
+            part.send(signal.SIGCONT)
+        return difference(both[0].tables, both[1].tables)
+
+    def leave(self) -> list[Host]:
+        """One after the other takes over, and stops; each machine has then seen all of it."""
+        seen = []
+        everybody = len(self.waiting) + len(self._idle)
+        for left in range(everybody, -1, -1):
+            self.ready(1 if left else 0)
+            assert self.serving.part.stop() == 0
+            seen.append(self.serving)
+            if left:
+                self._taken()
+        return seen
+
+
+def _lives(host: Host) -> Host:
+    assert host.part.alive, f"it ended; see {host.part.log}"
+    return host
+
+
+def _was_amid(host: Host, what: str) -> bool:
+    said = [line for line in host.part.lines() if line in (f"{what} {BEGINS}", f"{what} {ENDS}")]
+    return bool(said) and said[-1].endswith(BEGINS)
+
+
+def difference(one: dict[str, pa.Table], other: dict[str, pa.Table]) -> float:
+    """Of numbers with a fraction the largest; infinite if anything else is not the same."""
+    worst = 0.0
+    if one.keys() != other.keys():
+        return float("inf")
+    for name, table in one.items():
+        for column in table.column_names:
+            ours, theirs = table[column], other[name][column]
+            if pa.types.is_floating(ours.type) and len(ours) == len(theirs):
+                apart = np.abs(np.asarray(ours.to_numpy()) - np.asarray(theirs.to_numpy()))
+                worst = max(worst, float(np.nanmax(apart, initial=0.0)))
+            elif not ours.equals(theirs):
+                return float("inf")
+    return worst
+
+
+def drained(parts: list[Part]) -> None:
+    """No new observations; wait until all are acknowledged, or nothing comes any more."""
+    for part in parts:
+        part.send(signal.SIGUSR1)
+    with suppress(TimeoutError):
+        until(lambda: not any(part.alive for part in parts), PATIENCE_S)

@@ -1,0 +1,43 @@
+"""What systemd hears of a service: signs of life, until something hangs beside its worker."""
+
+from __future__ import annotations
+
+import socket
+import time
+from contextlib import closing, suppress
+from pathlib import Path
+
+import pytest
+
+from fleet_service.app import service
+from schemas.config import ZenohSettings
+from tests.fleet_service.conftest import running
+from tests.waiting import until
+
+LIFE = b"READY=1\nWATCHDOG=1"
+SAID = "no sign of life is given: a tile of an answer is being made for "
+
+
+def test_signs_of_life_end_with_a_reason_when_an_answer_hangs(
+    router: ZenohSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with closing(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        monkeypatch.setattr(service, "STATUS_S", 0.02)
+        with running(router, tmp_path / "archive") as run:
+            assert [manager.recv(64) for _ in range(3)] == [LIFE] * 3
+            run.service._replies._busy_since = time.monotonic() - 2 * service.HANGS_S
+
+            def said() -> int:
+                return sum(line.startswith(SAID) for line in run.lines)
+
+            until(said)
+            manager.setblocking(False)
+            with suppress(BlockingIOError):  # what came before
+                while manager.recv(64):
+                    pass
+            before = said()
+            until(lambda: said() > before + 2)
+            with pytest.raises(BlockingIOError):
+                manager.recv(64)

@@ -1,0 +1,83 @@
+"""Errors drawn from what was driven: of the same vehicle, on a like road, scaled to the town's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fleet_service.lab import models, resampled, town
+from fleet_service.lab.agent import Errors, SimulatedReports
+from fleet_service.lab.resampled import DrivenVisits, TrueVisits
+from schemas import mugrid
+from schemas.numeric import FloatArray, IntArray
+from schemas.thresholds import NS
+
+VEHICLES, MINUTES = 4, 6
+
+
+def visits_on(mu: FloatArray, vehicle: IntArray, low: FloatArray) -> DrivenVisits:
+    """Excited and gentle visits in turn, of vehicles that read `low` times the road, (vehicles,)."""
+    excited = np.arange(len(mu)) % 2 == 1
+    reading = mu * low[vehicle]
+    reports = SimulatedReports(
+        reading, 0.05 * mu, 0.5 * mu, np.zeros(len(mu), np.int64),
+        -0.5 * np.square((mugrid.CENTRES - reading[:, None]) / 0.05),
+    )  # fmt: skip
+    return DrivenVisits(vehicle, mu, excited, reports)
+
+
+def a_town(seed: int) -> tuple[town.Visits, np.random.Generator]:
+    rng = np.random.default_rng(seed)
+    return town.drive(rng, town.build(rng, MINUTES, 0.0), Errors.draw(rng, VEHICLES), MINUTES), rng
+
+
+def test_a_town_s_vehicle_is_one_of_the_ways_and_its_reports_are_of_the_town_s_road() -> None:
+    visits, rng = a_town(1)
+    low = np.array([0.7, 0.8, 0.9, 1.0, 1.1])
+    mu = np.tile(np.geomspace(0.05, 1.2, 80), len(low))
+    ways = visits_on(mu, np.repeat(np.arange(len(low)), 80), low)
+    found = resampled.drawn(rng, visits, ways, VEHICLES)
+    ratio = found.reports.reading / found.mu
+    kept = [np.unique(np.round(ratio[found.vehicle == vehicle], 6)) for vehicle in range(VEHICLES)]
+    assert all(len(of) == 1 for of in kept)  # what persists in a vehicle does in the town
+    assert len({float(of[0]) for of in kept}) == VEHICLES
+    assert found.reports.used == pytest.approx(0.5 * visits.mu)
+    inside = (found.reports.reading > 0.2) & (found.reports.reading < 1.1)
+    most = mugrid.CENTRES[found.reports.log_likelihood.argmax(axis=1)]
+    assert np.abs(most - found.reports.reading)[inside].max() < mugrid.CENTRES[1] - mugrid.CENTRES[0]
+
+
+def test_where_a_vehicle_never_was_on_such_a_road_another_s_visit_is_drawn() -> None:
+    visits, rng = a_town(2)
+    visits = replace(visits, mu=np.full(len(visits), 0.15))
+    mu = np.repeat([0.15, 0.9], 40)
+    ways = visits_on(mu, (mu > 0.5).astype(np.int64), np.array([1.0, 0.5]))
+    found = resampled.drawn(rng, visits, ways, VEHICLES)
+    assert found.reports.reading == pytest.approx(np.full(len(visits), 0.15))
+
+
+def test_the_truth_of_a_visit_is_where_its_vehicle_was_then() -> None:
+    truth = TrueVisits(
+        np.array([0, 0, 1]), np.array([0, 10, 0]) * NS, np.array([0.9, 0.2, 0.5]), np.array([0.1, 0.9, 0.7])
+    )
+    nan = np.full(4, np.nan, np.float32)
+    found = resampled.driven({
+        "vehicle": np.array([1, 0, 0, 0]), "enter_time": np.array([5, 0, 8, 11]) * NS,
+        "leave_time": np.array([6, 4, 16, 12]) * NS, "mu": np.array([np.nan, 0.8, 0.3, 0.2], np.float32),
+        "mu_lower": nan, "mu_upper": nan, "mu_utilised": nan, "used_longitudinal": nan, "used_lateral": nan,
+        "log_likelihood": np.zeros((4, mugrid.BINS), np.uint8),
+    }, truth)  # fmt: skip
+    assert found.mu.tolist() == [0.5, 0.9, 0.2, 0.2]
+    assert found.excited.tolist() == [True, False, True, True]
+
+
+def test_vehicles_of_two_ways_are_different_ones() -> None:
+    way = visits_on(np.full(4, 0.5), np.array([0, 0, 2, 2]), np.ones(3))
+    assert resampled.joined([way, way]).vehicle.tolist() == [0, 0, 2, 2, 3, 3, 5, 5]
+
+
+def test_nothing_is_said_of_a_fleet_that_was_never_excited() -> None:
+    way = visits_on(np.full(4, 0.5), np.zeros(4, np.int64), np.ones(1))
+    assert models.measure_real(way._replace(excited=np.zeros(4, bool)), range(1)) == {}

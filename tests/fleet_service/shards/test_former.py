@@ -1,0 +1,70 @@
+"""What a service that was followed still puts: it takes the place of nothing that its successor put."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fleet_service.archive import witnesses
+from fleet_service.archive.witnesses import Witnesses
+from fleet_service.fusion import Fusion
+from fleet_service.ingest.weather import WeatherInbox, WeatherMessage, gather
+from fleet_service.ingest.weather import archived as archived_weather
+from schemas import keys, weather, wire
+from tests.buckets import BucketServer, bucket_server
+from tests.fleet_service.shards.test_successor import Machine
+from tests.standbys import restored
+
+
+@pytest.fixture
+def bucket(tmp_path: Path) -> Iterator[BucketServer]:
+    pytest.importorskip("obstore", reason="pip install 'gripmap[objects]'")
+    with bucket_server(tmp_path / "objects") as server:
+        yield server
+
+
+def test_what_a_former_holder_puts_late_takes_the_place_of_nothing(bucket: BucketServer, tmp_path: Path) -> None:
+    month, known = "2026-11", dict[int, int]()
+
+    def meets(one: Machine, pseudonym: int) -> None:
+        list_ = Witnesses(one.root / "keys")
+        known[pseudonym] = list_.of(f"car-{pseudonym}", month, pseudonym)
+        list_.sync()
+
+    def hears(one: Machine, region: int) -> None:
+        inbox = WeatherInbox(one.root, one.config.name, fusion, Counter())
+        report = weather.encode(weather.Report(time.time_ns(), precipitation=1.0))
+        inbox.enqueue(WeatherMessage(keys.weather_key(region), report, wire.WEATHER_ENCODING))
+        assert inbox.take(time.time_ns()) is not None
+
+    fusion = Fusion(120.0)
+    one = Machine(tmp_path / "one", bucket)
+    for number in (1, 2):
+        meets(one, number)
+        hears(one, number)
+    one.copy.settle([])
+    one.copy.follow()
+    one.freeze()
+    two = Machine(tmp_path / "two", bucket)
+    for number in (3, 4):
+        meets(two, number)
+        hears(two, number)
+    gather(two.root)
+    two.copy.settle([])
+    two.copy.follow()
+    known_there = dict(known)
+    meets(one, 5)  # the frozen one wakes
+    gather(one.root)
+    one.copy.settle([])
+    one.copy._may, one.copy._alone = lambda: True, None  # as if it had been frozen right behind its looks
+    one.copy.follow()
+    found = restored(tmp_path / "new", bucket)
+    held = witnesses.read(found / "keys")
+    assert {name: held.get(name) for name in known_there} == known_there
+    assert set(archived_weather(found).region.tolist()) == {1, 2, 3, 4}
+    two.close()
+    one.close()

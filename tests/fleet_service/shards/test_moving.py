@@ -1,0 +1,145 @@
+"""A region goes from one service to another, live: map, alerts, trust and batches go along."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from fleet_service.app.service import Service
+from fleet_service.archive.bucket import ObjectBucket
+from fleet_service.cli import main
+from fleet_service.shards.holding import hold
+from fleet_service.shards.lease import Lease
+from fleet_service.shards.serving import standing_by
+from schemas.config import ServiceConfig, ZenohSettings
+from tests.buckets import BucketServer, bucket_server
+from tests.fleet_service.app.test_copy import BATCHES, known, reports
+from tests.fleet_service.app.test_service import Fleet
+from tests.fleet_service.shards.test_successor import driven
+from tests.waiting import until
+
+PATIENCE_S = 120.0
+EVERYWHERE = "*/*/*"
+
+
+@pytest.fixture
+def bucket(tmp_path: Path) -> Iterator[BucketServer]:
+    pytest.importorskip("obstore", reason="pip install 'gripmap[objects]'")
+    with bucket_server(tmp_path / "objects") as server:
+        yield server
+
+
+class Machine:
+    """A service with --standby, in threads of this process."""
+
+    def __init__(self, name: str, router: ZenohSettings, bucket: BucketServer, root: Path) -> None:
+        archive = {"path": str(root), **bucket.settings}
+        told = {"name": name, "zenoh": router, "standby": True, "lease_s": 10.0, "archive": archive, "segment_s": 0.1}
+        self._config, self._root = ServiceConfig.model_validate(told), root
+        self.lines: list[str] = []
+        self.stop = threading.Event()
+        self.service: Service | None = None
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def start(self, awaited: str) -> None:
+        self._thread.start()
+        until(lambda: self.said(awaited), PATIENCE_S)
+
+    def said(self, start: str) -> bool:
+        return any(line.startswith(start) for line in self.lines)
+
+    def end(self) -> Service:
+        self._thread.join(PATIENCE_S)
+        assert not self._thread.is_alive()
+        assert self.service is not None
+        return self.service
+
+    def _run(self) -> None:
+        with standing_by(self._config, self.stop) as signs:
+            holding = hold(self._config, self._root, self.stop, self.lines.append, signs)
+        if holding is not None:
+            self.service = Service(self._config, self._root, self.lines.append, holding)
+            self.service.run(self.stop)
+
+
+@contextmanager
+def machines(router: ZenohSettings, bucket: BucketServer, folder: Path, *names: str) -> Iterator[list[Machine]]:
+    with ExitStack() as stack:
+        made = [Machine(name, router, bucket, folder / name) for name in names]
+        for one in made:
+            stack.callback(one.stop.set)
+        yield made
+
+
+def test_a_region_is_handed_over_with_all_that_was_known(
+    router: ZenohSettings,
+    session: zenoh.Session,
+    bucket: BucketServer,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    fleet, sent = Fleet(session), reports(0.15, 1, BATCHES)
+    connect = ["--connect", router.connect[0]]
+    with machines(router, bucket, tmp_path, "north-a", "north-b") as (one, two):
+        one.start("ready: ")
+        two.start("standby: north-a ")
+        until(driven(fleet, sent), PATIENCE_S)
+        assert main(["hand-over", EVERYWHERE, "--to", "north-b", *connect]) == 0
+        told = capsys.readouterr().out.splitlines()
+        assert told[0] == f"north-a hands over {EVERYWHERE}"
+        assert told[1].startswith(f"north-b serves {EVERYWHERE}; nobody did for ")
+        former = one.end()
+        assert former.exit_code == 0
+        until(lambda: two.said("ready: "), PATIENCE_S)
+        assert two.service is not None
+        engine = two.service.engine
+        assert engine.alerts > 0
+        expected, found = known(former.engine), known(engine)
+        assert expected.keys() == found.keys()
+        assert [name for name in expected if not found[name].equals(expected[name])] == []
+        again = Fleet(session)  # what comes again is known there
+        until(driven(again, sent), PATIENCE_S)
+        assert engine.counts["duplicates"] >= len(sent)
+        config = tmp_path / "config.json"
+        config.write_text(json.dumps({"zenoh": router.model_dump()}))
+        assert main(["hand-over", EVERYWHERE, "--to", "north-b", "--config", str(config)]) == 0
+        assert f"north-b serves {EVERYWHERE} already" in capsys.readouterr().out
+        two.stop.set()
+        assert two.end().exit_code == 0
+
+
+def test_a_region_stays_where_nobody_stands_by_for_it(
+    router: ZenohSettings, bucket: BucketServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["hand-over", EVERYWHERE, "--connect", router.connect[0], "--to"]
+    assert main([*words, "north-b"]) == 2
+    assert f"error: region: nobody serves {EVERYWHERE}" in capsys.readouterr().err
+    with machines(router, bucket, tmp_path, "north-a") as (one,):
+        one.start("ready: ")
+        assert main([*words, "north-b"]) == 2
+        assert "error: to: no 'north-b' stands by, not for */*/*; start it with --standby" in capsys.readouterr().err
+        assert not one.said("handing over: ")
+        one.stop.set()
+        one.end()
+
+
+def test_what_is_given_free_for_one_is_left_alone_by_others_for_a_while(bucket: BucketServer) -> None:
+    store = ObjectBucket(bucket.url, bucket.store, 5.0)
+    lease_s = 3.0
+    one, two, three = (Lease(name, store, name, lease_s) for name in ("one", "two", "three"))
+    assert one._take(None, lambda: 0, threading.Event())
+    one.end("two")
+    stop = threading.Event()
+    threading.Timer(lease_s / 3, stop.set).start()
+    assert not three.wait(stop, print, lambda: 0, None)
+    assert two.wait(threading.Event(), print, lambda: 0, None)
+    assert two.former == ("one",)
+    two.end("one")
+    assert three.wait(threading.Event(), print, lambda: 0, None)  # in the end anybody may
+    assert three.former == ("one", "two")
