@@ -9,13 +9,17 @@ The names of `__all__` are what other programs may rely on; they are loaded when
 
 from __future__ import annotations
 
+import gripmap  # noqa: F401 says which other package hides one of ours, where one does
 from schemas.runtime import face
 
 _FACE = {
     "ESTIMATORS": "edge_agent.estimators",
     "Estimates": "edge_agent.estimators",
     "EstimatorBank": "edge_agent.estimators",
+    "GripWarning": "schemas.wire.ahead",
+    "Lookout": "edge_agent.ahead.lookout",
     "Memberships": "edge_agent.adaptation.memberships",
+    "Pose": "edge_agent.ahead.path",
     "SignalLog": "edge_agent.inputs.signal_log",
     "Vehicle": "schemas.vehicle",
     "InputError": "schemas.errors",
@@ -28,6 +32,7 @@ _FACE = {
     "make_bank": "edge_agent.app.library",
     "plot": "edge_agent.app.library",
     "read_log": "edge_agent.app.library",
+    "read_route": "edge_agent.ahead.route_file",
     "simulate_manoeuvre": "edge_agent.lab.simulation",
     "to_table": "edge_agent.app.library",
 }

@@ -9,6 +9,7 @@ The names of `__all__` are what other programs may rely on; they are loaded when
 
 from __future__ import annotations
 
+import gripmap  # noqa: F401 says which other package hides one of ours, where one does
 from schemas.runtime import face
 
 _FACE = {

@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     """Drive until the duration has passed or a signal comes; write the truth before leaving."""
     from edge_agent.ahead.lookout import Lookout
     from edge_agent.app.estimates_file import writable
-    from edge_agent.cli.live import drive_live, warning_lines
+    from edge_agent.cli.live import drive_live, warm_up_simulation, warning_lines
     from edge_agent.lab.simulation import SimulatedFleet
     from edge_agent.lab.simulation.blocks import blocks
     from edge_agent.lab.simulation.listeners import WarnedDrivers
@@ -39,16 +39,19 @@ def run(args: argparse.Namespace) -> int:
     from schemas.config import AgentConfig, load
 
     config = load(args.config, AgentConfig)
+    if args.truth:
+        writable("truth", args.truth)
     fleet = SimulatedFleet(args.scenario, args.vehicles, args.seed, args.rate, rough=args.rough)
-    recorder = TruthRecorder(tuple(fleet.names)) if args.truth and writable("truth", args.truth) else None
+    warm_up_simulation(args.scenario, args.rate, args.rough)
+    recorder = TruthRecorder(tuple(fleet.names)) if args.truth else None
     source = blocks(fleet, args.rate, recorder)
     at_end = partial(recorder.write, args.truth) if recorder is not None else lambda: None
     drivers, lookout = WarnedDrivers(fleet, args.warned), None
     if drivers.warned.any():
-        said = warning_lines(config)
+        show = warning_lines(config)
 
         def tell(name: str, warning: GripWarning) -> None:
-            said(name, warning)
+            show(name, warning)
             drivers.hear(name, warning)
 
         lookout = Lookout(fleet.names, tell, drivers.route_of, drivers.listens)
