@@ -14,7 +14,7 @@ from edge_agent.adaptation.memberships import Memberships
 from edge_agent.ahead.lookout import Lookout
 from edge_agent.ahead.path import Pose
 from edge_agent.app.estimator_factory import bank_of
-from edge_agent.app.live_loop import ENDED_DRAIN_S, STOPPED_DRAIN_S, Progress, drive
+from edge_agent.app.live_loop import ENDED_DRAIN_S, STATUS_EVERY_S, STOPPED_DRAIN_S, Progress, drive
 from edge_agent.app.metrics import metrics, troubles
 from edge_agent.cli.common import leave, publisher_of, status, stop_on_signal
 from edge_agent.inputs.block import Block
@@ -97,7 +97,12 @@ def drive_live(
         pipeline = Pipeline(bank_of(chosen, vehicles, memberships), len(vehicles), config)
         publisher = publisher_of(names, config, chosen, opened)
         running.append(publisher)
-        report = partial(status, publisher=publisher, log_line=line_logger(config.log, sys.stderr))
+        log_line = line_logger(config.log, sys.stderr)
+        who = names[0] if len(names) == 1 else f"{len(names)} vehicles"
+        log_line(
+            Line(f"{who}: driving; a line of counts every {STATUS_EVERY_S:.0f} s", event="ready", vehicles=len(names))
+        )
+        report = partial(status, publisher=publisher, log_line=log_line)
         if lookout is not None:
             lookout.start()
         drive(

@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     with talk.busy("loading"):
         from edge_agent.cli.common import checked_name
         from edge_agent.cli.live import drive_live
-        from edge_agent.inputs.live.sources import is_live
+        from edge_agent.inputs.live.sources import KINDS, is_live
         from schemas.config import AgentConfig, load
         from schemas.errors import InputError
         from schemas.runtime import plugins
@@ -64,17 +64,18 @@ def run(args: argparse.Namespace) -> int:
     sources = args.source or [SIMULATED]
     if all(is_live(source) for source in sources):
         return _live(args, sources, config)
-    if len(sources) == 1 and (kind := sources[0].partition(":")[0]) in plugins.found(plugins.SOURCES):
-        vehicle = load_vehicle(_vehicle_file(args))
-        name = args.name or vehicle.name
-        blocks = plugins.loaded(plugins.SOURCES, kind)(sources[0].partition(":")[2])
-        return drive_live(
-            [vehicle], [checked_name(name)], blocks, config, args.estimator, args.duration,
-            lookout=_lookout(args, name, config), vss=_vss(args, name, config), memberships=memberships_of(args),
-        )  # fmt: skip
     if len(sources) > 1:
         raise InputError("source", f"{', '.join(sources)} do not go together", "name live ones, or one log")
-    vehicle, name, blocks = _simulated(args) if sources[0] == SIMULATED else _logged(args, Path(sources[0]))
+    kind, colon, address = sources[0].partition(":")
+    others = plugins.found(plugins.SOURCES)
+    if kind in others:
+        vehicle = load_vehicle(_vehicle_file(args))
+        name, blocks = args.name or vehicle.name, plugins.loaded(plugins.SOURCES, kind)(address)
+    elif colon and not Path(sources[0]).exists():
+        known = ", ".join(sorted([*KINDS, *others]))
+        raise InputError("source", f"{sources[0]!r} is no file, and {kind!r} no kind of source", f"kinds are {known}")
+    else:
+        vehicle, name, blocks = _simulated(args) if kind == SIMULATED else _logged(args, Path(sources[0]))
     return drive_live(
         [vehicle], [checked_name(name)], blocks, config, args.estimator, args.duration,
         lookout=_lookout(args, name, config), vss=_vss(args, name, config), memberships=memberships_of(args),

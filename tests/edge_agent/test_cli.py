@@ -19,6 +19,7 @@ from edge_agent.cli import COMMANDS, main
 from edge_agent.estimators import ESTIMATORS
 from edge_agent.lab.simulation import MANOEUVRES
 from schemas import tables
+from schemas.runtime import plugins
 from schemas.vehicle import load_vehicle
 from schemas.wire import Kind
 from tests.edge_agent.fakes import BAD_LOGS
@@ -165,6 +166,29 @@ def test_run_drives_a_log_in_real_time_and_publishes_it(
     assert reported["unsettled"] == 0
 
 
+def test_run_drives_with_the_source_of_another_distribution(
+    drive: Path, tmp_path: Path, router: Router, service: Service, capsys: Output, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    about = tmp_path / "their_source-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: their-source\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[gripmap.sources]\ntheirs = their_source:blocks\n")
+    (tmp_path / "their_source.py").write_text(
+        "import time, pathlib\nfrom edge_agent import read_log\n"
+        "blocks = lambda address: read_log(pathlib.Path(address)).blocks(time.time_ns(), 10)\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(plugins, "found", plugins.found.__wrapped__)  # what is installed was looked up before
+    source = ["--source", f"theirs:{drive / 'log.parquet'}", "--vehicle", str(drive / "vehicle.json")]
+    words = ["run", *source, "--estimator", "ckf", "--duration", "1", *config(tmp_path, router)]
+    assert main([*words, "--name", "car-three"]) == 0
+    reported = counts(capsys)
+    assert reported["acknowledged"] == reported["published"] == sum(b.rows for b in service.batches) >= 3
+    assert main([*words[:2], "no-such:address", *words[3:]]) == 2
+    assert "source: 'no-such:address' is no file, and 'no-such' no kind of source" in (line := capsys.readouterr().err)
+    assert "kinds are can, gpsd, ros2, theirs, vss" in line
+
+
 def test_fleet_gives_each_vehicle_its_name_and_writes_what_is_true(
     tmp_path: Path, router: Router, service: Service, capsys: Output
 ) -> None:
@@ -207,7 +231,9 @@ def test_what_a_killed_agent_had_stored_is_sent_by_the_next(
     service.answer = True
     service.batches.clear()
     assert main([*options, "--duration", "0.5"]) == 0
-    assert counts(capsys)["unsettled"] == 0
+    seen = capsys.readouterr()
+    assert "driving; a line of counts every 5 s" in seen.err, "the first of them comes after five seconds"
+    assert json.loads(seen.out.splitlines()[-1])["unsettled"] == 0
     assert earlier <= set(service.identities())
 
 
