@@ -36,6 +36,7 @@ def test_agent_and_service_settle_and_leave(there: Stage, number: signal.Signals
     assert any(line.startswith(("status: ", "left at last")) for line in there.service.lines())
 
 
+@pytest.mark.campaign
 def test_agent_and_service_leave_a_frozen_router_behind_and_lose_nothing(there: Stage) -> None:
     (load,) = there.loads
     there.router.send(signal.SIGSTOP)

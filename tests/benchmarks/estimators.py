@@ -25,7 +25,7 @@ def estimators() -> list[Figure]:
 
     one, many = drive(1, len(t)), drive(200, 100)
     return [
-        Figure("bench.aco_fckf.us", one, "us per vehicle-step of the default, N = 1", 40),
+        Figure("bench.aco_fckf.us", one, "us per vehicle-step of the default, N = 1", 25),
         Figure("bench.aco_fckf.flatness", many / one, "N = 200 over N = 1", 1.2),
         Figure("bench.replay.real_time", 1e6 / (100 * one), "times real time at 100 Hz"),
     ]

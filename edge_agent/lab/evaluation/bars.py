@@ -48,6 +48,11 @@ def in_the_world(name: str) -> Callable[[Results], float]:
     return lambda results: results.world.get(DEFAULT, {}).get(name, math.nan)
 
 
+def worth_of(name: str) -> Callable[[Results], float]:
+    """Interval score with over without fuzzy inference, or with what the colony found over what chance found."""
+    return lambda results: worth.ratio(results.worth, name)
+
+
 def mean(values: FloatArray | None) -> float:
     """Mean; NaN of nothing."""
     return math.nan if values is None or not len(values) else float(np.mean(values))
@@ -110,7 +115,7 @@ BARS: Final = (
     EstimatorBar("real_world.coverage90", in_the_world("coverage90"), SHARE, 0.88, "more"),
     *(
         EstimatorBar(f"real_world.coverage90.{name}", in_the_world(f"coverage90.{name}"), SHARE, 0.80, "more")
-        for name in SURFACES
+        for name in (*SURFACES, "excited")
     ),
     EstimatorBar("real_world.width", in_the_world("width"), SHARE, 0.5, "less"),
     *(
@@ -123,6 +128,8 @@ BARS: Final = (
         )
         for name in SURFACES
     ),
+    EstimatorBar("fuzzy.worth", worth_of("fuzzy.worth"), SHARE, 0.97, "less"),
+    EstimatorBar("ants.worth", worth_of("ants.worth"), SHARE, 1.0, "less"),
 )
 
 UNITS: Final = {

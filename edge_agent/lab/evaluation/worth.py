@@ -12,6 +12,7 @@ Each seed is a town of rough cars and a set of rough manoeuvres on hills, with f
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -34,7 +35,7 @@ ESTIMATOR: Final = "aco-fckf"
 CARS, TOWN_S, DRIVE_S, SEEDS = 8, 60.0, 8.0, 5
 RATE_HZ: Final = 100.0
 SETTLED_S: Final = 1.0  # before, the score is that of the prior
-BARS: Final = {"fuzzy.worth": ("fuzzy", "none", 0.97), "ants.worth": ("colony", "random", 1.0)}
+RATIOS: Final = {"fuzzy.worth": ("fuzzy", "none"), "ants.worth": ("colony", "random")}
 MANOEUVRES: Final = (
     "double-lane-change", "slalom", "sine", "acceleration", "braking", "constant-radius", "pulses", "j-turn",
 )  # fmt: skip
@@ -101,21 +102,25 @@ def _scored(batches: Sequence[DriveSet], memberships: Memberships, *, adaptive: 
     return found
 
 
+def ratio(scores: Scores, name: str) -> float:
+    """Mean interval score of a way over that of another, over all seeds; NaN where one of them was not measured."""
+    over, under = (scores.get(way) for way in RATIOS[name])
+    return float(over["all"].mean() / under["all"].mean()) if over and under else math.nan
+
+
 def figures(scores: Scores) -> list[Figure]:
-    """The two worths with their bars, their spread over the seeds, per surface; then every score."""
+    """The spread of each ratio over the seeds, and the ratios per surface; then every score."""
     listed = []
-    for name, (over, under, bar) in BARS.items():
-        if over not in scores or under not in scores:
+    for name, (over, under) in RATIOS.items():
+        if not {over, under} <= set(scores):
             continue
-        ratio = {key: scores[over][key] / scores[under][key] for key in scores[over]}
-        whole = float(scores[over]["all"].mean() / scores[under]["all"].mean())
-        listed.append(Figure(name, whole, "1", bar, "less"))
-        if len(ratio["all"]) > 1:
-            listed.append(Figure(f"{name}.sd", float(np.std(ratio["all"], ddof=1)), "1"))
+        ratios = {key: scores[over][key] / scores[under][key] for key in scores[over]}
+        if len(ratios["all"]) > 1:
+            listed.append(Figure(f"{name}.sd", float(np.std(ratios["all"], ddof=1)), "1"))
         listed += [
-            Figure(f"{name}.{key}", float(np.nanmean(ratio[key])), "1")
-            for key in ratio
-            if key != "all" and _met(ratio[key])
+            Figure(f"{name}.{key}", float(np.nanmean(found)), "1")
+            for key, found in ratios.items()
+            if key != "all" and _met(found)
         ]
     for way, found in scores.items():
         listed += [Figure(f"worth.{way}.{key}", float(np.nanmean(v)), "1") for key, v in found.items() if _met(v)]

@@ -36,6 +36,7 @@ def settings(folder: Path, router: Router) -> list[str]:
     return ["--config", str(path)]
 
 
+@pytest.mark.campaign
 def test_a_car_that_listens_prints_its_warnings_and_heeds_its_route(
     router: Router, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -63,6 +64,7 @@ def test_a_route_without_listening_is_a_mistake(tmp_path: Path, capsys: pytest.C
     assert "route: is of no use without --ahead" in capsys.readouterr().err
 
 
+@pytest.mark.campaign
 def test_of_a_fleet_the_share_that_is_warned_hears_and_the_others_do_not(
     router: Router, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -42,6 +42,7 @@ def test_what_a_peer_sends_comes_in_without_a_sample_lost(kind: str, tmp_path: P
     assert lost(kind, tmp_path, 1.0) == (0, 100)
 
 
+@pytest.mark.campaign
 def test_the_values_of_every_peer_are_those_that_were_sent(tmp_path: Path) -> None:
     for kind in COUNTED:
         place, source = addresses(kind)
@@ -64,6 +65,7 @@ def test_the_values_of_every_peer_are_those_that_were_sent(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("kind", [*COUNTED, "gpsd"])
+@pytest.mark.campaign
 def test_a_source_that_was_killed_is_heard_again_when_it_is_back(kind: str, tmp_path: Path) -> None:
     place, source = addresses(kind)
     name, dbc = written("can" if kind == "gpsd" else kind, tmp_path)

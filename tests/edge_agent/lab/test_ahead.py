@@ -45,6 +45,7 @@ def test_cars_that_come_to_ice_are_counted_and_warned() -> None:
     assert deaf.came == 4, "who comes from snow is on it already"
 
 
+@pytest.mark.campaign
 def test_warnings_are_timed_over_a_real_router() -> None:
     figures = {figure.name: figure.value for figure in latency.figures(1, 5, 3)}
     assert figures["ahead.latency.unwarned"] == 0

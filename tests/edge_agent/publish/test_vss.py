@@ -78,6 +78,7 @@ def test_it_is_put_where_somebody_listens_as_it_is_printed(router: Router) -> No
     assert names(json.loads(heard[0]))["MostProbable"] == 30.0
 
 
+@pytest.mark.campaign
 def test_the_command_prints_lines_of_the_drive(
     router: Router, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -50,6 +50,7 @@ def counted(days: list[FloatArray]) -> pa.Table:
 NAMES = ("pairs", "unlike", "slippery", "seconds")
 
 
+@pytest.mark.campaign
 def test_the_interval_holds_as_often_as_it_says_when_days_differ() -> None:
     """Days of very unlike rates, mean RATE: the pairs of a day are no independent witnesses."""
     held, trials = 0, 20

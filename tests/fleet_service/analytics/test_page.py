@@ -64,6 +64,7 @@ def test_what_was_not_measured_has_no_colour_of_the_scale(tmp_path: Path) -> Non
         assert "0.15 ice" in found.page.locator("#ticks").inner_text()
 
 
+@pytest.mark.campaign
 def test_pointing_tapping_and_the_keyboard_read_a_cell(tmp_path: Path) -> None:
     path = tmp_path / "page.html"
     path.write_text(render("one", cells([0.2]), GRIP_SCALE))

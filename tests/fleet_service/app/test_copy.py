@@ -158,6 +158,7 @@ def drive(fleet: Fleet, sent: list[Batch]) -> bool:
 
 
 @pytest.mark.parametrize("kind", ["stopped", "frozen"])
+@pytest.mark.campaign
 def test_a_bucket_goes_and_comes_back_and_nothing_is_lost_or_doubled(
     router: ZenohSettings, session: zenoh.Session, bucket: BucketServer, tmp_path: Path, kind: str
 ) -> None:
@@ -180,6 +181,7 @@ def test_a_bucket_goes_and_comes_back_and_nothing_is_lost_or_doubled(
 
 
 @pytest.mark.parametrize("kind", ["stopped", "frozen"])
+@pytest.mark.campaign
 def test_a_service_killed_between_disk_and_bucket_loses_and_doubles_nothing(
     router: ZenohSettings, session: zenoh.Session, bucket: BucketServer, tmp_path: Path, kind: str
 ) -> None:
@@ -205,6 +207,7 @@ def test_a_service_killed_between_disk_and_bucket_loses_and_doubles_nothing(
 
 
 @pytest.mark.parametrize("beside", [True, False])
+@pytest.mark.campaign
 def test_an_erased_vehicle_leaves_the_bucket_too(
     router: ZenohSettings, session: zenoh.Session, bucket: BucketServer, tmp_path: Path, beside: bool
 ) -> None:

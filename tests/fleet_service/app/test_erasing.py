@@ -64,6 +64,7 @@ def shown(session: zenoh.Session) -> dict[int, int]:
     return found
 
 
+@pytest.mark.campaign
 def test_a_vehicle_is_erased_while_the_service_runs_and_others_drive_on(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path
 ) -> None:

@@ -32,6 +32,7 @@ from tests.fleet_service.examples import batch, key
 from tests.waiting import until
 
 
+@pytest.mark.campaign
 def test_a_running_service_compacts_and_keeps_every_row_once(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path
 ) -> None:

@@ -69,6 +69,7 @@ def test_what_would_read_too_much_is_refused_and_a_narrower_box_is_not(
 
 
 @pytest.mark.parametrize("group", [1, 7, 400])
+@pytest.mark.campaign
 def test_a_filter_finds_the_same_rows_however_they_are_grouped(
     root: Path, monkeypatch: pytest.MonkeyPatch, group: int
 ) -> None:

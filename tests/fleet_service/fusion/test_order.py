@@ -50,6 +50,7 @@ def difference(a: Fusion, b: Fusion) -> float:
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 40))
+@pytest.mark.campaign
 def test_any_order_within_the_window_gives_the_same_beliefs(seed: int, parts: int) -> None:
     o = drive(seed, 400, 900.0)
     straight, _ = fold_in(o, np.arange(400), 400)

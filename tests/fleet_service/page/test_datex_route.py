@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import pytest
 import zenoh
 
 from fleet_service.client.datex import Supplier
@@ -97,6 +98,7 @@ def pull(address: str) -> Callable[[], bytes]:
     return pulled
 
 
+@pytest.mark.campaign
 def test_silence_of_a_service_that_went_ends_nothing(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path
 ) -> None:

@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
+import pytest
+
 from fleet_service.archive import snapshots
 from fleet_service.page import colours
 from schemas import grid
@@ -228,6 +230,7 @@ def test_a_service_that_went_is_said_and_its_region_is_not_emptiness(page: Runni
         look(seen, "away")
 
 
+@pytest.mark.campaign
 def test_silence_of_the_server_is_seen_by_the_pages_own_clock(page: RunningPage) -> None:
     with shown(page) as seen:
         waits(seen, "gripmap.live.state")
@@ -235,6 +238,7 @@ def test_silence_of_the_server_is_seen_by_the_pages_own_clock(page: RunningPage)
         waits(seen, "document.getElementById('live').textContent.startsWith('○ last heard')")
 
 
+@pytest.mark.campaign
 def test_the_slider_shows_a_known_cell_as_it_was_and_two_moments_side_by_side(page: RunningPage, drive: Drive) -> None:
     drive("snow")
     until(lambda: kept(page.archive))
@@ -317,6 +321,7 @@ _FITTED: Final = """(() => {
 })()"""
 
 
+@pytest.mark.campaign
 def test_a_link_holds_the_whole_state(page: RunningPage, drive: Drive) -> None:
     drive("ice")
     with shown(page) as seen:

@@ -31,6 +31,7 @@ _DROP: Final = """text => {
 }"""
 
 
+@pytest.mark.campaign
 def test_a_night_is_played_moment_by_moment_and_ends_now(page: RunningPage, drive: Drive) -> None:
     drive("snow")
     until(lambda: kept(page.archive))

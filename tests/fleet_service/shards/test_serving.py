@@ -133,6 +133,7 @@ def test_answers_over_three_services_are_whole_in_order_and_say_what_is_missing(
             watcher.join(10.0)
 
 
+@pytest.mark.campaign
 def test_a_second_service_of_a_region_refuses_to_start(router: ZenohSettings, tmp_path: Path) -> None:
     wide = NAMES[1].rpartition("/")[0] + "/*"
 

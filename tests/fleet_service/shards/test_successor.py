@@ -180,6 +180,7 @@ def acknowledges(one: Machine) -> bool:
     return one.holding.may_acknowledge
 
 
+@pytest.mark.campaign
 def test_what_a_frozen_service_had_under_way_counts_for_nothing(bucket: BucketServer, tmp_path: Path) -> None:
     one = Machine(tmp_path / "one", bucket)
     for seed in range(3):
@@ -231,6 +232,7 @@ def test_a_folder_that_was_served_without_its_bucket_is_not_made_what_the_bucket
     assert len(rows_in(one.root, Kind.OBSERVATION)) == 5
 
 
+@pytest.mark.campaign
 def test_a_compaction_that_outlived_its_service_is_waited_for(
     bucket: BucketServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

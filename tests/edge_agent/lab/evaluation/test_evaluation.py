@@ -44,8 +44,9 @@ ASKED = {
     "real_world.standing_5pct.v_max": (0.2, "less"), "real_world.width": (0.5, "less"),
     "real_world.false_ice": (0.002, "less"), "real_world.below": (0.002, "less"),
     "real_world.coverage90": (0.88, "more"),
-    **{f"real_world.coverage90.{name}": (0.80, "more") for name in ("ice", "snow", "wet", "dry")},
+    **{f"real_world.coverage90.{name}": (0.80, "more") for name in ("ice", "snow", "wet", "dry", "excited")},
     **{f"real_world.contradiction_share.{name}.excited": (0.2, "less") for name in ("ice", "snow", "wet", "dry")},
+    "fuzzy.worth": (0.97, "less"), "ants.worth": (1.0, "less"),
 }  # fmt: skip
 
 
