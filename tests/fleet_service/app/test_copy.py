@@ -98,6 +98,20 @@ def test_a_service_starts_on_an_empty_disk_with_all_that_it_knew(
         assert len(segments.paths(new, Kind.OBSERVATION)) == len(segments.paths(root, Kind.OBSERVATION))
 
 
+def test_a_forgotten_month_stays_forgotten_where_only_the_bucket_is_left(bucket: BucketServer, tmp_path: Path) -> None:
+    root, config, sent = tmp_path / "archive", settings(bucket), reports(0.15, 1, 4)
+    with closing(Engine(config, root)) as engine:
+        take(engine, sent)
+        engine.flush()
+    file = tmp_path / "service.json"
+    file.write_text(json.dumps({"archive": {"path": str(root), **bucket.settings}}))
+    assert main(["forget", "--archive", str(root), "--period", MONTH, "--yes", "--config", str(file)]) == 0
+    with closing(Engine(config, tmp_path / "new")) as engine:
+        take(engine, sent)
+        assert engine.counts["refused.erased"] == len(sent)
+        assert engine.fusion.live.visits[: engine.fusion.size].sum() == 3 * len(sent), "the rows stay, nobody's"
+
+
 def test_nothing_is_acknowledged_by_an_engine_while_the_bucket_is_away(bucket: BucketServer, tmp_path: Path) -> None:
     sent = reports(0.7, 1, 2)
     with closing(Engine(settings(bucket), tmp_path / "archive")) as engine:
