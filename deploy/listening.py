@@ -62,7 +62,7 @@ class Drive:
     visits: int = 0  # that were fused
     alerts: int = 0  # on the new ice
     warnings: int = 0
-    told_error: list[tuple[float, float]] = field(default_factory=list)  # |error| in a known cell: with, without
+    known_error: list[tuple[float, float]] = field(default_factory=list)  # |error| in a known cell: with, without
 
 
 class ListeningTown:
@@ -169,9 +169,9 @@ class ListeningTown:
             path = route.ahead(pose, horizon_length(pose.speed)) if route is not None else None
             if path is None:
                 continue
-            self.active[k], told = warn(self.active[k], [look_ahead(path, self.heard, pose.time)], pose, self.heard)
-            self.drive.warnings += sum(one.state == "raised" for one in told)
-            for warning in told:
+            self.active[k], issued = warn(self.active[k], [look_ahead(path, self.heard, pose.time)], pose, self.heard)
+            self.drive.warnings += sum(one.state == "raised" for one in issued)
+            for warning in issued:
                 self.drivers.hear(self.fleet.names[k], warning)
         self.drivers.act()
 
@@ -180,16 +180,16 @@ class ListeningTown:
         if beliefs is None or seen is None:
             return
         key: IntArray = self.pipeline.places
-        told: dict[int, FloatArray | None] = {
+        map_beliefs: dict[int, FloatArray | None] = {
             k: self.heard.belief(int(key[k]), self._now()) if key[k] >= 0 else None for k in self.prior.enters(key)
         }
-        informed = self.prior.step(key, *beliefs, told)
+        informed = self.prior.step(key, *beliefs, map_beliefs)
         alone = np.exp(beliefs[0])
         truth = self.fleet.truth.mu_wheel[-1].mean(axis=1)
-        for k, belief in told.items():
+        for k, belief in map_beliefs.items():
             if belief is not None:
                 errors = [abs(float(mugrid.quantiles(p[k], 0.5)) - truth[k]) for p in (informed, alone)]
-                self.drive.told_error.append((errors[0], errors[1]))
+                self.drive.known_error.append((errors[0], errors[1]))
 
     def _on_ice(self, latitude: float, longitude: float) -> bool:
         x, y = self.fleet.scenario.from_latlon(np.array([latitude]), np.array([longitude]))
@@ -236,7 +236,7 @@ def measured(with_: list[Drive], without: list[Drive]) -> list[Figure]:
     """The figures of drives with and without listening."""
     slid, before = (sum(len({k for k, _ in drive.slid}) for drive in drives) for drives in (with_, without))
     laps, laps_before = (sum(len(drive.slid) for drive in drives) for drives in (with_, without))
-    errors = np.array([pair for drive in with_ for pair in drive.told_error]).reshape(-1, 2)
+    errors = np.array([pair for drive in with_ for pair in drive.known_error]).reshape(-1, 2)
     inside = [[row for drive in drives for row in drive.inside] for drives in (with_, without)]
     covered = [float(np.mean(rows)) if rows else float("nan") for rows in inside]
     alert_passes = [drive.alert_passes for drive in without if np.isfinite(drive.alert_passes)]

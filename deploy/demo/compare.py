@@ -167,10 +167,9 @@ class LostGrip:
 
     def line(self) -> str:
         """In words."""
-        told = [f"{int(self.lost[rows].sum())} of {int(rows.sum())}" for rows in (self.warned, ~self.warned)]
-        return (
-            f"Over the new ice, once it was known: {told[0]} warned drivers lost grip, {told[1]} who were not warned."
-        )
+        counts = [f"{int(self.lost[rows].sum())} of {int(rows.sum())}" for rows in (self.warned, ~self.warned)]
+        known = "Over the new ice, once it was known"
+        return f"{known}: {counts[0]} warned drivers lost grip, {counts[1]} who were not warned."
 
 
 def lost_grip(visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int, share: float) -> LostGrip:
@@ -194,9 +193,9 @@ def lost_grip(visits: pa.Table, alerts: list[tuple[int, Alert]], changed_ns: int
         before = rows.get((name, number))
         if before is None or (lost and not before[0]):
             rows[name, number] = (lost, cell)
-    told = np.array([warned[_number(name) - 1] for name, _ in rows], np.bool_)
+    warned_passes = np.array([warned[_number(name) - 1] for name, _ in rows], np.bool_)
     lost_, cell_ = (np.array([row[k] for row in rows.values()]) for k in (0, 1))
-    return LostGrip(told, lost_.astype(np.bool_), cell_.astype(np.int64))
+    return LostGrip(warned_passes, lost_.astype(np.bool_), cell_.astype(np.int64))
 
 
 def _number(vehicle: str) -> int:

@@ -87,10 +87,10 @@ class Tiles:
         late = [tile for tile, at in self._wanted.items() if pose.time - at > LEAVE_S * NS]
         by_age = sorted((at, tile) for tile, at in self._wanted.items() if tile not in late and tile not in wanted)
         surplus = len(self._wanted) - len(late) - MOST_TILES
-        gone = late + [tile for _, tile in by_age[: max(surplus, 0)]]
-        for tile in gone:
+        dropped = late + [tile for _, tile in by_age[: max(surplus, 0)]]
+        for tile in dropped:
             del self._wanted[tile]
-        return fresh, gone
+        return fresh, dropped
 
 
 def keys_of(box: Box) -> list[int]:

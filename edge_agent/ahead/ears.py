@@ -51,7 +51,7 @@ class Ears:
         self._subscribers: dict[int, Any] = {}
         self._routers: frozenset[str] = frozenset()
         self._again, self._answered = list[int](), False  # [ns] when to ask once more; since the router is there
-        self._told = session.declare_publisher(
+        self._publisher = session.declare_publisher(
             keys.ahead_key(vehicle), encoding=AHEAD_ENCODING, priority=getattr(zenoh.Priority, _TOPIC.priority),
             congestion_control=zenoh.CongestionControl.DROP,
         )  # fmt: skip
@@ -83,8 +83,8 @@ class Ears:
         """
         routers = frozenset(str(zid) for zid in self._session.info.routers_zid())
         back, self._routers = bool(routers - self._routers), routers
-        fresh, gone = self._tiles.follow([path.near(within) for path in paths], pose)
-        for tile in gone:
+        fresh, dropped = self._tiles.follow([path.near(within) for path in paths], pose)
+        for tile in dropped:
             self._subscribers.pop(tile).undeclare()
         for tile in fresh:
             self._subscribers[tile] = self._session.declare_subscriber(keys.alert_key(tile), self._on_alert)
@@ -108,8 +108,8 @@ class Ears:
 
     def tell(self, payload: Callable[[], bytes]) -> None:
         """Put what lies ahead on the vehicle's own key, if anybody listens."""
-        if self._told.matching_status.matching:  # type: ignore[attr-defined] # stub: bool
-            self._told.put(payload())
+        if self._publisher.matching_status.matching:  # type: ignore[attr-defined] # stub: bool
+            self._publisher.put(payload())
             self.counts["told"] += 1
 
     def close(self) -> None:
@@ -117,7 +117,7 @@ class Ears:
         for subscriber in self._subscribers.values():
             subscriber.undeclare()
         self._subscribers.clear()
-        self._told.undeclare()
+        self._publisher.undeclare()
 
     def _ask(self, box: Box) -> None:
         text = ",".join(f"{side:.6f}" for side in box)

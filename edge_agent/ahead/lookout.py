@@ -119,17 +119,17 @@ class Lookout:
         """
         if beliefs is None:
             return
-        told: dict[int, FloatArray | None] = {}
+        map_beliefs: dict[int, FloatArray | None] = {}
         for k in self._prior.enters(places):
             ears = self._watchers[k].ears if k in self._watchers else None
             if ears is None or places[k] < 0:
-                told[k] = None
+                map_beliefs[k] = None
             elif ears.looking().acquire(blocking=False):  # the loop does not wait: it asks again at the next block
                 try:
-                    told[k] = ears.known.belief(int(places[k]), time.time_ns())
+                    map_beliefs[k] = ears.known.belief(int(places[k]), time.time_ns())
                 finally:
                     ears.looking().release()
-        informed = self._prior.step(places, *beliefs, told)
+        informed = self._prior.step(places, *beliefs, map_beliefs)
         self._here = np.column_stack([mugrid.quantiles(informed, q) for q in (0.5, 0.05, 0.95)])
 
     def outlook(self, name: str) -> Outlook | None:
@@ -192,15 +192,16 @@ class Lookout:
         with ears.looking():
             paths = paths_ahead(pose, self._route_of(k), ears, length + FURTHER_M)
             horizons = [look_ahead(path.near(length), ears.known, pose.time) for path in paths]
-            watcher.active, told = warn(watcher.active, horizons, pose, ears.known)
+            watcher.active, issued = warn(watcher.active, horizons, pose, ears.known)
         watcher.places = frozenset(np.concatenate([path.places.ravel() for path in paths]).tolist())
         self.counts.looks += 1
-        for warning in told:
+        for warning in issued:
             self.counts.warnings += 1
             self._hear(watcher.name, warning)
-        ended = tuple(warning for warning in told if warning.state == "ended")
+        ended = tuple(warning for warning in issued if warning.state == "ended")
         watcher.outlook = Outlook(
-            watcher.name, pose.time, paths[0].kind, (*(one.told for one in watcher.active), *ended), runs(horizons[0]),
+            watcher.name, pose.time, paths[0].kind,
+            (*(one.warning for one in watcher.active), *ended), runs(horizons[0]),
             tuple(self._here[k].tolist()),
         )  # fmt: skip
         ears.follow(paths, pose, length)

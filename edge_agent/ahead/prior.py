@@ -55,7 +55,7 @@ class MapPrior:
         return np.flatnonzero(keys != self._key).tolist()
 
     def step(
-        self, keys: IntArray, own: FloatArray, visit: FloatArray, told: dict[int, FloatArray | None]
+        self, keys: IntArray, own: FloatArray, visit: FloatArray, map_beliefs: dict[int, FloatArray | None]
     ) -> FloatArray:
         """What the vehicles believe with the map's help, (N, 32) probabilities.
 
@@ -63,11 +63,11 @@ class MapPrior:
             keys: (N,) place that each is in, NOWHERE where it is unknown.
             own: (N, 32) log of the filter's posterior over uniform.
             visit: (N, 32) log-likelihood of the visit so far.
-            told: the map's belief for those who `enters`; None where it knows nothing.
+            map_beliefs: the map's belief for those who `enters`; None where it knows nothing.
         """
         now = _normal(np.exp(own))
         out = now.copy()
-        for k, belief in told.items():
+        for k, belief in map_beliefs.items():
             self._enter(k, int(keys[k]), belief)
         for k in [k for k, known in enumerate(self._map) if known is not None]:
             likelihood = np.exp(visit[k])

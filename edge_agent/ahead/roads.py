@@ -75,9 +75,9 @@ class _Neighbours:
                     if not 0.3 * self.side < distance <= reach:
                         continue
                     link = math.atan2(dy, dx)
-                    turn, lean = _apart(link, heading), _apart(link, (key % grid.SECTORS) * math.pi / 2.0)
-                    if turn <= TURN and lean <= LEAN:
-                        found.append((distance * (1.0 + 2.0 * turn + 0.5 * lean), key, link))
+                    turn, turned = _apart(link, heading), _apart(link, (key % grid.SECTORS) * math.pi / 2.0)
+                    if turn <= TURN and turned <= LEAN:
+                        found.append((distance * (1.0 + 2.0 * turn + 0.5 * turned), key, link))
         chosen: list[tuple[int, float]] = []
         for _, key, link in sorted(found):
             if all(_apart(link, other) > FORK for _, other in chosen):

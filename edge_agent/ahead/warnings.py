@@ -34,7 +34,7 @@ SLOWEST: Final = 0.5  # [m/s] who stands has no time to a stretch
 class Active:
     """A warning that stands: what was told of it, its places, and where and when it was seen last."""
 
-    told: GripWarning
+    warning: GripWarning
     places: frozenset[int]
     seen: int
     distance_m: float
@@ -46,7 +46,7 @@ class _Stretch:
     start: float
     end: float
     worst: int
-    room: float  # half the square of the speed that can be braked away before it
+    braking_energy: float  # half the square of the speed that can be braked away before it
     horizon: Horizon
 
 
@@ -61,30 +61,30 @@ def warn(
         pose: of the car.
         known: what the car has heard, ahead or not.
     """
-    told: list[GripWarning] = []
+    issued: list[GripWarning] = []
     speed = pose.speed + GAIN if pose.speed > SLOWEST else 0.0
     stretches = [stretch for horizon in horizons for stretch in _stretches(horizon, speed)]
-    kept: dict[str, Active] = {one.told.id: one for one in active}
+    kept: dict[str, Active] = {one.warning.id: one for one in active}
     here: set[str] = set()  # those that lie ahead now
     for places, ways in _by_place(stretches):
         nearest = min(ways, key=lambda stretch: stretch.start)
         before = next((one for one in kept.values() if one.places & places), None)
         sure = len({id(way.horizon) for way in ways}) == len(horizons)
         if before is None:
-            if nearest.room > 0.5 * speed**2:
+            if nearest.braking_energy > 0.5 * speed**2:
                 continue
             first = min(nearest.places)
             name = f"{grid.quadkey(first // grid.SECTORS, grid.CELL_ZOOM)}{first % grid.SECTORS}-{pose.time // NS:x}"
             one = _warning(name, "raised", nearest, pose, sure)
-            told.append(one)
+            issued.append(one)
             kept[name] = Active(one, places, pose.time, nearest.start)
             here.add(name)
             continue
-        here.add(before.told.id)
-        name, one = before.told.id, _warning(before.told.id, "updated", nearest, pose, sure)
+        here.add(before.warning.id)
+        name, one = before.warning.id, _warning(before.warning.id, "updated", nearest, pose, sure)
         grown = len(places - before.places) >= CHANGED_PLACES
-        if grown or abs(one.mu - before.told.mu) >= CHANGED_MU:
-            told.append(one)
+        if grown or abs(one.mu - before.warning.mu) >= CHANGED_MU:
+            issued.append(one)
             kept[name] = Active(one, before.places | places, pose.time, nearest.start)
         else:
             kept[name] = replace(before, seen=pose.time, distance_m=nearest.start)
@@ -93,9 +93,9 @@ def warn(
             continue
         stands = worth_a_warning(known.look_up(np.array(sorted(last.places)), pose.time)).any()
         if not stands or pose.time - last.seen > ABSENT_S * NS:
-            told.append(_ended(last, pose, stands=bool(stands)))
+            issued.append(_ended(last, pose, stands=bool(stands)))
             del kept[name]
-    return tuple(kept.values()), told
+    return tuple(kept.values()), issued
 
 
 def _stretches(horizon: Horizon, speed: float) -> list[_Stretch]:
@@ -106,8 +106,8 @@ def _stretches(horizon: Horizon, speed: float) -> list[_Stretch]:
     for first, last in _runs(horizon.slippery):
         places = frozenset(horizon.key[first : last + 1][horizon.slippery[first : last + 1]].tolist())
         worst = first + int(np.nanargmin(np.where(horizon.slippery, horizon.mu, np.nan)[first : last + 1]))
-        room = float(brakes[first] - brakes[min(begins, first)])
-        found.append(_Stretch(places, float(first), float(last + 1), worst, room, horizon))
+        braking_energy = float(brakes[first] - brakes[min(begins, first)])
+        found.append(_Stretch(places, float(first), float(last + 1), worst, braking_energy, horizon))
     return found
 
 
@@ -153,4 +153,4 @@ def _ended(one: Active, pose: Pose, *, stands: bool) -> GripWarning:
         reason = "passed"
     else:
         reason = "the car took another way"
-    return replace(one.told, state="ended", time=pose.time, reason=reason)
+    return replace(one.warning, state="ended", time=pose.time, reason=reason)

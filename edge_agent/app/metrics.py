@@ -11,7 +11,7 @@ from schemas.runtime.metrics import Metric, gauge
 from schemas.wire import Kind
 
 BEHIND_S: Final = 1.0  # of real time, from which on the agent is too slow for its vehicles
-OWED_S: Final = 60.0  # without any answer: longer than a service takes to start again
+UNANSWERED_S: Final = 60.0  # without any answer: longer than a service takes to start again
 FULL: Final = 0.9  # of the outbox
 _NAMES: Final = {Kind.OBSERVATION: "observation", Kind.STATE: "state"}
 
@@ -35,7 +35,7 @@ def metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
         Metric("damaged_records", "counter", "known to be lost by damage of the outbox", {"": publisher.damage[1]}),
         Metric("sender_failures", "counter", "rounds of the sending thread that failed", {"": counts.failures}),
         gauge("stranded_records", "in the outbox under a name that is no longer used", publisher.stranded),
-        gauge("unanswered_seconds", "since something was put that nobody answers", publisher.owed_s),
+        gauge("unanswered_seconds", "since something was put that nobody answers", publisher.unanswered_s),
         gauge("clock_behind_seconds", "of the service's clock", publisher.clock_behind_s),
         gauge("outbox_fill", "share of the outbox that is full", publisher.fill),
         gauge("unsettled_records", "neither acknowledged nor rejected yet", publisher.unsettled()),
@@ -51,8 +51,8 @@ def troubles(publisher: Publisher, progress: Progress) -> list[str]:
     found = [] if publisher.links else ["no session is open"]
     if publisher.cut_off:
         found.append("a session has no router")
-    if publisher.owed_s > OWED_S:
-        found.append(f"nothing was acknowledged for {publisher.owed_s:.0f} s")
+    if publisher.unanswered_s > UNANSWERED_S:
+        found.append(f"nothing was acknowledged for {publisher.unanswered_s:.0f} s")
     if publisher.fill > FULL:
         found.append("the outbox is full: the oldest states go first")
     if abs(publisher.clock_behind_s) > CLOCK_OFF_S:

@@ -80,7 +80,7 @@ def _bicycle(speed: FloatArray, steering: FloatArray, vehicle: Vehicle) -> Float
     m, inertia, a, b = vehicle.mass, vehicle.yaw_inertia, vehicle.cg_to_front_axle, vehicle.cg_to_rear_axle
     per_share = 4.0 * vehicle.cornering_stiffness / (a + b)  # of all wheels, shared out by their static load
     c_f, c_r = b * per_share, a * per_share
-    half, motion, told = 0.5 / RATE_HZ, np.zeros(2), np.full(len(speed), np.nan)
+    half, motion, modelled = 0.5 / RATE_HZ, np.zeros(2), np.full(len(speed), np.nan)
     before = 0.0
     for k, (v, delta) in enumerate(zip(speed.tolist(), steering.tolist(), strict=True)):
         if not (v > SLOWEST and abs(delta) < 1.0):  # standing, or NaN
@@ -92,5 +92,5 @@ def _bicycle(speed: FloatArray, steering: FloatArray, vehicle: Vehicle) -> Float
         ])  # fmt: skip
         driven = np.array([c_f / m, a * c_f / inertia]) * (half * (before + delta))
         motion = np.linalg.solve(np.eye(2) - half * system, motion + half * (system @ motion) + driven)
-        before, told[k] = delta, motion[1]
-    return told
+        before, modelled[k] = delta, motion[1]
+    return modelled

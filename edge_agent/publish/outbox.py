@@ -204,9 +204,10 @@ class Outbox:
         """Payload bytes held."""
         return self._bytes
 
-    def owed_s(self, now: float) -> float:
+    def unanswered_s(self, now: float) -> float:
         """For how long nothing was answered that was put, in the region that waits longest [s]."""
-        return max((now - pacer.owed for pacer in list(self._pacers.values()) if pacer.owed is not None), default=0.0)
+        since = (pacer.unanswered_since for pacer in list(self._pacers.values()))
+        return max((now - one for one in since if one is not None), default=0.0)
 
     def store(self, drafts: Sequence[Draft], now: float) -> list[StoredBatch]:
         """Name the drafts and commit them in one transaction; nothing changes when the commit fails.

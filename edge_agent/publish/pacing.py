@@ -35,15 +35,25 @@ class Pacer:
     """
 
     __slots__ = (
-        "_answered", "_halved", "_owed", "_probe_at", "_probe_s", "_stale", "_sure", "_turn", "_waiting", "_window",
-        "flying", "silent",
+        "_answered",
+        "_halved",
+        "_probe_at",
+        "_probe_s",
+        "_stale",
+        "_sure",
+        "_turn",
+        "_unanswered_since",
+        "_waiting",
+        "_window",
+        "flying",
+        "silent",
     )  # fmt: skip
 
     def __init__(self) -> None:
         self.flying, self.silent = 0, False
         self._waiting: list[int] = []  # heap of keys, and of such as are gone
         self._window, self._sure = FIRST_WINDOW, LARGEST_WINDOW  # up to `sure` it grows fast
-        self._owed: float | None = None  # since when an answer is
+        self._unanswered_since: float | None = None  # since when an answer is
         self._halved = -float("inf")
         self._answered = False
         self._stale = 0  # of those that fly, put before the silence: that they are lost says nothing
@@ -55,9 +65,9 @@ class Pacer:
         return not self.flying and not self._waiting
 
     @property
-    def owed(self) -> float | None:
+    def unanswered_since(self) -> float | None:
         """Since when something was put and nothing answered; None: nothing is owed."""
-        return self._owed
+        return self._unanswered_since
 
     def wait(self, key: int) -> None:
         """Let a batch wait for its turn; lower keys are older and go first."""
@@ -66,8 +76,8 @@ class Pacer:
     def fly(self, now: float) -> None:
         """A batch is put."""
         self.flying += 1
-        if self._owed is None:
-            self._owed = now
+        if self._unanswered_since is None:
+            self._unanswered_since = now
 
     def settled(self) -> None:
         """A batch that flew was answered."""
@@ -87,7 +97,7 @@ class Pacer:
         self.flying -= 1
         if self.silent:
             return
-        if not self._answered and self._owed is not None and now - self._owed >= SILENT_S:
+        if not self._answered and self._unanswered_since is not None and now - self._unanswered_since >= SILENT_S:
             self.silent, self._probe_s = True, FIRST_PROBE_S
             self._probe_at = now + jitter * self._probe_s
         elif self._stale > 0:
@@ -98,18 +108,18 @@ class Pacer:
 
     def reconnected(self, now: float) -> None:
         """A router is there again: what flew is lost, and a silent route is tried at once."""
-        self.flying, self._owed = 0, None
+        self.flying, self._unanswered_since = 0, None
         self._probe_at, self._probe_s = now, FIRST_PROBE_S
 
     def take(self, now: float, jitter: float, most: int, held: Container[int]) -> list[int]:
         """Keys of the batches to be put now, at most so many, oldest first; those not `held` are gone."""
         if self._answered:
-            self._answered, self._owed = False, now if self.flying else None
+            self._answered, self._unanswered_since = False, now if self.flying else None
         if self.silent:
             return self._probe(now, jitter, held)
         out: list[int] = []
-        room = min(most, int(self._window) - self.flying)
-        while self._waiting and len(out) < room:
+        free = min(most, int(self._window) - self.flying)
+        while self._waiting and len(out) < free:
             key = heapq.heappop(self._waiting)
             if key in held:
                 out.append(key)

@@ -103,9 +103,9 @@ class Publisher:
         return not all(list(self._connected.values()))
 
     @property
-    def owed_s(self) -> float:
+    def unanswered_s(self) -> float:
         """For how long nothing was answered that was put [s]."""
-        return self._outbox.owed_s(self._clock())
+        return self._outbox.unanswered_s(self._clock())
 
     @property
     def stranded(self) -> int:
@@ -281,11 +281,11 @@ class Publisher:
         for batch in self._outbox.due(self._clock(), RESEND_LIMIT, there) if there else ():
             self.counts.resent_batches += self._links[batch.stream.vehicle].put(batch)
 
-    def _compare_clocks(self, told: int) -> None:
+    def _compare_clocks(self, reported: int) -> None:
         """Hold our clock against that of a service [ns], 0 if it does not tell; an ack is some second old."""
-        if not told:
+        if not reported:
             return
-        behind = (told - self._wall()) / NS
+        behind = (reported - self._wall()) / NS
         if abs(behind) > CLOCK_OFF_S and abs(behind - self.clock_behind_s) > CLOCK_OFF_S:
             log.warning("the clock is %.0f s behind the service's: reports come late, or are refused", behind)
         self.clock_behind_s = behind

@@ -34,11 +34,11 @@ def road_friction(mu: float, mu_lower: float, mu_upper: float, mu_utilised: floa
         mu, mu_lower, mu_upper: 50 %, 5 % and 95 % quantiles; NaN where unknown.
         mu_utilised: largest grip used in the last second, any wheel.
     """
-    told = {"MostProbable": mu if mu_utilised >= EXCITED_SHARE * mu else math.nan, "LowerBound": mu_lower,
+    signals = {"MostProbable": mu if mu_utilised >= EXCITED_SHARE * mu else math.nan, "LowerBound": mu_lower,
             "UpperBound": mu_upper}  # fmt: skip
     return {
         f"{BRANCH}.{name}": round(min(FULL * value, FULL), DIGITS)
-        for name, value in told.items()
+        for name, value in signals.items()
         if math.isfinite(value)
     }
 

@@ -13,9 +13,9 @@ from schemas.errors import InputError
 LOOK_S: Final = 0.1  # between two looks whether it shall stop
 
 
-def run(what: str, module: str, words: Sequence[str], stop: threading.Event, told: str | None = None) -> str | None:
-    """What a module said that was run as a process, with `told` on its stdin; None if it was stopped. It may die at any
-    instant.
+def run(what: str, module: str, words: Sequence[str], stop: threading.Event, document: str | None = None) -> str | None:
+    """What a module said that was run as a process, with `document` on its stdin; None if it was stopped. It may die at
+    any instant.
 
     Raises:
         InputError: it failed.
@@ -25,10 +25,10 @@ def run(what: str, module: str, words: Sequence[str], stop: threading.Event, tol
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe, text=True) as child:
         while True:
             try:
-                output, errors = child.communicate(told, LOOK_S)
+                output, errors = child.communicate(document, LOOK_S)
                 break
             except subprocess.TimeoutExpired:
-                told = None  # it is on its way
+                document = None  # it is on its way
                 if stop.is_set():
                     child.terminate()
                     return None

@@ -85,12 +85,12 @@ class SteadyClock:
         """Vehicles that were just heard, and the times that they told [ns]."""
         now, wall = self.now(), self._wall()
         if self._doubted is None:
-            self._confirmed = self._confirmed or any(abs(told - now) <= NEAR_NS for told in times.values())
+            self._confirmed = self._confirmed or any(abs(reported - now) <= NEAR_NS for reported in times.values())
             return
-        for vehicle, told in times.items():
-            if abs(told - wall) <= NEAR_NS:
+        for vehicle, reported in times.items():
+            if abs(reported - wall) <= NEAR_NS:
                 self._votes[vehicle] = True
-            elif abs(told - now) <= NEAR_NS:
+            elif abs(reported - now) <= NEAR_NS:
                 self._votes[vehicle] = False
         if self._steady() - self._doubted >= VOTE_NS and 2 * sum(self._votes.values()) > len(self._votes):
             self._zero, self._confirmed = wall - self._steady(), True

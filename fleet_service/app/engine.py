@@ -131,8 +131,8 @@ class Engine:
             self._tracks, self._places = Tracks(), NewCells()
             self._know(memory)
             still = {(alert.cell, alert.sector) for alert in self._alerts.standing}
-            gone = [alert for alert in stood if (alert.cell, alert.sector) not in still]
-            self._ended += [replace(alert, raised=False, reason=ERASED) for alert in gone]
+            ended = [alert for alert in stood if (alert.cell, alert.sector) not in still]
+            self._ended += [replace(alert, raised=False, reason=ERASED) for alert in ended]
 
     def drop_old(self) -> int:
         """Drop cells that are back at the prior and old; returns how many. In `between`."""

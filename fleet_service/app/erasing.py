@@ -38,16 +38,16 @@ def asked(engine: Engine, config: ServiceConfig, root: Path, stop: threading.Eve
     rows = answered = 0
     for question in requests.waiting(root):
         try:
-            told = _erase(engine, config, root, requests.read(question), stop)
+            outcome = _erase(engine, config, root, requests.read(question), stop)
         except InputError as error:
             requests.settle(question, error)
             continue
-        if told is None:  # the service stops; the next one does it
+        if outcome is None:  # the service stops; the next one does it
             break
         if engine.copy is not None:
-            told["copy"] = _followed(engine.copy)
-        requests.settle(question, told)
-        rows, answered = rows + told["rows"], answered + 1
+            outcome["copy"] = _followed(engine.copy)
+        requests.settle(question, outcome)
+        rows, answered = rows + outcome["rows"], answered + 1
     return f"erased: {answered} requests, {rows} rows" if answered else None
 
 
@@ -72,13 +72,13 @@ def _erase(
     key_of(root, wanted.month)
     vehicle = wanted.vehicle
     if vehicle is None:
-        gone = _recalled(engine, lambda: destroy_key(root, wanted.month, engine.newest), stop)
-        return {"rows": 0, "files": []} if gone else None
+        destroyed = _recalled(engine, lambda: destroy_key(root, wanted.month, engine.newest), stop)
+        return {"rows": 0, "files": []} if destroyed else None
     cut = engine.between(lambda: engine.written_to, stop)
     if cut is None:
         return None
-    told = json.dumps({**asdict(wanted), "config": config.model_dump(mode="json", exclude={"archive"}), "cut": cut})
-    output = beside.run("erasure", "fleet_service.app.erasing_process", [str(root)], stop, told)
+    request = json.dumps({**asdict(wanted), "config": config.model_dump(mode="json", exclude={"archive"}), "cut": cut})
+    output = beside.run("erasure", "fleet_service.app.erasing_process", [str(root)], stop, request)
     if output is None:
         return None
     answer: dict[str, Any] = json.loads(output)
@@ -95,14 +95,14 @@ def _recalled(engine: Engine, before: Callable[[], None], stop: threading.Event)
     return engine.between(work, stop)
 
 
-def apart(root: Path, told: dict[str, Any]) -> dict[str, Any]:
+def apart(root: Path, request: dict[str, Any]) -> dict[str, Any]:
     """The part of a process of its own.
 
     Raises:
         InputError, OSError: as of `retention.forget_vehicle`.
     """
     known = weather.files(root)  # one that comes meanwhile is read again, which changes nothing
-    with erased(root, told["vehicle"], told["month"]) as done:
-        cut = Cut(*told["cut"])
-        checkpoints.save(root, remember(root, ServiceConfig(**told["config"]), until=cut).image(cut, known))
+    with erased(root, request["vehicle"], request["month"]) as done:
+        cut = Cut(*request["cut"])
+        checkpoints.save(root, remember(root, ServiceConfig(**request["config"]), until=cut).image(cut, known))
     return {"rows": done.rows, "files": [str(path.relative_to(root)) for path in done.files]}

@@ -90,7 +90,7 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
         engine.counts["files_set_aside"] = count_set_aside(root)
         return None
 
-    def with_room(work: Callable[[threading.Event], str | None]) -> Callable[[threading.Event], str | None]:
+    def with_disk_space(work: Callable[[threading.Event], str | None]) -> Callable[[threading.Event], str | None]:
         """On a full disk a job that makes room has the reserve to work with."""
 
         def done(stop: threading.Event) -> str | None:
@@ -122,10 +122,10 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
         return f"handing over: to {holding.to}"
 
     return [
-        Job("compaction", config.compact_s, with_room(compaction)),
+        Job("compaction", config.compact_s, with_disk_space(compaction)),
         Job("checkpoint", config.checkpoint_s, checkpoint),
         Job("snapshot", config.snapshot_s, snapshot),
-        Job("retention", DAY_S if config.raw_days else 0.0, with_room(retention)),
+        Job("retention", DAY_S if config.raw_days else 0.0, with_disk_space(retention)),
         Job("inventory", INVENTORY_S, inventory),
         Job("old_cells", DAY_S, old_cells),
         Job("following", 0.0 if engine.copy is None else FOLLOW_S, following),

@@ -55,11 +55,11 @@ class Memory(NamedTuple):
     def drop_old(self) -> int:
         """Drop cells that nobody visited for KEPT_NS: what is believed of them is the prior again; returns how many."""
         newest = self.fusion.checkpoint or 0
-        gone = self.fusion.untouched(newest - KEPT_NS)
-        gone[sorted(self.alerts.raised)] = False
-        dropped = int(gone.sum())
+        stale = self.fusion.untouched(newest - KEPT_NS)
+        stale[sorted(self.alerts.raised)] = False
+        dropped = int(stale.sum())
         if dropped > self.fusion.size * LEAST_DROPPED:
-            place = self.fusion.drop(gone)
+            place = self.fusion.drop(stale)
             self.map.renumbered()
             self.alerts.renumbered(place)
             if self.visitors is not None:
@@ -94,8 +94,8 @@ def remember(
     fusion, streams = begin.fusion, begin.streams
     visitors = None
     if config.public_vehicles > 1:  # after a checkpoint that does not have them nothing is shown until so many came
-        told = begin.beside.get(VISITORS)
-        visitors = Visitors.of(fusion, told) if told and len(told["bits"]) else Visitors(fusion)
+        kept = begin.beside.get(VISITORS)
+        visitors = Visitors.of(fusion, kept) if kept and len(kept["bits"]) else Visitors(fusion)
     shown, alerts = MapState(fusion), Alerts(fusion)
     alerts.resume(begin.standing)
     used = archived(root, damaged=damaged)  # before the observations, which it acts on

@@ -60,7 +60,7 @@ def ask(root: Path, question: PastQuery, wanted: Callable[[int], bool]) -> Itera
         assert child.stdin
         assert child.stdout
         with child.stdin as pipe:
-            pipe.write(told(question))
+            pipe.write(encoded(question))
         try:
             while head := child.stdout.read(_HEAD.size):
                 tile, size = _HEAD.unpack(head)
@@ -108,7 +108,7 @@ def replies(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
     yield from answer(cache, question.query, lambda _: True, question.at, question.only)
 
 
-def told(question: PastQuery) -> bytes:
+def encoded(question: PastQuery) -> bytes:
     """A question for `answer_one`."""
     return json.dumps({**question._asdict(), "query": question.query.model_dump_json()}).encode()
 

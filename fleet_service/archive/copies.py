@@ -243,17 +243,18 @@ class Copy:
             ]  # fmt: skip
             new.sort(key=lambda name: name.endswith(_LAST))
             vanished = [name for name in new if not self._put_there(name)]
-            gone = [] if vanished else [name for name in known if name not in local and not self._aside(name).exists()]
-            gone.sort(key=lambda name: not name.endswith(_LAST))
+            absent = [name for name in known if name not in local and not self._aside(name).exists()]
+            removed = [] if vanished else absent
+            removed.sort(key=lambda name: not name.endswith(_LAST))
             if strays := [name for name in new if not self._fence.passes(name)]:  # compacted by who began before
                 self._put_fence(self._term, self._fence._replace(names=self._fence.names.union(strays)))
-            if gone:
+            if removed:
                 self._insist()  # then whoever comes next finds all that was put until now, and misses none of what goes
-            for name in gone:
+            for name in removed:
                 self._slow.delete(name)
                 self._copied.remove(name)
             self._copied.sync()
-            return len(new) - len(vanished) + len(gone)
+            return len(new) - len(vanished) + len(removed)
         finally:
             self._following.release()
 

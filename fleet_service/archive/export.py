@@ -95,8 +95,8 @@ def cell_hours(root: Path, part: Extract) -> pa.Table:
     loaded = (load(path, tables.CELL_HOUR_SCHEMA, where=where) for path in paths)
     found = [table for table in loaded if table is not None]
     table = pa.concat_tables([*found, tables.CELL_HOUR_SCHEMA.empty_table()])
-    told = np.nan_to_num(table["value_count"].to_numpy()) > 0  # null before 1.2
-    table = without(table, _OF_MU, told)
+    measured = np.nan_to_num(table["value_count"].to_numpy()) > 0  # null before 1.2
+    table = without(table, _OF_MU, measured)
     return geo.with_cells(_inside(table, part.bbox).sort_by([("cell", "ascending"), ("hour", "ascending")]))
 
 

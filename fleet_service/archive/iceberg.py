@@ -132,10 +132,12 @@ def _catalog(place: Place) -> Catalog:
         raise InputError("catalog", "pyiceberg is not installed", "pip install 'gripmap[iceberg]'") from error
     if not place.catalog.startswith(("sqlite://", "postgresql")):
         return load_catalog(place.catalog)
-    told = {"type": "sql", "uri": place.catalog}
+    catalog_properties = {"type": "sql", "uri": place.catalog}
     if place.catalog.startswith("sqlite:///"):  # the tables' own files beside the catalogue
-        told["warehouse"] = Path(place.catalog.removeprefix("sqlite:///")).absolute().with_suffix("").as_uri()
-    return load_catalog("gripmap", **told)  # by this name others find the tables
+        catalog_properties["warehouse"] = (
+            Path(place.catalog.removeprefix("sqlite:///")).absolute().with_suffix("").as_uri()
+        )
+    return load_catalog("gripmap", **catalog_properties)  # by this name others find the tables
 
 
 def _table(catalog: Catalog, place: Place, kind: Kind) -> Table:
@@ -170,14 +172,14 @@ def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> Registere
     return Registered(len(missing), len(stale), sum(f.record_count for n, f in now.items() if n in there))
 
 
-def _commit(table: Table, gone: list[Any], added: list[str]) -> None:
+def _commit(table: Table, removed: list[Any], added: list[str]) -> None:
     """Change a table at once, or not at all."""
-    if not gone and not added:
+    if not removed and not added:
         return
     with table.transaction() as change:
-        if gone:
+        if removed:
             with change.update_snapshot().overwrite() as without:
-                for file in gone:
+                for file in removed:
                     without.delete_data_file(file)
         if added:
             change.add_files(added, check_duplicate_files=False)  # `_held` has looked

@@ -60,13 +60,13 @@ def answer_to(question: Path) -> dict[str, Any] | None:
     """
     path = _answer_of(question)
     try:
-        told: dict[str, Any] = json.loads(path.read_bytes())
+        answer: dict[str, Any] = json.loads(path.read_bytes())
     except FileNotFoundError:
         return None
     path.unlink()
-    if "error" in told:
-        raise InputError(*told["error"])
-    return told
+    if "error" in answer:
+        raise InputError(*answer["error"])
+    return answer
 
 
 def waiting(root: Path) -> list[Path]:
@@ -84,22 +84,22 @@ def read(question: Path) -> Erasure:
         InputError: it is none.
     """
     try:
-        told = json.loads(question.read_bytes())
-        return Erasure(str(told["month"]), None if told.get("vehicle") is None else str(told["vehicle"]))
+        record = json.loads(question.read_bytes())
+        return Erasure(str(record["month"]), None if record.get("vehicle") is None else str(record["vehicle"]))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError("request", f"{question.name} is none", "ask again") from error
 
 
-def settle(question: Path, told: dict[str, Any] | InputError) -> None:
+def settle(question: Path, outcome: dict[str, Any] | InputError) -> None:
     """Answer a question and take it away.
 
     Raises:
         OSError: the answer cannot be written; the question stays.
     """
-    if isinstance(told, InputError):
-        told = {"error": [told.field, told.problem, told.fix]}
+    if isinstance(outcome, InputError):
+        outcome = {"error": [outcome.field, outcome.problem, outcome.fix]}
     with written(_answer_of(question), _SECRET) as file:
-        file.write(json.dumps(told).encode())
+        file.write(json.dumps(outcome).encode())
     question.unlink()
 
 

@@ -164,8 +164,8 @@ def erased(root: Path, vehicle: str, month: str) -> Iterator[Forgotten]:
             theirs = [path for path in layout.compacted(root, kind, begin, end) if _names(kind, path, pseudonym)]
             iceberg.let_go(root, theirs)
             for path in theirs:
-                if len(gone := _without(root, kind, path, pseudonym)):
-                    rows, cells = rows + len(gone), cells.union(gone)
+                if len(removed := _without(root, kind, path, pseudonym)):
+                    rows, cells = rows + len(removed), cells.union(removed)
                     files += [path, rollup.part_of(path)] if kind is Kind.OBSERVATION else [path]
         for folder in layout.days(root, snapshots.TABLE, begin, end):
             files += [path for path in sorted(folder.glob("*.parquet")) if _thinned(root, path, cells)]

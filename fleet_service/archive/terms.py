@@ -65,8 +65,8 @@ def fence_of(bucket: ObjectBucket) -> Fence:
     content = bucket.get(max(names)) if names else None
     if content is None:
         return Fence(0, frozenset())
-    told = json.loads(gzip.decompress(content))
-    return Fence(int(told["epoch"]), frozenset(told["names"]))
+    document = json.loads(gzip.decompress(content))
+    return Fence(int(document["epoch"]), frozenset(document["names"]))
 
 
 def newest(names: Iterable[str]) -> int:

@@ -75,8 +75,8 @@ def _erased(root: Path, wanted: Erasure, config: str | None) -> Forgotten:
     question = requests.ask(root, wanted) if held(root) else None
     looked = time.monotonic()
     while question is not None:  # a service that ends meanwhile leaves it to us
-        if (told := requests.answer_to(question)) is not None:
-            return Forgotten(told["rows"], tuple(root / path for path in told["files"]), told.get("copy"))
+        if (answer := requests.answer_to(question)) is not None:
+            return Forgotten(answer["rows"], tuple(root / path for path in answer["files"]), answer.get("copy"))
         time.sleep(ASK_S)
         if time.monotonic() - looked > LOOK_S:
             looked = time.monotonic()

@@ -94,16 +94,16 @@ def _waited(
 
     if not config.standby:
         return hold(config, root, stop, log_line)
-    told = [""]
+    latest = [""]
 
     def say(line: str) -> None:
-        told[0] = line
+        latest[0] = line
         log_line(f"{line}, {address}" if address else line)
 
     with (
         serving(
             config.metrics_host, config.metrics_port, lambda: of_standby(config),
-            lambda: [line for line in told if "cannot" in line],
+            lambda: [line for line in latest if "cannot" in line],
         ) as address,
         standing_by(config, stop, watchdog.patient()) as signs,
     ):  # fmt: skip

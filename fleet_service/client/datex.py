@@ -85,16 +85,16 @@ def publication(
     creator = ET.SubElement(root, _name("com:publicationCreator"))
     _text(creator, "com:country", supplier.country)
     _text(creator, "com:nationalIdentifier", supplier.name)
-    told: set[str] = set()
+    written: set[str] = set()
     for alert in standing:
-        known = alert.id if alert.id in old else _same_place(alert, old, told)
+        known = alert.id if alert.id in old else _same_place(alert, old, written)
         record = _record(alert, known or alert.id, now)
         if known is not None:
             record = _versioned(record, old[known])
-        told.add(record.get("id", ""))
+        written.add(record.get("id", ""))
         root.append(_situation(supplier, record))
     for name, record in old.items():
-        if name in told:
+        if name in written:
             continue
         place = (
             float(child.text or "nan") for child in _found(record, "sit:locationReference/loc:coordinatesForDisplay")
@@ -200,11 +200,11 @@ def _has_ended(record: ET.Element) -> bool:
     return record.find(".//com:overallEndTime", _SPACES) is not None
 
 
-def _same_place(alert: StretchAlert, old: dict[str, ET.Element], told: set[str]) -> str | None:
+def _same_place(alert: StretchAlert, old: dict[str, ET.Element], written: set[str]) -> str | None:
     """The situation that has a cell of a stretch, where a reader began anew and names it otherwise."""
     cells = {f"{latitude:.{DIGITS}f} {longitude:.{DIGITS}f}" for latitude, longitude in alert.points}
     for name, record in old.items():
-        if name not in told and not _has_ended(record) and cells & _cells(record):
+        if name not in written and not _has_ended(record) and cells & _cells(record):
             return name
     return None
 

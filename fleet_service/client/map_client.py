@@ -77,22 +77,22 @@ def ask(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
         payloads = sorted(replies(session, EVERYWHERE, parameters))
         after = services.asked(session)  # who came meanwhile may not have been asked
         # and who went may have been asked in place of who followed it, even if it is back
-        gone = {token.region for token in services.fell | (before - after)}
+        withdrawn = {token.region for token in services.fell | (before - after)}
         stayed = {token.region for token in before & after}
-        whole = {one for one in stayed if not any(regions.overlap(one, region) for region in gone)}
-        told = bool(before | after)
-        served = bool(payloads) or (bool(whole) if told else is_served(session, asked))
-        if not told and services.asked(session):  # it came while it was looked for
-            told, served = True, bool(payloads)
-        elif not told and served and not payloads:  # likewise, and its token is on the way; or it has none
+        whole = {one for one in stayed if not any(regions.overlap(one, region) for region in withdrawn)}
+        declared = bool(before | after)
+        served = bool(payloads) or (bool(whole) if declared else is_served(session, asked))
+        if not declared and services.asked(session):  # it came while it was looked for
+            declared, served = True, bool(payloads)
+        elif not declared and served and not payloads:  # likewise, and its token is on the way; or it has none
             payloads = sorted(replies(session, EVERYWHERE, parameters))
     answer = replace(_joined(asked, [payload for _, payload in payloads]), served=served)
-    if not told:  # services of a former version, or an access list of one
+    if not declared:  # services of a former version, or an access list of one
         return answer
     tiles = {regions.region_of(tile) for key, _ in payloads if (tile := keys.parse(key).quadint) is not None}
-    whole |= {one for one in tiles if not any(regions.overlap(one, region) for region in gone)}
+    whole |= {one for one in tiles if not any(regions.overlap(one, region) for region in withdrawn)}
     somewhere = asked.bbox is not None or asked.route is not None
-    missing = regions.unserved(asked, whole) if somewhere else sorted(gone)
+    missing = regions.unserved(asked, whole) if somewhere else sorted(withdrawn)
     found = tuple(sorted({token.region for token in after}))
     return replace(answer, missing=tuple(missing), regions=found)
 

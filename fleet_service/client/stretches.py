@@ -104,9 +104,9 @@ class Stretches:
 
     def take_all(self, standing: Iterable[Alert], is_heard: Callable[[Alert], bool]) -> None:
         """These stand; of the others those ended, unheard, for whose place a service speaks."""
-        told = {(alert.cell, alert.sector): alert for alert in standing}
-        self._standing = {place: one for place, one in self._standing.items() if place in told or not is_heard(one)}
-        for alert in told.values():
+        present = {(alert.cell, alert.sector): alert for alert in standing}
+        self._standing = {place: one for place, one in self._standing.items() if place in present or not is_heard(one)}
+        for alert in present.values():
             self.take(alert)
 
     @property

@@ -79,8 +79,9 @@ def watch(
     def tell_services() -> None:
         nonlocal away
         here = {token.region for token in services.here}
-        now = set(regions.unserved(asked, here)) if asked.bbox else {token.region for token in services.gone} - here
-        if now != away and (here or services.gone):
+        left = {token.region for token in services.withdrawn} - here
+        now = set(regions.unserved(asked, here)) if asked.bbox else left
+        if now != away and (here or services.withdrawn):
             _say_regions(say, now - away, away - now, as_json=wishes.as_json)
             away = now
 

@@ -21,7 +21,7 @@ from fleet_service.fusion.standing import ERRORS, UNKNOWN, Standing, classes, fi
 from fleet_service.fusion.store.cells import Cells
 from fleet_service.fusion.store.records import ICE, NOBODY, NONE, USED, Rows
 from fleet_service.fusion.store.store import Store, distinct
-from fleet_service.fusion.trust import judged, newcomer, slope_std
+from fleet_service.fusion.trust import initial_trust, judged, slope_std
 from fleet_service.fusion.weather import Reports, Weather, no_reports, weather_of
 from fleet_service.fusion.window import Arrivals, Votes, absorb, commit
 from schemas import grid
@@ -78,7 +78,7 @@ class Fusion:
         self._kept_epochs = self._lateness_ns // c.EPOCH_NS + 2  # whose trust an observation in time may still need
         self._epoch: int | None = None
         self.store = Store()
-        self.standings: list[Standing] = [first_standing(newcomer(False))]
+        self.standings: list[Standing] = [first_standing(initial_trust(False))]
         self.reports: Reports = no_reports()
         self._weather: Weather = weather_of(self.reports)
 
@@ -169,10 +169,10 @@ class Fusion:
         """Slots (size,) of which nobody told anything since `before` [ns]; see `drop`."""
         return self.store.untouched(before)
 
-    def drop(self, gone: BoolArray) -> IntArray:
+    def drop(self, dropped: BoolArray) -> IntArray:
         """Drop slots (size,) that are `untouched`, as if nobody had ever been there; returns where each slot went, -1
         for those that are gone."""
-        return self.store.drop(gone)
+        return self.store.drop(dropped)
 
     def update_weather(self, reports: Reports) -> None:
         """Take in weather; each report must act from `next_epoch` on at the earliest, or the map depends on when it
@@ -259,7 +259,7 @@ class Fusion:
             store.forget(before // NS)
             last = self.standings[-1]
             joined = store.vehicles - len(last.weight)
-            weight = np.append(last.weight, np.full(joined, newcomer(False), np.float32))
+            weight = np.append(last.weight, np.full(joined, initial_trust(False), np.float32))
             standing = judged(
                 store.peers, last._replace(weight=weight, error=last.errors(np.arange(store.vehicles))), self._epoch
             )

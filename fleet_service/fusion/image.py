@@ -72,9 +72,9 @@ def image_of(fusion: Fusion) -> Image:
     image["trusts"] = {
         "epoch": np.array([standing.epoch for standing in fusion.standings]),
         "vehicles": np.array([len(standing.weight) for standing in fusion.standings]),
-        "newcomer": np.array([standing.newcomer for standing in fusion.standings]),
+        "newcomer": np.array([standing.initial for standing in fusion.standings]),
     } | {
-        name: np.array([standing.newcomer_error[k] for standing in fusion.standings]) for k, name in enumerate(ERRORS)
+        name: np.array([standing.initial_error[k] for standing in fusion.standings]) for k, name in enumerate(ERRORS)
     }  # fmt: skip
     reports = fusion.reports
     image["weather"] = {f.name: getattr(reports, f.name).reshape(-1) for f in fields(Reports)}

@@ -111,9 +111,9 @@ def _level(steps: ByteArray, used: FloatArray) -> None:
 
 def at_least(used: FloatArray) -> FloatArray:
     """ℓ(μ) = ln Φ((μ - u) / σ_u): rises to u and is flat above; flat everywhere where u is NaN. (n, 32)."""
-    told = np.minimum(np.nan_to_num(used, nan=-np.inf), c.UTILISED_MOST)[:, None]
-    std = np.hypot(c.UTILISED_STD, c.UTILISED_RELATIVE * np.maximum(told, 0.0))
-    return log_distribution((mugrid.CENTRES - told) / std)
+    known_use = np.minimum(np.nan_to_num(used, nan=-np.inf), c.UTILISED_MOST)[:, None]
+    std = np.hypot(c.UTILISED_STD, c.UTILISED_RELATIVE * np.maximum(known_use, 0.0))
+    return log_distribution((mugrid.CENTRES - known_use) / std)
 
 
 def posterior(mu: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:

@@ -82,7 +82,7 @@ def beliefs(
         slippery = _slippery(out[k])
         if slippery < c.DECIDED or slippery > 1.0 - c.DECIDED:
             continue
-        told, unknown = False, max(_slippery(weather.prior[prior]), c.NEIGHBOUR_SURE)
+        informative, unknown = False, max(_slippery(weather.prior[prior]), c.NEIGHBOUR_SURE)
         key = live.cells[slots[k]].key
         cell, sector = key // grid.SECTORS, key % grid.SECTORS
         back = (sector + 2) % grid.SECTORS
@@ -112,10 +112,10 @@ def beliefs(
                     for i in range(_BINS):
                         message[i] = 1.0 - weight + weight * road[i] / weather.prior[prior, i]
             if most > 0.0:
-                told = True
+                informative = True
                 for i in range(_BINS):
                     p[i] *= message[i]
-        if told:
+        if informative:
             read_road(kernels, live.cells, slots[k], p, out[k])
     return out
 

@@ -39,25 +39,25 @@ class Standing(NamedTuple):
     epoch: int
     weight: Float32Array
     error: Float32Array
-    newcomer: float
-    newcomer_error: Float32Array
+    initial: float
+    initial_error: Float32Array
 
     def weights(self, vehicle: IntArray) -> Float32Array:
         """Weights of vehicles (n,) by index."""
         inside = vehicle < len(self.weight)
-        known = np.append(self.weight, np.float32(self.newcomer))
+        known = np.append(self.weight, np.float32(self.initial))
         return np.asarray(known[np.where(inside, vehicle, len(self.weight))])
 
     def errors(self, vehicle: IntArray) -> Float32Array:
         """Errors of vehicles (n,) by index, (n, 4)."""
         inside = vehicle < len(self.error)
-        known = np.vstack([self.error, self.newcomer_error[None]])
+        known = np.vstack([self.error, self.initial_error[None]])
         return np.asarray(known[np.where(inside, vehicle, len(self.error))])
 
 
-def first_standing(newcomer: float) -> Standing:
+def first_standing(initial: float) -> Standing:
     """That of a service that knows nobody."""
-    return Standing(-1, np.zeros(0, np.float32), unknown(0), newcomer, unknown(1)[0])
+    return Standing(-1, np.zeros(0, np.float32), unknown(0), initial, unknown(1)[0])
 
 
 def unknown(vehicles: int) -> Float32Array:

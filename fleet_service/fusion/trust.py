@@ -176,7 +176,7 @@ def judged(peers: RecordArray, before: Standing, epoch: int) -> Standing:
     square, slope = _fleet(peers, before.weight)
     _find_errors(peers, before.weight, before.error, (square, slope), error)
     fleet = np.array([0.0, c.BIAS_RELATIVE, _spread(square, 0.0, 0.0), slope], np.float32)
-    return Standing(epoch, weight, error, newcomer(established), fleet)
+    return Standing(epoch, weight, error, initial_trust(established), fleet)
 
 
 @compiled
@@ -258,11 +258,11 @@ def slope_std(peers: RecordArray, standing: Standing) -> float:
     """How well the slope of the fleet's values is known: its standard deviation, SLOPE_STD before anybody told."""
     vehicles = len(standing.weight)
     trust = np.minimum(standing.weight.astype(np.float64), 1.0)
-    told = max(float((trust * peers["used_squares"][:vehicles]).sum()), 0.0)
-    return float(1.0 / np.sqrt(told + 1.0 / c.SLOPE_STD**2))
+    information = max(float((trust * peers["used_squares"][:vehicles]).sum()), 0.0)
+    return float(1.0 / np.sqrt(information + 1.0 / c.SLOPE_STD**2))
 
 
-def newcomer(established: bool) -> float:
+def initial_trust(established: bool) -> float:
     """Weight of a vehicle that was compared with nobody yet."""
     weight = _scaled(c.TRUST_PRIOR)
     return min(weight, c.NEWCOMER) if established else weight

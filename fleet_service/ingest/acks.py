@@ -49,9 +49,9 @@ class Acks:
             name = (stream.boot, *stream.key[2:])
             settled.setdefault(stream.vehicle, {}).setdefault(name, []).extend(seqs)
             if stream in self._late:
-                told = self._late[stream].intersection(seqs)
-                late[stream.vehicle, name] |= told
-                self._late[stream] -= told
+                unreported = self._late[stream].intersection(seqs)
+                late[stream.vehicle, name] |= unreported
+                self._late[stream] -= unreported
                 if not self._late[stream]:
                     del self._late[stream]
         out = []

@@ -199,9 +199,9 @@ class BatchIntake:
         return self._rows(kind, new, found, clock) if new else AcceptedBatches([], {})
 
     def _tell_time(self, owners: Sequence[Parsed], time: IntArray) -> None:
-        for owner, told in zip(owners, time.tolist(), strict=True):
+        for owner, measured in zip(owners, time.tolist(), strict=True):
             name = str(owner.name)
-            self.times[name] = max(self.times.get(name, 0), told)
+            self.times[name] = max(self.times.get(name, 0), measured)
 
     def _new(self, kind: Kind, heads: Heads, time: IntArray, good: BoolArray) -> dict[BatchId, int]:
         """Those of the good batches that were not accepted before, each once, and their places."""
@@ -234,14 +234,14 @@ class BatchIntake:
         vehicle, boot, region, _ = name
         try:
             pseudonym = number(self._pseudonyms.of(vehicle, time))
-            told = self._pseudonyms.boot(vehicle, boot, time)
+            boot_pseudonym = self._pseudonyms.boot(vehicle, boot, time)
             witness = self._witnesses.of(vehicle, self._pseudonyms.month(time), pseudonym)
         except OSError:
             self._counts["key_failures"] += 1
             return None
         key = (pseudonym, boot, kind, region)
         if key not in self._streams:  # else its archive is older, and keeps starts as they were sent
-            key = (pseudonym, told, kind, region)
+            key = (pseudonym, boot_pseudonym, kind, region)
         if key not in self._streams and not self._budget.take(witness, 1, self._now):
             self._counts["too_many_streams"] += 1
             return None

@@ -151,10 +151,10 @@ def report(rng: Generator, errors: Errors, p: Passes) -> SimulatedReports:
     bound = log_ndtr((mugrid.CENTRES - used[:, None]) / BOUND_STD)
     above = np.clip((mugrid.CENTRES - used[:, None]) / (mugrid.UPPER - mugrid.LOWER), 0.0, 1.0)
     sloping = bound + errors.slope[who, None] * above
-    told = likelihood(reading, model.stated * relative, model.stated * NOISE_ABSOLUTE)
+    peaked = likelihood(reading, model.stated * relative, model.stated * NOISE_ABSOLUTE)
     std = np.where(p.excited, model.stated * std, np.nan)
     return SimulatedReports(
-        np.where(p.excited, reading, np.nan), std, used, p.manoeuvre, np.where(p.excited[:, None], told, sloping)
+        np.where(p.excited, reading, np.nan), std, used, p.manoeuvre, np.where(p.excited[:, None], peaked, sloping)
     )  # fmt: skip
 
 

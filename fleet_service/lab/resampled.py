@@ -112,8 +112,8 @@ def _scaled(reports: SimulatedReports, row: IntArray, by: FloatArray) -> Simulat
     width = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS
     place = np.clip((mugrid.CENTRES / by[:, None] - mugrid.CENTRES[0]) / width, 0.0, mugrid.BINS - 1.0)
     left = np.minimum(place.astype(np.int64), mugrid.BINS - 2)
-    told, part = reports.log_likelihood[row], place - left
-    below, above = (np.take_along_axis(told, at, axis=1) for at in (left, left + 1))
+    reported, part = reports.log_likelihood[row], place - left
+    below, above = (np.take_along_axis(reported, at, axis=1) for at in (left, left + 1))
     return SimulatedReports(
         reports.reading[row] * by, reports.std[row] * by, reports.used[row] * by, reports.manoeuvre[row],
         below + part * (above - below),

@@ -35,11 +35,11 @@ class TileFile:
             raise _refused(f"{path} is not there")
         try:
             self._table = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, check_same_thread=False)
-            told = dict(self._table.execute("select name, value from metadata where name = 'format'"))
+            metadata = dict(self._table.execute("select name, value from metadata where name = 'format'"))
             least, most = self._table.execute("select min(zoom_level), max(zoom_level) from tiles").fetchone()
         except sqlite3.Error as error:
             raise _refused(f"{path} cannot be read ({error})") from error
-        form = str(told.get("format"))
+        form = str(metadata.get("format"))
         if form not in KINDS or least is None:
             raise _refused(f"{path} holds {form} tiles" if least is not None else f"{path} holds no tile")
         self.kind, self.zooms = KINDS[form], (int(least), int(most))

@@ -32,7 +32,7 @@ def colour_of(mu: float, lower: float, upper: float) -> str:
     return LITTLE
 
 
-def told() -> dict[str, Any]:
+def as_json() -> dict[str, Any]:
     """All of it for the page."""
     return {
         "narrow": NARROW, "middling": MIDDLING, "edges": EDGES, "slippery": SLIPPERY_MU, "four": FOUR, "two": TWO,

@@ -172,7 +172,7 @@ def page_of(features: Iterable[dict[str, Any]], more: bool, address: str, follow
     }  # fmt: skip
 
 
-def told(features: Iterable[dict[str, Any]]) -> Iterable[dict[str, Any]]:
+def with_identity(features: Iterable[dict[str, Any]]) -> Iterable[dict[str, Any]]:
     """Features with their id, and without what the geometry says."""
     names = {field.name for field in COLUMNS}
     for feature in features:

@@ -26,7 +26,7 @@ class ServiceHealth:
     def __init__(self, addresses: list[str]) -> None:
         self._addresses = addresses
         self._lock = threading.Lock()
-        self._told: list[dict[str, Any]] = []
+        self._answers: list[dict[str, Any]] = []
         self._asked = 0.0
         self._before: dict[str, tuple[float, float]] = {}
 
@@ -34,9 +34,9 @@ class ServiceHealth:
         """One entry a service: `address`, `answers`, and what it says."""
         with self._lock:
             if time.monotonic() - self._asked >= KEPT_S:
-                self._told = [self._ask(address) for address in self._addresses]
+                self._answers = [self._ask(address) for address in self._addresses]
                 self._asked = time.monotonic()
-            return self._told
+            return self._answers
 
     def _ask(self, address: str) -> dict[str, Any]:
         try:

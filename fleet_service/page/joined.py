@@ -47,8 +47,8 @@ def joined(modules: Mapping[str, str], main: str) -> str:
     )
 
 
-def _called(name: str, body: str, told: list[str]) -> str:
-    return f"const from_{name} = (() => {{\n{body}return {{ {', '.join(told)} }};\n}})();\n"
+def _called(name: str, body: str, exported: list[str]) -> str:
+    return f"const from_{name} = (() => {{\n{body}return {{ {', '.join(exported)} }};\n}})();\n"
 
 
 def _plain(text: str) -> str:

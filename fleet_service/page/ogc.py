@@ -73,8 +73,8 @@ class FeatureRoutes:
         """Features by place, from `after` on; `next` goes on where this ends, whatever changes meanwhile."""
         question = asked.features(request, time.time_ns())
         if not self._reader.served:
-            told = "no service answers for the map; that is no empty map\n"
-            return PlainTextResponse(told, 503, headers={"Retry-After": "10"})
+            message = "no service answers for the map; that is no empty map\n"
+            return PlainTextResponse(message, 503, headers={"Retry-After": "10"})
         return await run_in_threadpool(self._items, request, question)
 
     def _items(self, request: Request, question: FeatureQuestion) -> Response:
@@ -87,7 +87,7 @@ class FeatureRoutes:
         given = {name: value for name, value in request.query_params.items() if name != "after"}
         stamp = datetime.fromtimestamp((question.at or time.time_ns()) / NS, UTC).isoformat().replace("+00:00", "Z")
         answer = features.page_of(
-            features.told(export.features(geo.with_cells(table))), more, str(request.url),
+            features.with_identity(export.features(geo.with_cells(table))), more, str(request.url),
             f"{address}?{urlencode(given | {'after': last})}", stamp,
         )  # fmt: skip
         return JSONResponse(answer, media_type=GEOJSON, headers={"Cache-Control": "no-store"})
@@ -98,7 +98,7 @@ class FeatureRoutes:
         table = await run_in_threadpool(self._cells, FeatureQuestion(_box(place), after=place - 1, limit=1))
         cell, sector = divmod(place, grid.SECTORS)
         table = table.filter((pa.compute.field("cell") == cell) & (pa.compute.field("sector") == sector))
-        for found in features.told(export.features(geo.with_cells(table))):
+        for found in features.with_identity(export.features(geo.with_cells(table))):
             links = [{"href": f"{_base(request)}{_OWN}", "rel": "collection", "type": features.JSON}]
             return JSONResponse({**found, "links": links}, media_type=GEOJSON)
         return PlainTextResponse("nobody was there: nothing is known\n", 404)

@@ -104,7 +104,7 @@ class Reader:
         here = {token.region for token in services.here}
         known = [keys.chunks(region, grid.REGION_ZOOM) for region in self._queriers]
         fallen = {
-            token.region for token in services.gone
+            token.region for token in services.withdrawn
             if token.region.startswith(tuple("0123"))
             and not any(regions.covers(one, token.region) for one in here)
             and not any(regions.overlap(one, token.region) for one in known)
@@ -130,17 +130,17 @@ class Reader:
                 yield tile, decode_tile(payload)
 
     def _tile(self, sample: zenoh.Sample) -> None:
-        with _told(sample):
+        with _refusals_logged(sample):
             tile = keys.parse(str(sample.key_expr)).quadint
             if tile is not None:
                 self._world.take_tile(tile, decode_tile(sample.payload.to_bytes()), time.time())
 
     def _alert(self, sample: zenoh.Sample) -> None:
-        with _told(sample):
+        with _refusals_logged(sample):
             self._world.take_alert(wire.decode_alert(sample.payload.to_bytes()), time.time())
 
     def _token(self, sample: zenoh.Sample) -> None:
-        with _told(sample):
+        with _refusals_logged(sample):
             parsed = keys.parse(str(sample.key_expr))
             names = self._names[parsed.topic.name]
             (names.add if sample.kind == zenoh.SampleKind.PUT else names.discard)(str(parsed.name))
@@ -219,7 +219,7 @@ def _box_of_expression(region: str) -> list[float]:
 
 
 @contextlib.contextmanager
-def _told(sample: zenoh.Sample) -> Iterator[None]:
+def _refusals_logged(sample: zenoh.Sample) -> Iterator[None]:
     """What a stranger put is no reason to end: it is said, and the next is heard."""
     try:
         yield

@@ -54,7 +54,7 @@ def profile(points: Points, table: pa.Table) -> dict[str, Any]:
         middle = (first + last) // 2
         place = {"from_m": round(float(along[first]), 1), "to_m": round(float(along[last]), 1),
                  "longitude": float(longitude[middle]), "latitude": float(latitude[middle])}  # fmt: skip
-        stretches.append(place | (_told(cells[rows[first]]) if rows[first] >= 0 else {"basis": UNKNOWN}))
+        stretches.append(place | (_described(cells[rows[first]]) if rows[first] >= 0 else {"basis": UNKNOWN}))
         share[stretches[-1]["basis"]] += float(along[last] - along[first]) / length
     measured = [k for k, one in enumerate(stretches) if one["basis"] == "measured"]
     worst = min(measured, key=lambda k: stretches[k]["mu_lower"], default=None)
@@ -66,7 +66,7 @@ def safe_speeds(mu_lower: float) -> dict[str, float]:
     return {str(sight): float(stopping_speed(mu_lower, sight)) for sight in SIGHTS_M}
 
 
-def _told(cell: dict[str, Any]) -> dict[str, Any]:
+def _described(cell: dict[str, Any]) -> dict[str, Any]:
     measured = cell["basis"] == "measured"
     names = ("cell", "sector", "basis", "mu_lower", "mu_upper", "p_slippery", "vehicles", "age_s")
     return {name: cell[name] for name in names} | {

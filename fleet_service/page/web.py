@@ -68,7 +68,7 @@ def application(sources: Sources, hosts: Iterable[str], lifespan: Callable[[Star
         "/base/{z:int}/{x:int}/{y:int}": routes.picture, **routes.features.paths(),
     }  # fmt: skip
     app = Starlette(
-        routes=[Route(path, told(answer)) for path, answer in paths.items()],
+        routes=[Route(path, with_errors(answer)) for path, answer in paths.items()],
         lifespan=lifespan,
     )
     return Guarded(
@@ -107,7 +107,7 @@ class Routes:
         """Numbers and colours that the page computes with."""
         base = self._of.base_map
         return JSONResponse({
-            "colours": colours.told(), "reaction_s": REACTION_S, "sights_m": route.SIGHTS_M,
+            "colours": colours.as_json(), "reaction_s": REACTION_S, "sights_m": route.SIGHTS_M,
             "mu_steps": records.MU_STEPS, "share_steps": records.SHARE_STEPS, "overlay": self._of.overlay is not None,
             "base_map": base and {"address": base.address, "zooms": base.zooms},
         })  # fmt: skip
@@ -142,8 +142,8 @@ class Routes:
         version = self._of.world.version(tile)  # a page passes over what is older than what it holds
         found = self._of.reader.ask(keys.map_key(tile), {"basis": "borrowed"})
         return b"".join(
-            records.TileBlock(told, records.CELL_LEVEL, version, 0, 0.0, records.of_table(table)).encoded()
-            for told, table in found
+            records.TileBlock(key, records.CELL_LEVEL, version, 0, 0.0, records.of_table(table)).encoded()
+            for key, table in found
         )
 
     async def events(self, request: Request) -> Response:
@@ -207,8 +207,8 @@ class Routes:
         if self._of.datex is None:
             return PlainTextResponse("this page publishes no situations; see --datex\n", 404)
         if self._of.datex.document is None:
-            told = "no service has answered yet; that is no dry road\n"
-            return PlainTextResponse(told, 503, headers={"Retry-After": "10"})
+            message = "no service has answered yet; that is no dry road\n"
+            return PlainTextResponse(message, 503, headers={"Retry-After": "10"})
         return Response(self._of.datex.document, media_type="application/xml", headers={"Cache-Control": "no-store"})
 
     async def overlay(self, _: Request) -> Response:
@@ -216,7 +216,7 @@ class Routes:
         return JSONResponse(await run_in_threadpool(overlay.cells, self._of.overlay))
 
 
-def told(answer: Callable[[Request], Awaitable[Response]]) -> Callable[[Request], Awaitable[Response]]:
+def with_errors(answer: Callable[[Request], Awaitable[Response]]) -> Callable[[Request], Awaitable[Response]]:
     """An answer that says what was wrong with a question, and how to mend it."""
 
     async def wrapped(request: Request) -> Response:

@@ -221,10 +221,10 @@ def _joined(parts: list[tuple[Observations, Before]]) -> tuple[Observations, Bef
     of = Observations(
         **{f.name: np.concatenate([getattr(o, f.name) for o, _ in parts]) for f in fields(Observations)}
     )  # fmt: skip
-    told = [before for _, before in parts]
+    befores = [before for _, before in parts]
     return of, Before(
-        late=np.concatenate([b.late for b in told]), late_by=np.concatenate([b.late_by for b in told]),
-        weight=np.concatenate([b.weight for b in told]), error=np.concatenate([b.error for b in told]),
+        late=np.concatenate([b.late for b in befores]), late_by=np.concatenate([b.late_by for b in befores]),
+        weight=np.concatenate([b.weight for b in befores]), error=np.concatenate([b.error for b in befores]),
     )  # fmt: skip
 
 

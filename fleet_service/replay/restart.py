@@ -58,8 +58,8 @@ def restart(root: Path, lateness_s: float, beside: Sequence[str] = ()) -> Restar
             above = tables.pop(ABOVE)["seq"].to_numpy()
             columns = tables.pop(STREAMS)
             streams = SequenceTrackers.of({name: columns[name].to_numpy() for name in columns.column_names}, above)
-            told = {name: tables.pop(name) for name in beside if name in tables}
-            others = {n: {column: t[column].to_numpy() for column in t.column_names} for n, t in told.items()}
+            extra = {name: tables.pop(name) for name in beside if name in tables}
+            others = {n: {column: t[column].to_numpy() for column in t.column_names} for n, t in extra.items()}
             fusion = fusion_from(tables, lateness_s)
         except Exception as error:  # noqa: BLE001 whatever is wrong with it, the log has it all
             log.warning("checkpoint %s is not begun from: %s", path.name, error)

@@ -284,16 +284,16 @@ def holder_of(root: Path, url: str) -> tuple[str, bool]:
         OSError: the folder cannot be read or written.
     """
     path, place = root / HOLDER, {"copy": url, "host": socket.gethostname(), "folder": root.stat().st_ino}
-    told: dict[str, Any] = {}
+    identity: dict[str, Any] = {}
     if path.exists():
         with suppress(ValueError):
-            told = json.loads(path.read_bytes())
-    if not place.items() <= told.items() or "holder" not in told:
-        known, told = told.get("copy") == url, {**place, "holder": secrets.token_hex(8)}
+            identity = json.loads(path.read_bytes())
+    if not place.items() <= identity.items() or "holder" not in identity:
+        known, identity = identity.get("copy") == url, {**place, "holder": secrets.token_hex(8)}
         with written(path) as file:
-            file.write(json.dumps(told).encode())
-        return str(told["holder"]), known
-    return str(told["holder"]), True
+            file.write(json.dumps(identity).encode())
+        return str(identity["holder"]), known
+    return str(identity["holder"]), True
 
 
 def forget_holder(root: Path) -> None:
@@ -307,5 +307,5 @@ def forget_holder(root: Path) -> None:
 
 
 def _read(name: str, content: bytes) -> Held:
-    told: dict[str, Any] = json.loads(content)
-    return Held(int(Path(name).stem), **{**told, "before": tuple(told.get("before", ()))})
+    record: dict[str, Any] = json.loads(content)
+    return Held(int(Path(name).stem), **{**record, "before": tuple(record.get("before", ()))})

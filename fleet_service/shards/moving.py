@@ -71,13 +71,13 @@ def hand_over(session: zenoh.Session, region: str, to: str, say: Callable[[str],
         if service == to:
             return None
         say(f"{service} hands over {_ask(session, service, to)}")
-        end, gone = time.monotonic() + MOVED_S, 0.0
+        end, absent_since = time.monotonic() + MOVED_S, 0.0
         while (now := _server(there, region)) != to:
-            gone = gone or (time.monotonic() if now is None else 0.0)
+            absent_since = absent_since or (time.monotonic() if now is None else 0.0)
             if time.monotonic() > end or now not in (None, service):
                 raise InputError("to", f"{to} does not serve {region}, but {now or 'nobody'} does", "see their logs")
             time.sleep(LOOK_S)
-        return Moved(service, time.monotonic() - (gone or time.monotonic()))
+        return Moved(service, time.monotonic() - (absent_since or time.monotonic()))
 
 
 def _server(there: tokens.Watched, region: str) -> str | None:

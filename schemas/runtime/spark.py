@@ -84,11 +84,11 @@ def spread(session: Any, tasks: Sequence[_Task], work: Callable[[_Task], _Outcom
     frame = session.createDataFrame(pa.table([pa.array(packed, pa.binary())], schema=_TASK))
     each = frame.coalesce(1).repartition(len(tasks))  # out of one partition they go around: one in each
     try:
-        told: pa.Table = each.mapInArrow(done, from_arrow_schema(_TASK)).toArrow()
+        answers: pa.Table = each.mapInArrow(done, from_arrow_schema(_TASK)).toArrow()
     except (PySparkException, Py4JError) as error:
         problem = str(error).strip().partition("\n")[0][:200]
         raise InputError("engine", f"Spark gave up: {problem}", "its log says why; what is done is done") from error
-    outcomes = dict(_unpacked(told["task"]))
+    outcomes = dict(_unpacked(answers["task"]))
     for outcome in outcomes.values():
         if isinstance(outcome, InputError):
             raise outcome

@@ -25,7 +25,7 @@ class _Voice:
     def __init__(self) -> None:
         self.on = False
         self.words = ""
-        self.told: set[str] = set()
+        self.said_once: set[str] = set()
         self.shown: Any = None
         self.timer: threading.Timer | None = None
         self.lock = threading.Lock()
@@ -37,7 +37,7 @@ _voice = _Voice()
 def speak(*, quiet: bool = False) -> None:
     """Let this process talk to a person; a command line calls it."""
     _voice.on = not quiet
-    _voice.told.clear()
+    _voice.said_once.clear()
 
 
 def say(line: str) -> None:
@@ -49,8 +49,8 @@ def say(line: str) -> None:
 
 def say_once(line: str) -> None:
     """A line of progress that is the same however often it is due; on a terminal it is what turns."""
-    if line not in _voice.told:
-        _voice.told.add(line)
+    if line not in _voice.said_once:
+        _voice.said_once.add(line)
         say(line)
 
 

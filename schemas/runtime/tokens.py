@@ -30,7 +30,7 @@ class Watched:
     """Tokens that stand, kept up."""
 
     def __init__(self) -> None:
-        self._guard, self._here, self._gone, self._fell = Lock(), set[Served](), set[Served](), set[Served]()
+        self._guard, self._here, self._withdrawn, self._fell = Lock(), set[Served](), set[Served](), set[Served]()
 
     @property
     def here(self) -> set[Served]:
@@ -39,10 +39,10 @@ class Watched:
             return set(self._here)
 
     @property
-    def gone(self) -> set[Served]:
+    def withdrawn(self) -> set[Served]:
         """Those that stood and fell."""
         with self._guard:
-            return set(self._gone)
+            return set(self._withdrawn)
 
     @property
     def fell(self) -> set[Served]:
@@ -59,7 +59,7 @@ class Watched:
         """A token stands, or fell."""
         with self._guard:
             (self._here.add if stands else self._here.discard)(token)
-            (self._gone.discard if stands else self._gone.add)(token)
+            (self._withdrawn.discard if stands else self._withdrawn.add)(token)
             if not stands:
                 self._fell.add(token)
 
@@ -76,7 +76,7 @@ def watched(session: zenoh.Session) -> Iterator[Watched]:
     # at once, on the thread that receives: what fell is known before the answer to any later question is
     subscriber = session.liveliness().declare_subscriber(_ALL, zenoh.handlers.Callback(hear, indirect=False))
     for token in standing(session):  # a get ends when all were told, which a subscription's history does not
-        if token not in tokens.gone:
+        if token not in tokens.withdrawn:
             tokens.take(token, stands=True)
     try:
         yield tokens

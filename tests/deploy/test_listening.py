@@ -19,7 +19,7 @@ def test_a_town_that_hears_its_own_map_makes_the_same_map_bit_for_bit(monkeypatc
     hearing.drivers = WarnedDrivers(hearing.fleet, 0.0)
     with_, without = hearing.run(40.0), deaf.run(40.0)
     assert hearing.heard.alerts
-    assert len(with_.told_error) > 50, "cells that the map knew, and that it told"
+    assert len(with_.known_error) > 50, "cells that the map knew, and that it told"
     assert not deaf.heard.cells
     assert with_.visits == without.visits > 500
     slots = np.arange(hearing.fusion.size)

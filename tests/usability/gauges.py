@@ -32,8 +32,8 @@ def shown(root: Path) -> Shown:
         published={}, acknowledged={}, rejected={}, late={}, resent_batches=0, bad_acks=0, failures=0
     )
     publisher: Any = SimpleNamespace(
-        unanswered=0, clock_behind_s=0.0, counts=counts, dropped=0, damage=(0, 0), stranded=0, owed_s=0.0, fill=0.0,
-        links=1, unsettled=lambda: 0,
+        unanswered=0, clock_behind_s=0.0, counts=counts, dropped=0, damage=(0, 0), stranded=0, unanswered_s=0.0,
+        fill=0.0, links=1, unsettled=lambda: 0,
     )  # fmt: skip
     progress: Any = SimpleNamespace(behind=0, now_s=0.0, lag_s=0.0)
     return {"service": of_service, "agent": agent_metrics.metrics(publisher, progress)}

@@ -6,15 +6,15 @@ from edge_agent.estimators.bank import EstimatorBank, Part
 from edge_agent.estimators.common.arrays import clear, put
 from edge_agent.estimators.common.output import write_motion, write_quality, write_unknown
 from edge_agent.estimators.estimates import FOUR_FRICTIONS, Column
+from edge_agent.estimators.friction_mixture.beliefs import report_beliefs
 from edge_agent.estimators.friction_mixture.constants import NODES, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.friction_grid import quantile, visit_evidence
 from edge_agent.estimators.friction_mixture.grip_guard import reported_upper
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles, new_filters
+from edge_agent.estimators.friction_mixture.reported_interval import LOWER_END, UPPER_END
 from edge_agent.estimators.friction_mixture.split_sides import BOTH, project
 from edge_agent.estimators.friction_mixture.step import step, velocity
-from edge_agent.estimators.friction_mixture.told import tell_beliefs
-from edge_agent.estimators.friction_mixture.told_interval import LOWER_END, UPPER_END
 from edge_agent.estimators.friction_mixture.workspace import MixtureContext, Scratch
 from schemas.mugrid import CENTRES
 from schemas.numeric import BoolArray, FloatArray
@@ -37,7 +37,7 @@ def mixture_bank(rows: FloatArray, design: MixtureDesign, spreads: FloatArray | 
         _advance,
         columns=FOUR_FRICTIONS,
         evidence=True,
-        beliefs=tell_beliefs,
+        beliefs=report_beliefs,
     )
 
 

@@ -14,7 +14,7 @@ from edge_agent.estimators.friction_mixture.constants import ALL_NODES, NODES, N
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.drive_split import FIRST_ODDS
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory
-from edge_agent.estimators.friction_mixture.told_interval import find_interval
+from edge_agent.estimators.friction_mixture.reported_interval import find_interval
 from edge_agent.estimators.friction_mixture.wheel_readings import refuse_jumps
 from edge_agent.estimators.friction_mixture.workspace import BlockFeatures, Scratch
 from schemas.numeric import FloatArray

@@ -22,11 +22,11 @@ from edge_agent.estimators.friction_mixture.intake import begin_block, take_samp
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantiles
 from edge_agent.estimators.friction_mixture.mixing import awake, drive_on, match_moments, wake_or_sleep
 from edge_agent.estimators.friction_mixture.node_filter import predict_node
+from edge_agent.estimators.friction_mixture.reported_interval import find_interval
 from edge_agent.estimators.friction_mixture.residuals import gained_velocity
 from edge_agent.estimators.friction_mixture.restart import recover, start
 from edge_agent.estimators.friction_mixture.rolling_motion import watch_wheels
 from edge_agent.estimators.friction_mixture.split_sides import BOTH, LEFT, RIGHT, project
-from edge_agent.estimators.friction_mixture.told_interval import find_interval
 from edge_agent.estimators.friction_mixture.trust import judge
 from edge_agent.estimators.friction_mixture.weighing import measure
 from edge_agent.estimators.friction_mixture.workspace import Scratch

@@ -69,7 +69,7 @@ class _Track:
     speed: list[float] = field(default_factory=list)
     mu: list[float] = field(default_factory=list)
     beside: list[float] = field(default_factory=list)
-    told: dict[str, _Raised] = field(default_factory=dict)
+    raised: dict[str, _Raised] = field(default_factory=dict)
     active: tuple[Active, ...] = ()
 
 
@@ -143,13 +143,13 @@ def _ways(fleet: SimulatedFleet, k: int, pose: Pose, known: HeardMap, *, routed:
 
 
 def _look(track: _Track, pose: Pose, known: HeardMap, ways: list[Path]) -> None:
-    track.active, told = warn(track.active, [look_ahead(way, known, pose.time) for way in ways], pose, known)
+    track.active, issued = warn(track.active, [look_ahead(way, known, pose.time) for way in ways], pose, known)
     look = len(track.metre) - 1
-    for one in told:
+    for one in issued:
         if one.state == "raised":
-            track.told[one.id] = _Raised(look, one.distance_m, one.length_m)
+            track.raised[one.id] = _Raised(look, one.distance_m, one.length_m)
         elif one.state == "ended":
-            track.told[one.id].ended = look
+            track.raised[one.id].ended = look
 
 
 def _judge(track: _Track, counts: Approaches) -> None:
@@ -162,13 +162,13 @@ def _judge(track: _Track, counts: Approaches) -> None:
             continue
         counts.came += 1
         start = float(metre[look - 1])  # the ice begins after the look before, at the latest by this one
-        standing = (one.at for one in track.told.values() if one.at < look < one.ended)
+        standing = (one.at for one in track.raised.values() if one.at < look < one.ended)
         late = min((_short(metre, speed, mu, at, start) for at in standing), default=float("inf"))
         counts.warned += late <= 0.0
         if late > 0.0:
             counts.short.append(late)
-    counts.raised += len(track.told)
-    for one in track.told.values():
+    counts.raised += len(track.raised)
+    for one in track.raised.values():
         end = metre[one.at] + one.distance + one.length + 30.0
         ahead = (metre >= metre[one.at] - 10.0) & (metre <= end)
         whole = metre[-1] >= end  # the drive went on so far

@@ -99,8 +99,8 @@ def record(fleet: SimulatedFleet, seconds: float, prior: HeardMap | None = None)
             raise RuntimeError("the default estimator tells no belief")
         if prior is not None:
             now = START_NS
-            told = {k: _belief(prior, int(pipeline.places[k]), now) for k in informed.enters(pipeline.places)}
-            informed.step(pipeline.places, *beliefs, told)
+            map_beliefs = {k: _belief(prior, int(pipeline.places[k]), now) for k in informed.enters(pipeline.places)}
+            informed.step(pipeline.places, *beliefs, map_beliefs)
         columns.append((pipeline.places, *beliefs, fleet.truth.mu_wheel[-1].mean(axis=1)))
     place, own, visit, truth = (np.stack(column) for column in zip(*columns, strict=True))
     return FilterTrace(place, own, visit, truth, published)
@@ -108,17 +108,17 @@ def record(fleet: SimulatedFleet, seconds: float, prior: HeardMap | None = None)
 
 def entry_errors(trace: FilterTrace, known: HeardMap, now: int) -> FloatArray:
     """|error| of the median within FIRST_S of entering a cell that the map knows, (n, 2): with the map and without."""
-    told, alone = with_map(trace, known, now), _medians(np.exp(trace.own))
+    with_prior, alone = with_map(trace, known, now), _medians(np.exp(trace.own))
     since = _since_entry(trace.place)
     first = (since * BLOCK / RATE_HZ < FIRST_S) & np.isin(trace.place, known.keys())
     first[: int(RATE_HZ / BLOCK * 5.0)] = False  # the first seconds of a drive are nobody's entry
-    return np.column_stack([np.abs(one - trace.truth)[first] for one in (told, alone)])
+    return np.column_stack([np.abs(one - trace.truth)[first] for one in (with_prior, alone)])
 
 
 def arrivals(trace: FilterTrace, wrong: HeardMap, right: HeardMap, now: int) -> list[tuple[float, float]]:
     """Seconds from where a map is wrong until |μ - truth| <= ARRIVED, with it and without; the stay, if never."""
     differ = _differ(trace.place, wrong, right, now)
-    told, alone = with_map(trace, wrong, now), _medians(np.exp(trace.own))
+    with_prior, alone = with_map(trace, wrong, now), _medians(np.exp(trace.own))
     out = []
     for k in range(trace.place.shape[1]):
         edges = np.flatnonzero(np.diff(np.concatenate([[False], differ[:, k], [False]]).astype(np.int8)))
@@ -126,7 +126,7 @@ def arrivals(trace: FilterTrace, wrong: HeardMap, right: HeardMap, now: int) -> 
             if last - first < RATE_HZ / BLOCK:  # less than a second there
                 continue
             pair = []
-            for one in (told, alone):
+            for one in (with_prior, alone):
                 near = np.abs(one[first:last, k] - trace.truth[first:last, k]) <= ARRIVED
                 pair.append((int(near.argmax()) if near.any() else last - first) * BLOCK / RATE_HZ)
             out.append((pair[0], pair[1]))
@@ -153,8 +153,8 @@ def with_map(trace: FilterTrace, known: HeardMap, now: int) -> FloatArray:
     """Median of what would be believed with a map, (T, N)."""
     prior, out = MapPrior(trace.place.shape[1]), np.empty(trace.place.shape)
     for t, place in enumerate(trace.place):
-        told = {k: _belief(known, int(place[k]), now) for k in prior.enters(place)}
-        out[t] = mugrid.quantiles(prior.step(place, trace.own[t], trace.visit[t], told), 0.5)
+        map_beliefs = {k: _belief(known, int(place[k]), now) for k in prior.enters(place)}
+        out[t] = mugrid.quantiles(prior.step(place, trace.own[t], trace.visit[t], map_beliefs), 0.5)
     return out
 
 

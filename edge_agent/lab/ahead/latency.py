@@ -70,10 +70,10 @@ def figures(seed: int, alerts: int, vehicles: int = VEHICLES) -> list[Figure]:
 def measure(rng: np.random.Generator, alerts: int, vehicles: int) -> tuple[list[float], float, int]:
     """Seconds of each alert, share of a core per car, and alerts that no warning came of."""
     names = [f"car-{k:04d}" for k in range(vehicles)]
-    told: dict[str, queue.Queue[tuple[float, GripWarning]]] = {name: queue.Queue() for name in names}
+    warned: dict[str, queue.Queue[tuple[float, GripWarning]]] = {name: queue.Queue() for name in names}
 
     def hear(name: str, warning: GripWarning) -> None:
-        told[name].put((time.perf_counter(), warning))
+        warned[name].put((time.perf_counter(), warning))
 
     places = [degrees(np.zeros(1), np.array([APART_M * k]), ORIGIN) for k in range(vehicles)]
 
@@ -103,13 +103,13 @@ def measure(rng: np.random.Generator, alerts: int, vehicles: int) -> tuple[list[
             put = time.perf_counter()
             service.put(_ice(places[k], raised=True))
             try:
-                at, _ = told[names[k]].get(timeout=PATIENCE_S)
+                at, _ = warned[names[k]].get(timeout=PATIENCE_S)
                 waited.append(at - put)
             except queue.Empty:
                 lost += 1
             service.put(_ice(places[k], raised=False))
             try:
-                told[names[k]].get(timeout=PATIENCE_S)
+                warned[names[k]].get(timeout=PATIENCE_S)
             except queue.Empty:
                 lost += 1
         seconds = time.perf_counter() - began

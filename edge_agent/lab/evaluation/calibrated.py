@@ -84,9 +84,9 @@ def narrowed(cars: int, seed: int, judged_s: int = JUDGED_S) -> Narrowed:
     found = []
     for vehicles in (fleet.vehicles, learned):
         mended = np.stack([corrected(t[:, n], signals[:, n], vehicle) for n, vehicle in enumerate(vehicles)], axis=1)
-        told = bank_of(ESTIMATOR, vehicles).advance(t, mended)
-        inside = (told.mu_lower <= mu) & (mu <= told.mu_upper)
-        found += [float((told.mu_upper - told.mu_lower)[judged].mean()), float(inside[judged].mean())]
+        estimated = bank_of(ESTIMATOR, vehicles).advance(t, mended)
+        inside = (estimated.mu_lower <= mu) & (mu <= estimated.mu_upper)
+        found += [float((estimated.mu_upper - estimated.mu_lower)[judged].mean()), float(inside[judged].mean())]
     return Narrowed(*found)
 
 

@@ -231,7 +231,7 @@ def wished_acceleration(
         aim = min(aim, warned_square(d, g, lanes) + 2.0 * WARNED_BRAKES * max(d[Driver.WARNED_START] - reach, 0.0))
     wish = (max(aim, SLOWEST**2) - vx * vx) / (2.0 * reach)
     across = min(abs(vx * x[Motion.YAW_RATE]) / q, 1.0)
-    room = math.sqrt(1.0 - across * across)  # what cornering leaves of the budget
+    longitudinal = math.sqrt(1.0 - across * across)  # what cornering leaves of the budget
     driven = max(
         p[Parameter.DRIVE_FRONT], 1.0 - p[Parameter.DRIVE_FRONT]
     )  # share of the pull on an axle that carries half the vehicle
@@ -244,7 +244,7 @@ def wished_acceleration(
     if stops(t, d[Driver.STOPS], key):
         wish = -STOPPING * q
     hardest = max(q, FRIGHT) if vx * vx > TOO_FAST * aim else q
-    return float(min(max(wish, -max(room, LEAST_BRAKING) * hardest), room * gas))
+    return float(min(max(wish, -max(longitudinal, LEAST_BRAKING) * hardest), longitudinal * gas))
 
 
 @compiled

@@ -47,7 +47,7 @@ class WarnedDrivers:
         self.warned = warned_ones(len(fleet.names), share)
         self._number = {name: k for k, name in enumerate(fleet.names)}
         self._routes: dict[int, GivenRoute] = {}
-        self._told: queue.SimpleQueue[tuple[int, GripWarning]] = queue.SimpleQueue()
+        self._warnings: queue.SimpleQueue[tuple[int, GripWarning]] = queue.SimpleQueue()
 
     def listens(self, k: int) -> bool:
         """Whether vehicle k is warned."""
@@ -59,7 +59,7 @@ class WarnedDrivers:
 
     def hear(self, name: str, warning: GripWarning) -> None:
         """A warning for a driver; from any thread. He acts on it from the next block on, after his reaction."""
-        self._told.put((self._number[name], warning))
+        self._warnings.put((self._number[name], warning))
 
     def heeding(self, blocks: Iterator[Block], hear: Callable[[], None] = lambda: None) -> Iterator[Block]:
         """The blocks, with the drivers told between them what was heard; `hear` is called before each."""
@@ -77,8 +77,8 @@ class WarnedDrivers:
 
     def act(self) -> None:
         """Hand the drivers what was heard for them."""
-        while not self._told.empty():
-            k, warning = self._told.get()
+        while not self._warnings.empty():
+            k, warning = self._warnings.get()
             if warning.state != "ended":  # one that is passed he leaves behind by himself
                 start, end = warning.distance_m - AROUND_M, warning.distance_m + warning.length_m + AROUND_M
                 self._fleet.warn(k, (start, end), warning.safe_speed, warning.mu_lower)

@@ -63,8 +63,8 @@ def test_an_agent_that_nobody_answers_or_whose_outbox_is_full_is_in_trouble(tmp_
     for seed in range(6):
         publisher.offer(*drive(seed))
     until(lambda: publisher.fill > metrics.FULL)
-    until(lambda: publisher.owed_s > 0.0)
-    late.append(metrics.OWED_S)
+    until(lambda: publisher.unanswered_s > 0.0)
+    late.append(metrics.UNANSWERED_S)
     found = metrics.troubles(publisher, Progress())
     assert any(text.startswith("nothing was acknowledged for 6") for text in found)
     assert "the outbox is full: the oldest states go first" in found

@@ -10,7 +10,7 @@ from edge_agent.estimators.friction_mixture.constants import PATCH_NODES
 from edge_agent.estimators.friction_mixture.design import design_of
 from edge_agent.estimators.friction_mixture.friction_grid import quantile
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory
-from edge_agent.estimators.friction_mixture.told_interval import (
+from edge_agent.estimators.friction_mixture.reported_interval import (
     DRAWN_IN,
     LEARNED_END,
     LOWER_END,

@@ -31,13 +31,13 @@ def test_cars_that_come_to_ice_are_counted_and_warned() -> None:
     track = approaches._Track([10.0 * k for k in range(30)], [10.0] * 30, mu, mu)
     approaches._judge(track, deaf)
     assert (deaf.came, deaf.warned) == (1, 0), "who is not told is not warned"
-    track.told = {"ice": approaches._Raised(12, 80.0, 50.0), "nothing": approaches._Raised(2, 30.0, 20.0, ended=8)}
+    track.raised = {"ice": approaches._Raised(12, 80.0, 50.0), "nothing": approaches._Raised(2, 30.0, 20.0, ended=8)}
     approaches._judge(track, deaf)
     assert (deaf.came, deaf.warned, deaf.false) == (2, 1, 1), "the first in time; the second of nothing"
-    track.told["ice"].ended = 18
+    track.raised["ice"].ended = 18
     approaches._judge(track, deaf)
     assert (deaf.came, deaf.warned) == (3, 1), "a warning that was taken back is none"
-    track.told["ice"] = approaches._Raised(18, 20.0, 50.0)
+    track.raised["ice"] = approaches._Raised(18, 20.0, 50.0)
     approaches._judge(track, deaf)
     assert (deaf.came, deaf.warned) == (4, 1), "too late"
     track.mu[16:20] = [0.3] * 4

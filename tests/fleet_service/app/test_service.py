@@ -21,7 +21,7 @@ from schemas import grid, keys, tables, wire
 from schemas.config import ZenohSettings
 from schemas.wire import Batch, Kind
 from tests.fleet_service.conftest import Running, running
-from tests.fleet_service.examples import CELL, LATITUDE, LONGITUDE, REGION, SECOND, TILE, batch, key
+from tests.fleet_service.examples import CELL, LATITUDE, LONGITUDE, REGION, SECOND, TILE, batch, key, send
 from tests.waiting import matched, until
 
 VEHICLES = ("sim-001", "sim-002", "sim-003")
@@ -76,7 +76,7 @@ class Fleet:
         self.tiles.put((str(sample.key_expr), pa.ipc.open_stream(sample.payload.to_bytes()).read_all()))
 
     def publish(self, sent: Batch) -> None:
-        self.session.put(key(sent.vehicle), wire.encode(sent), encoding=wire.ENCODING[sent.kind])
+        send(self.session, sent)
 
     def unsettled(self, sent: list[Batch]) -> list[Batch]:
         """Those that were not acknowledged yet."""

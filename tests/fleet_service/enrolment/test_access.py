@@ -121,7 +121,7 @@ def test_reader_and_vehicle_see_who_serves_and_cannot_say_that_they_do(running: 
         with tokens.watched(reader) as seen:
             assert seen.here == {served}
             token.undeclare()
-            until(lambda: seen.gone == {served})
+            until(lambda: seen.withdrawn == {served})
 
 
 def test_a_new_vehicle_comes_in_while_routers_are_restarted_one_at_a_time(running: Network) -> None:

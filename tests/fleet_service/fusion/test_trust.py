@@ -7,7 +7,7 @@ import pytest
 
 from fleet_service.fusion import Fusion
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.trust import newcomer
+from fleet_service.fusion.trust import initial_trust
 from fleet_service.serve.alerts import Alerts
 from tests.fleet_service.examples import belief, observations, slippery, value
 
@@ -33,8 +33,8 @@ def test_a_group_that_agrees_only_with_itself_loses_its_vote_wherever_it_meets(p
 
 
 def test_a_newcomer_is_believed_less_once_others_are_known() -> None:
-    assert newcomer(False) == pytest.approx(0.75)
-    assert Fusion(120.0).trust(7) == pytest.approx(newcomer(False))
+    assert initial_trust(False) == pytest.approx(0.75)
+    assert Fusion(120.0).trust(7) == pytest.approx(initial_trust(False))
     assert driven().trust(999) == pytest.approx(c.NEWCOMER)
 
 

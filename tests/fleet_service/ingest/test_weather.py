@@ -161,7 +161,8 @@ def test_reports_of_a_day_are_gathered_in_a_file_and_the_map_stays_whatever_a_ch
 def test_a_running_service_takes_weather_over_its_key(
     service: Running, session: zenoh.Session, start: Callable[..., Any]
 ) -> None:
-    publisher = session.declare_publisher(keys.weather_key(REGION))
+    # by default a put is dropped where the link is busy for a millisecond
+    publisher = session.declare_publisher(keys.weather_key(REGION), congestion_control=zenoh.CongestionControl.BLOCK)
     matched(publisher)
     publisher.put(bytes(wire.MAX_BYTES + 1), encoding=wire.WEATHER_ENCODING)
     publisher.put(weather.encode(Report(time.time_ns(), precipitation=2.0)), encoding=wire.WEATHER_ENCODING)

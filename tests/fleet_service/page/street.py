@@ -10,7 +10,7 @@ import zenoh
 
 from schemas import grid, mugrid, wire
 from schemas.numeric import FloatArray, IntArray
-from tests.fleet_service.examples import CELL, at_least, batch, key, value
+from tests.fleet_service.examples import CELL, at_least, batch, send, value
 
 VISIT_NS: Final = 600_000_000  # 10 m at 17 m/s
 ROLLED: Final = 0.25  # grip used where a part is only passed
@@ -74,7 +74,7 @@ def _report(
         mu_utilised=used, used_longitudinal=used * WAYS[CARS.index(car) % 3][0],
         used_lateral=used * WAYS[CARS.index(car) % 3][1],
     )  # fmt: skip
-    session.put(key(car), wire.encode(told), encoding=wire.ENCODING[told.kind])
+    send(session, told)
 
 
 def _drive(parts: Sequence[Part]) -> tuple[IntArray, IntArray, FloatArray]:

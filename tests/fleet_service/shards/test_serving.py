@@ -20,13 +20,13 @@ from fleet_service.app.service import Service
 from fleet_service.cli import main
 from fleet_service.client import map_client, watching
 from fleet_service.shards.serving import claimed, rivals, serving
-from schemas import grid, keys, query, regions, wire
+from schemas import grid, keys, query, regions
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
 from schemas.runtime import tokens
 from schemas.wire import Batch, Kind
 from tests.fleet_service.conftest import Running, running
-from tests.fleet_service.examples import SECOND, batch
+from tests.fleet_service.examples import SECOND, batch, send
 from tests.waiting import until
 
 # Three regions side by side, and a street that begins in the east, so that no order of tiles is its own.
@@ -71,8 +71,7 @@ def three(router: ZenohSettings, folder: Path) -> Iterator[list[Running]]:
 def drive(session: zenoh.Session, services: list[Running]) -> None:
     for car in range(CARS):
         for made in visits(f"sim-{car:03}"):
-            session.put(keys.observation_key(made.region, made.vehicle), wire.encode(made),
-                        encoding=wire.ENCODING[made.kind])  # fmt: skip
+            send(session, made, keys.observation_key(made.region, made.vehicle))
     wanted = CARS * len(LONGITUDES)
     until(lambda: sum(run.service.engine.counts[Kind.OBSERVATION] for run in services) == wanted)
 
@@ -226,8 +225,7 @@ def drive_one(session: zenoh.Session, service: Running) -> None:
     """A car's batches of the middle region."""
     own = [made for made in visits("sim-000") if made.region == REGIONS[1]]
     for made in own:
-        session.put(keys.observation_key(made.region, made.vehicle), wire.encode(made),
-                    encoding=wire.ENCODING[made.kind])  # fmt: skip
+        send(session, made, keys.observation_key(made.region, made.vehicle))
     until(lambda: service.service.engine.counts[Kind.OBSERVATION] == len(own))
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates
-from edge_agent.estimators.friction_mixture.told_interval import LEARNED_END, LOWER_END, UPPER_END
+from edge_agent.estimators.friction_mixture.reported_interval import LEARNED_END, LOWER_END, UPPER_END
 from edge_agent.lab.evaluation.batch import DriveSet, estimates, realistic
 from edge_agent.lab.evaluation.measures import bounds, consistency
 from edge_agent.lab.evaluation.reliability import LEVELS, between_quantiles, on_the_grid, shares, watched

@@ -15,7 +15,7 @@ from schemas.runtime.records import Records
 
 
 @compiled
-def tell_beliefs(
+def report_beliefs(
     filters: Records[MixtureMemory], contexts: Records[MixtureContext], own: FloatArray, visit: FloatArray
 ) -> None:
     """Write log(posterior/uniform) of each filter, and its evidence in the visit so far; both (N, 32), maximum 0."""
