@@ -111,6 +111,7 @@ BARS: Final = (
     EstimatorBar("default.spin.coverage90", of("default.spin", "coverage90"), SHARE, 0.80, "more"),
     EstimatorBar("real_world.standing_5pct.v_max", in_the_world("standing_5pct.v_max"), M_S, 0.2, "less"),
     EstimatorBar("real_world.false_ice", in_the_world("false_ice"), SHARE, 0.002, "less"),
+    EstimatorBar("real_world.false_ice.of_all", in_the_world("false_ice.of_all"), SHARE, 0.002, "less"),
     EstimatorBar("real_world.below", in_the_world("below"), SHARE, 0.002, "less"),
     EstimatorBar("real_world.coverage90", in_the_world("coverage90"), SHARE, 0.88, "more"),
     *(

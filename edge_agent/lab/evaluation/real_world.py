@@ -5,9 +5,9 @@ are over samples, so that a minute on dry road weighs a minute.
 
 Legend
     surface       by the mean friction of the four wheels: ice to .2, snow to .45, wet to .75, dry above
-    false ice     share of all samples whose whole interval lies below SLIPPERY_MU on a road above SURE_GRIP; "strict":
-                  share of those on wet and dry road; "settled": of those that left snow and ice SETTLED_S ago, or never
-                  met any: who drives off the ice learns of it when he uses the grip
+    false ice     share of the samples on wet and dry road whose whole interval lies below SLIPPERY_MU; "settled": of
+                  those that left snow and ice SETTLED_S ago, or never met any: who drives off the ice learns of it
+                  when he uses the grip; "of_all": share of all samples that are such on a road above SURE_GRIP
     below         share of all samples whose upper end lies below the grip in use: certainly wrong
     excited       some wheel used EXCITED_SHARE of its grip within the last second
     contradiction share of the samples in which the estimator says that no friction explains its data (health)
@@ -115,8 +115,8 @@ def count(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatArray) 
             tally.add(f"contradiction_share.{name}.{kind}", contradicted, (mu > above) & (mu <= most) & among)
     tally.add("coverage90.no_torque", inside[:, np.isnan(batch.signals[:, :, S.TORQUE]).all(axis=0)])
     icy, grips = reported.mu_upper < SLIPPERY_MU, mu > SURFACES["wet"][0]
-    tally.add("false_ice", icy & (mu > SURE_GRIP))
-    tally.add("false_ice.strict", icy, grips)
+    tally.add("false_ice", icy, grips)
+    tally.add("false_ice.of_all", icy & (mu > SURE_GRIP))
     tally.add("false_ice.settled", icy, grips & ~lately(~grips, SETTLED_S).astype(bool))
     tally.add("below", reported.mu_upper < in_use(batch))
     tally.add("width", width / (PRIOR[1] - PRIOR[0]), excited)

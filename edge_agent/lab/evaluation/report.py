@@ -141,8 +141,8 @@ def oracles(barred: Sequence[Figure], values: dict[str, float]) -> str:
 def world(values: dict[str, float]) -> str:
     """One row per estimator in the rough world."""
     shown = {
-        "coverage90": "coverage", "coverage90.ice": "on ice", "false_ice": "false ice", "false_ice.strict": "strict",
-        "false_ice.settled": "settled", "below": "below",
+        "coverage90": "coverage", "coverage90.ice": "on ice", "false_ice": "false ice",
+        "false_ice.of_all": "of all", "false_ice.settled": "settled", "below": "below",
         "width": "width, excited", "score": "score", "rmse_vx": "rmse_vx", "coverage90.vx": "coverage of v_x",
         "rmse_vy": "rmse_vy", "coverage90.vy": "coverage of v_y", "lost": "lost",
         "standing_5pct.v_max": "standing [m/s]",
