@@ -8,7 +8,7 @@ PAPERS := .venv/.papers
 TESTS := $(BIN)/python -m pytest -q --numprocesses $$(( $$(getconf _NPROCESSORS_ONLN) + 1 )) --dist loadfile
 export PYTHONDONTWRITEBYTECODE :=  # what was parsed once is kept: tests start hundreds of processes
 
-.PHONY: setup demo test test-all test-shuffled check package docs lint types faults faults-quick cluster-faults soak bench tune proto lock clean analytics-bench spark-test usability figures roads-bench page-bench ahead-bench browser-test batch-bench
+.PHONY: setup demo test test-all test-shuffled check package docs lint types faults faults-quick cluster-faults soak bench tune proto lock clean analytics-bench spark-test usability figures roads-bench page-bench ahead-bench browser-test batch-bench image kube
 
 setup: $(STAMP)  ## make .venv and install everything, pinned
 
@@ -77,6 +77,12 @@ usability: setup  ## the first hour of a new user as figures; wants chromium and
 
 figures: setup  ## keep what the campaigns' last runs measured in deploy/figures, and write the READMEs' numbers anew
 	$(BIN)/python -m tests.usability.kept
+
+image: setup  ## the steps of deploy/Dockerfile as a script, and a service of what they leave
+	$(BIN)/python -m tests.image
+
+kube: setup  ## manifests for Kubernetes: validated, and their pods' commands started; wants kubectl; .kube/figures.json
+	$(BIN)/python -m tests.deploy.kubernetes
 
 cluster-faults: setup  ## services that follow each other, a hundred times; writes .faults/cluster/figures.json
 	$(BIN)/python -m tests.faults.cluster

@@ -5,6 +5,7 @@ An object is there whole or not at all, and durable when its put has returned; a
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 
 SCHEMES: Final = re.compile(r"(s3|gs|az|abfss?)://[^/]+")  # a folder or memory would not be a second place
 CONNECT_S: Final = 2.0
+_ENDPOINTS: Final = ("AWS_ENDPOINT_URL", "AWS_ENDPOINT")
+_TOOK: Final = re.compile(r" in [\d.]+[^\s\d]*s\b")
 _TEXT: Final = 160  # characters of an error; what the server says as XML may name keys
 
 
@@ -50,7 +53,8 @@ class ObjectBucket:
             raise InputError("archive.copy", "a copy needs obstore, which is not installed", fix) from error
         self._do, self._known, self._missing = obstore, AlreadyExistsError, (NotFoundError, FileNotFoundError)
         self._failed: tuple[type[Exception], ...] = (BaseError, OSError)
-        plain = options.get("endpoint", options.get("aws_endpoint", "")).startswith("http://")
+        places = (options.get("endpoint"), options.get("aws_endpoint"), *map(os.environ.get, _ENDPOINTS))
+        plain = next((place for place in places if place), "").startswith("http://")
         seconds = {"timeout": f"{timeout_s:g}s", "connect_timeout": f"{CONNECT_S:g}s"}
         client: Any = {**seconds, **({"allow_http": True} if plain else {})}  # else the environment decides
         retry: Any = {"max_retries": 2, "retry_timeout": timedelta(seconds=timeout_s)}
@@ -164,6 +168,7 @@ class ObjectBucket:
 
 
 def reason(error: BaseException) -> str:
-    """The first words of an error: no headers, and nothing of what the server answered."""
+    """The first words of an error: no headers, nothing of what the server answered, and not how long it took, so that
+    the same trouble is the same line."""
     line = (str(error).splitlines() or [type(error).__name__])[0]
-    return line.partition("<")[0].strip()[:_TEXT]
+    return _TOOK.sub("", line.partition("<")[0]).strip()[:_TEXT]

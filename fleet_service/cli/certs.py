@@ -17,6 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--fleet", metavar="FILE", type=Path, required=True, help="JSON: who takes part, by role")
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="run it again to renew and to revoke")
+    parser.add_argument("--at", metavar="DIR", type=Path, help="where the routers' files will lie (default: --out)")
     parser.add_argument("--days", type=float, default=365.0, help="how long a certificate is good (default 365)")
     parser.add_argument("--ca-days", type=float, default=3650.0, help="how long a new authority is good (default 3650)")
     parser.add_argument("--renew-days", type=float, default=30.0, help="renew what ends sooner (default 30)")
@@ -42,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     except ImportError as error:
         raise InputError("certs", "the package cryptography is missing", "pip install 'gripmap[certs]'") from error
     try:
-        registry = Registry(out, Terms(*days), datetime.now(UTC))
+        registry = Registry(out, Terms(*days), datetime.now(UTC), arguments.at)
         leaving = registry.leaving(fleet)
         if arguments.dry_run:
             print(f"would revoke {len(leaving)}: {', '.join(leaving) or 'nobody'}")

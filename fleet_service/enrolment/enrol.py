@@ -52,10 +52,11 @@ class Registry:
         folder: DIR of `authority`; made if it is not there.
         terms: validity.
         now: the time, with zone.
+        used_at: folder in which the routers will find their files (default: `folder`).
     """
 
-    def __init__(self, folder: Path, terms: Terms, now: datetime) -> None:
-        self._folder, self._terms, self._now = folder, terms, now
+    def __init__(self, folder: Path, terms: Terms, now: datetime, used_at: Path | None = None) -> None:
+        self._folder, self._terms, self._now, self._used_at = folder, terms, now, used_at or folder
         self._authority = folder / "authority"
         self._revoked = folder / "revoked"
         folder.mkdir(parents=True, exist_ok=True)
@@ -85,7 +86,7 @@ class Registry:
         done.revoked += self._revoke(self.leaving(fleet))
         self._trust()
         for name in fleet.routers:
-            text = json.dumps(router_configuration(fleet, name, self._folder), indent=1)
+            text = json.dumps(router_configuration(fleet, name, self._used_at), indent=1)
             ca.write(self._folder / f"{name}.json5", text.encode() + b"\n", 0o644)
         return done
 

@@ -50,6 +50,7 @@ CAMPAIGNS: Final = {
     "demo": Campaign("make demo", ".demo", "demo"),
     "bench": Campaign("make bench", ".bench", "bench"),
     "faults": Campaign("make faults", ".faults", "faults"),
+    "kube": Campaign("make kube", ".kube", "kube"),
     "page": Campaign("make page-bench", ".page", "page"),
     "roads": Campaign("make roads-bench", ".roads", "roads"),
     "usability": Campaign("make usability", ".usability", "usability"),

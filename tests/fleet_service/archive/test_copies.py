@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from fleet_service.archive import copies, layout, segments
-from fleet_service.archive.bucket import CopyError
+from fleet_service.archive.bucket import CopyError, ObjectBucket
 from fleet_service.archive.compaction import compact
 from fleet_service.archive.copied import copy_of
 from fleet_service.archive.copies import OWNER, Copy
@@ -223,6 +223,23 @@ def test_settings_that_cannot_be_used_say_which_and_why(tmp_path: Path, monkeypa
     monkeypatch.setitem(sys.modules, "obstore", None)
     with pytest.raises(InputError, match="obstore, which is not installed.*gripmap\\[objects\\]"):
         Copy(tmp_path, "s3://bucket", {})
+
+
+def test_a_bucket_is_reached_by_the_environment_alone_and_the_same_trouble_is_the_same_line(
+    bucket: BucketServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in bucket.store.items():
+        monkeypatch.setenv(f"AWS_{name.upper()}", value)
+    there = ObjectBucket(bucket.url, {}, 5.0)
+    there.put("some/thing", b"1")
+    assert there.get("some/thing") == b"1"
+    bucket.stop()
+    lines = set()
+    for _ in range(3):
+        with pytest.raises(CopyError) as raised:
+            there.names("some")
+        lines.add(str(raised.value))
+    assert len(lines) == 1
 
 
 def test_a_folder_alone_is_an_archive_and_secrets_do_not_show(tmp_path: Path) -> None:

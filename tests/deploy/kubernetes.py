@@ -1,0 +1,331 @@
+"""The manifests of deploy/kubernetes: built by kustomize, held against Kubernetes' schemas, and their pods started.
+
+    python -m tests.deploy.kubernetes        writes .kube/figures.json: kube.invalid, kube.commands_failed
+
+A pod is its containers as processes with command, environment and mounts of the manifest; each path of a mount lies
+below a folder of that pod, and names of pods and their ports are those of this machine. Nothing is applied to a
+cluster: what only a cluster has (volumes' kinds, policies, load balancers) is looked at in the text.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from ruamel.yaml import YAML
+
+from fleet_service.cli import main as fleet_service
+from schemas.runtime.figures import Figure, markdown, write
+from schemas.runtime.jit import cache_root
+from tests.buckets import BucketServer, bucket_server
+from tests.house import ROOT
+from tests.waiting import until
+
+FOLDER: Final = ROOT / "deploy" / "kubernetes"
+OVERLAYS: Final = ("one-node", "secure", "three-regions")
+VERSION: Final = "1.32"  # of the schemas
+BUCKET: Final = "gripmap-archive"
+START_S: Final = 300.0  # kernels may have to be compiled, on a machine that is busy
+Manifest = dict[str, Any]
+
+
+def built(overlay: str) -> list[Manifest]:
+    """The objects that `kubectl apply -k` would send."""
+    words = ["kubectl", "kustomize", str(FOLDER / overlay)]
+    done = subprocess.run(words, check=True, capture_output=True, text=True)
+    return [dict(one) for one in YAML(typ="safe").load_all(done.stdout) if one]
+
+
+def invalid(objects: list[Manifest]) -> list[str]:
+    """What Kubernetes' schemas find wrong, strictly: unknown fields too."""
+    import kubernetes_validate
+
+    found = []
+    for one in objects:
+        try:
+            kubernetes_validate.validate(one, VERSION, strict=True)
+        except kubernetes_validate.ValidationError as error:
+            found.append(f"{one['kind']} {one['metadata']['name']}: {error.message}")
+    return found
+
+
+def of_kind(objects: list[Manifest], kind: str) -> list[Manifest]:
+    """Those of a kind."""
+    return [one for one in objects if one["kind"] == kind]
+
+
+@dataclass
+class Pod:
+    """One pod of a StatefulSet; `root` is where its mounts lie."""
+
+    name: str
+    template: Manifest
+    claims: list[str]
+    root: Path
+    ports: dict[int, int] = field(default_factory=dict)  # of its containers, by those that it has here
+
+    @property
+    def containers(self) -> list[Manifest]:
+        """Those that go on."""
+        return list(self.template["spec"]["containers"])
+
+    @property
+    def grace_s(self) -> float:
+        """How long it may take to leave [s]."""
+        return float(self.template["spec"]["terminationGracePeriodSeconds"])
+
+    def port(self, container: Manifest, named: str | int) -> int:
+        """A container's port, by name or number, on this machine."""
+        numbers = {one["name"]: one["containerPort"] for one in container.get("ports", [])}
+        return self.ports[numbers.get(named, named)]
+
+
+def pods(objects: list[Manifest], root: Path) -> list[Pod]:
+    """Every pod of every StatefulSet, with free ports."""
+    found = []
+    for one in of_kind(objects, "StatefulSet"):
+        claims = [claim["metadata"]["name"] for claim in one["spec"].get("volumeClaimTemplates", [])]
+        for k in range(one["spec"]["replicas"]):
+            name = f"{one['metadata']['name']}-{k}"
+            pod = Pod(name, one["spec"]["template"], claims, root / name)
+            numbers = [port["containerPort"] for part in pod.containers for port in part.get("ports", [])]
+            pod.ports = dict(zip(numbers, free_ports(len(numbers)), strict=True))
+            found.append(pod)
+    return found
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports that nobody has now."""
+    with ExitStack() as stack:
+        sockets = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
+        return [int(one.getsockname()[1]) for one in sockets]
+
+
+class Cluster:
+    """An overlay's pods on this machine."""
+
+    def __init__(self, overlay: str, root: Path) -> None:
+        self.overlay, self.root, self.objects = overlay, root, built(overlay)
+        self.pods = pods(self.objects, root)
+        self.failed: list[str] = []
+        self._configs = {one["metadata"]["name"]: dict(one["data"]) for one in of_kind(self.objects, "ConfigMap")}
+        self._environment = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+        self.certificates = root / "certs"
+        for data in self._configs.values():
+            for name, text in data.items():
+                data[name] = self._here(name, text)
+        fleet = next((data["fleet.json"] for data in self._configs.values() if "fleet.json" in data), None)
+        if fleet is not None:
+            (root / "fleet.json").write_text(fleet)
+            words = ["--fleet", str(root / "fleet.json"), "--out", str(self.certificates), "--at", "/etc/gripmap/certs"]
+            assert fleet_service(["certs", *words]) == 0
+
+    def _here(self, name: str, text: str) -> str:
+        """A file's text with the addresses of this machine."""
+        for pod in self.pods:
+            for number, port in pod.ports.items():
+                text = text.replace(f"{pod.name}.routers:{number}", f"127.0.0.1:{port}")
+        if name == "fleet.json":
+            fleet = json.loads(text)
+            for router, settings in fleet["routers"].items():
+                (pod,) = (one for one in self.pods if one.name == router)
+                settings |= {"hosts": ["127.0.0.1"], "listen": "127.0.0.1", "port": pod.ports[settings["port"]]}
+            return json.dumps(fleet)
+        for pod in self.pods:
+            if name in (f"{pod.name}.json", "router.json5"):  # its own settings
+                for number, port in pod.ports.items():
+                    text = text.replace(f'"metrics_port": {number}', f'"metrics_port": {port}')
+                    text = text.replace(f"tcp/0.0.0.0:{number}", f"tcp/127.0.0.1:{port}")
+                break
+        return text.replace('"metrics_host": "0.0.0.0"', '"metrics_host": "127.0.0.1"')
+
+    def _placed(self, pod: Pod, container: Manifest, text: str) -> str:
+        """A text with the paths of a container's mounts below the pod's folder."""
+        for mount in sorted(container.get("volumeMounts", []), key=lambda one: -len(one["mountPath"])):
+            if mount["mountPath"] != "/tmp":
+                text = text.replace(mount["mountPath"], str(self._folder(pod, mount)))
+        return text.replace("/var/cache/gripmap", str(self.root / "image-cache"))
+
+    @staticmethod
+    def _folder(pod: Pod, mount: Manifest) -> Path:
+        return pod.root / str(mount["name"])
+
+    def _mount(self, pod: Pod) -> None:
+        """Fill the volumes of a pod."""
+        volumes = {one["name"]: one for one in pod.template["spec"]["volumes"]}
+        for container in [*pod.template["spec"].get("initContainers", []), *pod.containers]:
+            for mount in container.get("volumeMounts", []):
+                folder = self._folder(pod, mount)
+                folder.mkdir(parents=True, exist_ok=True)
+                volume = volumes.get(mount["name"])
+                if volume is None:
+                    assert mount["name"] in pod.claims, f"{pod.name}: no volume {mount['name']}"
+                elif "configMap" in volume:
+                    for name, text in self._configs[volume["configMap"]["name"]].items():
+                        (folder / name).write_text(self._placed(pod, container, text))
+                elif "secret" in volume:
+                    self._unpack(pod, container, folder)
+
+    def _unpack(self, pod: Pod, container: Manifest, folder: Path) -> None:
+        """What the documented command puts into a secret of certificates: those of its pods, and whom they trust."""
+        of = pod.name.rpartition("-")[0]
+        for path in [*self.certificates.glob(f"{of}-*.*"), self.certificates / "trust.pem"]:
+            (folder / path.name).write_text(self._placed(pod, container, path.read_text()))
+
+    def _words(self, pod: Pod, container: Manifest) -> list[str]:
+        given = {one["name"]: self._value(pod, one) for one in container.get("env", [])}
+        words = [self._placed(pod, container, word) for word in container["command"]]
+        for name, value in given.items():
+            words = [word.replace(f"$({name})", value) for word in words]
+        return words
+
+    def _value(self, pod: Pod, one: Manifest) -> str:
+        if "value" in one:
+            return str(one["value"])
+        assert one["valueFrom"] == {"fieldRef": {"fieldPath": "metadata.name"}}
+        return pod.name
+
+    def _environment_of(self, pod: Pod, container: Manifest, secrets: dict[str, dict[str, str]]) -> dict[str, str]:
+        given = {one["name"]: self._value(pod, one) for one in container.get("env", [])}
+        for one in container.get("envFrom", []):
+            given |= secrets[one["secretRef"]["name"]]
+        return self._environment | {name: self._placed(pod, container, value) for name, value in given.items()}
+
+    @contextmanager
+    def running(self, bucket: BucketServer | None = None) -> Iterator[Cluster]:
+        """Every pod started; each probe answers before the block begins, and each leaves well after it."""
+        kept = cache_root()
+        image = self.root / "image-cache"
+        image.mkdir()
+        if kept is not None:  # what an image has compiled
+            (image / "gripmap").symlink_to(kept)
+        secrets = {"bucket": _bucket_environment(bucket)} if bucket else {}
+        started: list[tuple[Pod, Manifest, subprocess.Popen[bytes]]] = []
+        with ExitStack() as stack:
+            for pod in self.pods:
+                self._mount(pod)
+                for container in pod.template["spec"].get("initContainers", []):
+                    done = subprocess.run(self._words(pod, container), capture_output=True, text=True, check=False)
+                    if done.returncode:
+                        self.failed.append(f"{pod.name}: {container['name']}: {done.stderr}")
+                for container in pod.containers:
+                    log = stack.enter_context((pod.root / f"{container['name']}.log").open("wb"))
+                    environment = self._environment_of(pod, container, secrets)
+                    process = subprocess.Popen(
+                        self._words(pod, container), cwd=pod.root, env=environment, stdout=log, stderr=log
+                    )
+                    started.append((pod, container, stack.enter_context(process)))
+                    stack.callback(process.kill)
+            for pod, container, process in started:
+                self._await(pod, container, process)
+            yield self
+            for pod, container, process in reversed(started):
+                process.send_signal(signal.SIGTERM)
+                try:
+                    code = process.wait(pod.grace_s)
+                except subprocess.TimeoutExpired:
+                    code = -1
+                if code:
+                    self.failed.append(f"{pod.name}: {container['name']} left with {code}")
+
+    def _await(self, pod: Pod, container: Manifest, process: subprocess.Popen[bytes]) -> None:
+        """Wait until its probes hold: the one of the start first, as a kubelet would."""
+        names = [name for name in ("startupProbe", "readinessProbe", "livenessProbe") if name in container]
+        assert "readinessProbe" in names
+        for name in names:
+            holds = partial(answers, pod, container, container[name])
+            try:
+                until(lambda holds=holds: process.poll() is not None or holds(), START_S)  # type: ignore[misc]
+            except TimeoutError:
+                self.failed.append(f"{pod.name}: {name} never answered")
+                return
+            if process.poll() is not None:
+                log = (pod.root / f"{container['name']}.log").read_text()[-2000:]
+                self.failed.append(f"{pod.name}: {container['name']} ended with {process.returncode}: {log}")
+                return
+
+    def fetch(self, pod: Pod, path: str) -> str:
+        """A page of a pod's metrics server."""
+        (container,) = pod.containers
+        with urllib.request.urlopen(f"http://127.0.0.1:{pod.port(container, 'metrics')}{path}", timeout=5.0) as page:
+            return str(page.read().decode())
+
+
+def answers(pod: Pod, container: Manifest, probe: Manifest) -> bool:
+    """Whether a probe holds."""
+    if "tcpSocket" in probe:
+        with socket.socket() as one:
+            one.settimeout(1.0)
+            return one.connect_ex(("127.0.0.1", pod.port(container, probe["tcpSocket"]["port"]))) == 0
+    asked = probe["httpGet"]
+    try:
+        address = f"http://127.0.0.1:{pod.port(container, asked['port'])}{asked['path']}"
+        with urllib.request.urlopen(address, timeout=5.0) as page:
+            return 200 <= int(page.status) < 400
+    except (urllib.error.URLError, OSError):
+        return False
+
+
+def _bucket_environment(bucket: BucketServer) -> dict[str, str]:
+    return {
+        "AWS_ENDPOINT": bucket.store["endpoint"], "AWS_REGION": bucket.store["region"], "AWS_ALLOW_HTTP": "true",
+        "AWS_ACCESS_KEY_ID": bucket.store["access_key_id"], "AWS_DISABLE_BULK_DELETE": "true",
+        "AWS_SECRET_ACCESS_KEY": bucket.store["secret_access_key"],
+    }  # fmt: skip
+
+
+@contextmanager
+def cluster(overlay: str, root: Path) -> Iterator[Cluster]:
+    """An overlay that runs, with a bucket beside it where its pods want one."""
+    made = Cluster(overlay, root)
+    wanted = any("envFrom" in container for pod in made.pods for container in pod.containers)
+    with ExitStack() as stack:
+        bucket = stack.enter_context(bucket_server(root / "objects")) if wanted else None
+        (root / "objects" / BUCKET).mkdir(parents=True, exist_ok=True)
+        yield stack.enter_context(made.running(bucket))
+
+
+def main() -> int:
+    """Validate and start every overlay; 1 where a bar does not hold."""
+    wrong, failed, objects, started = list[str](), list[str](), 0, 0
+    for overlay in OVERLAYS:
+        found = built(overlay)
+        objects += len(found)
+        wrong += [f"{overlay}: {line}" for line in invalid(found)]
+        with tempfile.TemporaryDirectory() as folder:
+            began = time.monotonic()
+            with cluster(overlay, Path(folder)) as running:
+                started += len(running.pods)
+            failed += [f"{overlay}: {line}" for line in running.failed]
+            print(f"{overlay}: {len(found)} objects, {len(running.pods)} pods in {time.monotonic() - began:.0f} s")
+    for line in (*wrong, *failed):
+        print(line)
+    figures = [
+        Figure("kube.invalid", len(wrong), "of the objects", 0), Figure("kube.objects", objects, "objects"),
+        Figure("kube.commands_failed", len(failed), "of the containers", 0),
+        Figure("kube.pods", started, "pods started as processes", 9, "more"),
+    ]  # fmt: skip
+    write(ROOT / ".kube" / "figures.json", "kube", [0], figures)
+    print(markdown(figures))
+    return int(not all(figure.holds for figure in figures))
+
+
+if __name__ == "__main__":
+    if shutil.which("kubectl") is None:
+        sys.exit("error: kubectl: is not installed; it builds the manifests")
+    sys.exit(main())

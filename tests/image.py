@@ -1,0 +1,143 @@
+"""`make image`: the steps of deploy/Dockerfile as a script, below a folder of their own: no container engine is needed.
+
+The Python is this machine's of the version that FROM names, in a fresh environment; folders of the image lie below
+another root. What the image then holds is started: a router, and a service that is ready without compiling anything.
+Users cannot be changed here: what USER names is only looked at.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Final
+
+from schemas.runtime.talk import COMPILING
+from tests.house import ROOT
+from tests.packaging import candidates
+from tests.waiting import until
+
+DOCKERFILE: Final = ROOT / "deploy" / "Dockerfile"
+PLACES: Final = ("/src", "/etc/gripmap", "/var/lib/gripmap", "/var/cache/gripmap")
+OURS: Final = ("PIP_", "SSL_", "REQUESTS_", "CURL_", "HTTP", "HTTPS", "NO_PROXY", "http_", "https_", "no_proxy")
+START_S: Final = 60.0
+
+
+def steps(text: str) -> list[tuple[str, str]]:
+    """Instruction and its words, a line each, without remarks."""
+    lines = [line for line in text.splitlines() if not line.lstrip().startswith("#")]
+    joined = re.sub(r"\\\n", " ", "\n".join(lines))
+    parted = [line.partition(" ") for line in joined.splitlines() if line.strip()]
+    return [(name, rest.strip()) for name, _, rest in parted]
+
+
+class Image:
+    """What the steps leave, below `root`."""
+
+    def __init__(self, root: Path) -> None:
+        self.root, self.user = root, "root"
+        self.folder = root
+        kept = {name: value for name, value in os.environ.items() if name.startswith(OURS)}
+        self.environment = {**kept, "HOME": str(root / "home"), "LANG": "C.UTF-8"}
+
+    def here(self, text: str) -> str:
+        """A text with the folders of the image below the root, and this user for its owner."""
+        for place in PLACES:
+            text = re.sub(rf"(?<![\w.]){re.escape(place)}\b", str(self.root) + place, text)
+        return re.sub(r"chown (-R )?\d+:\d+", rf"chown \g<1>{os.getuid()}:{os.getgid()}", text)
+
+    def take(self, name: str, words: str) -> None:
+        """Do one instruction."""
+        if name == "FROM":
+            self._begin(words)
+        elif name == "WORKDIR":
+            self.folder = Path(self.here(words))
+            self.folder.mkdir(parents=True, exist_ok=True)
+        elif name == "COPY":
+            *sources, to = words.split()
+            for source in sources:
+                self._copy(ROOT / source, self.folder / to)
+        elif name == "ENV":
+            key, _, value = words.partition("=")
+            self.environment[key] = self.here(value)
+        elif name == "USER":
+            self.user = words
+        elif name == "RUN":
+            self.run("bash", "-euc", self.here(words))
+        else:
+            raise SystemExit(f"error: {name}: is no step that is known here")
+
+    def run(self, *words: str) -> None:
+        """Run a command of the image; an end that is not 0 ends this."""
+        subprocess.run(words, cwd=self.folder, env=self.environment, check=True)
+
+    def _begin(self, base: str) -> None:
+        version = re.fullmatch(r"python:(\d+\.\d+)-slim", base)
+        assert version, base
+        asked = "import sys; print('%d.%d' % sys.version_info[:2])"
+        for command in candidates(version[1]):
+            done = subprocess.run([command, "-c", asked], capture_output=True, text=True, check=False)
+            if done.stdout.strip() == version[1]:
+                subprocess.run([command, "-m", "venv", self.root / "usr"], check=True)
+                self.environment["PATH"] = f"{self.root / 'usr' / 'bin'}:/usr/bin:/bin"
+                return
+        raise SystemExit(f"error: Python {version[1]}: is not on this machine")
+
+    @staticmethod
+    def _copy(source: Path, to: Path) -> None:
+        if source.is_dir():
+            shutil.copytree(source, to, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(source, to / source.name if to.is_dir() else to)
+
+
+def starts(image: Image) -> float:
+    """Seconds until a service of the image is ready at a router of it; nothing may be compiled."""
+    port = "127.0.0.1:0"
+    with subprocess.Popen(
+        ["python", "-m", "deploy.router", "--listen", f"tcp/{port}"],
+        cwd=image.folder, env=image.environment, stdout=subprocess.PIPE, text=True,
+    ) as router:  # fmt: skip
+        assert router.stdout is not None
+        endpoint = router.stdout.readline().split()[1]
+        config, lines = image.folder / "service.json", image.folder / "lines"
+        config.write_text(f'{{"zenoh": {{"connect": ["{endpoint}"]}}}}')
+        began = time.monotonic()
+        with lines.open("w") as out:
+            words = ["fleet-service", "run", "--config", str(config), "--archive", str(image.folder / "archive")]
+            service = subprocess.Popen(words, cwd=image.folder, env=image.environment, stdout=out, stderr=out)
+        until(lambda: service.poll() is not None or "ready: " in lines.read_text(), START_S)
+        took = time.monotonic() - began
+        for process in (service, router):
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(30) == 0, lines.read_text()
+    assert "ready: " in lines.read_text()
+    assert COMPILING not in lines.read_text(), "its kernels were compiled when it was built"
+    return took
+
+
+def main() -> int:
+    """Build it, and start what it holds."""
+    with tempfile.TemporaryDirectory() as folder:
+        image = Image(Path(folder))
+        (image.root / "home").mkdir()
+        for name, words in steps(DOCKERFILE.read_text()):
+            began = time.monotonic()
+            image.take(name, words)
+            print(f"{time.monotonic() - began:6.1f} s  {name} {shlex.quote(words)[:100]}", flush=True)
+        user, _, group = image.user.partition(":")
+        assert user.isdecimal(), "Kubernetes must see that it is not root"
+        assert int(user) > 0 < int(group)
+        print(f"a service of the image is ready after {starts(image):.1f} s, with kernels that the build has compiled")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
