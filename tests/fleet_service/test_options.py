@@ -88,7 +88,8 @@ CHANGES: Final[dict[str, dict[str, str | tuple[list[str], list[str]]]]] = {
         "--json": "",
     },
     "certs": {
-        "--fleet": "{fleet2}", "--out": "{out}/others", "--at": "/etc/gripmap/certs", "--days": "100", "--ca-days": "1000",
+        "--fleet": "{fleet2}", "--out": "{out}/others", "--at": "/etc/gripmap/certs",
+        "--days": "100", "--ca-days": "1000",
         "--ca": ([*CERTS, "--ca", "next"], CERTS),
     },
 }  # fmt: skip
