@@ -9,6 +9,7 @@ cluster: what only a cluster has (volumes' kinds, policies, load balancers) is l
 
 from __future__ import annotations
 
+import http.client
 import json
 import os
 import shutil
@@ -260,10 +261,14 @@ class Cluster:
                 return
 
     def fetch(self, pod: Pod, path: str) -> str:
-        """A page of a pod's metrics server."""
+        """A page of a pod's metrics server; empty while a standby that takes over closes its own for the service's."""
         (container,) = pod.containers
-        with urllib.request.urlopen(f"http://127.0.0.1:{pod.port(container, 'metrics')}{path}", timeout=5.0) as page:
-            return str(page.read().decode())
+        address = f"http://127.0.0.1:{pod.port(container, 'metrics')}{path}"
+        try:
+            with urllib.request.urlopen(address, timeout=5.0) as page:
+                return str(page.read().decode())
+        except (OSError, http.client.HTTPException):  # refused, cut off, or late
+            return ""
 
 
 def answers(pod: Pod, container: Manifest, probe: Manifest) -> bool:
