@@ -93,9 +93,11 @@ class _Without(MetaPathFinder):
 
 
 def print_line(line: str, stream: TextIO) -> None:
-    """Print a line at once; what lies behind the stream (a full disk, a reader that left) never ends the process."""
+    """Print a line at once, whole also where other threads print; what lies behind the stream (a full disk, a reader
+    that left) never ends the process."""
     with suppress(OSError):
-        print(line, file=stream, flush=True)
+        stream.write(f"{line}\n")  # in one piece: `print` writes the end of a line by itself
+        stream.flush()
 
 
 def line_logger(form: Form, stream: TextIO, **who: object) -> Callable[[str], None]:

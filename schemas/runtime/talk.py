@@ -14,6 +14,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, Final
 
+from schemas.runtime.process import print_line
+
 PATIENCE_S: Final = 0.8  # after which a person asks whether it still runs
 TICK_S: Final = 1.0
 COMPILING: Final = "compiling kernels, once on this machine: about 40 s for the default estimator"
@@ -43,8 +45,7 @@ def speak(*, quiet: bool = False) -> None:
 def say(line: str) -> None:
     """A line of progress."""
     if _voice.on:
-        with suppress(OSError):
-            print(line, file=sys.stderr, flush=True)
+        print_line(line, sys.stderr)
 
 
 def say_once(line: str) -> None:

@@ -64,3 +64,21 @@ def test_kernels_compile_where_what_they_can_do_without_is_kept_out() -> None:
         "assert 'scipy' not in sys.modules and not np.zeros(1 << 20).any(); trim_memory()"
     )
     assert subprocess.run([sys.executable, "-W", "error", "-c", words], check=False).returncode == 0
+
+
+MANY = """
+import sys, threading
+from schemas.runtime.process import print_line
+sys.setswitchinterval(1e-6)
+def talk(who):
+    for number in range(5000):
+        print_line(f"{who} {number}", sys.stdout)
+threads = [threading.Thread(target=talk, args=(who,)) for who in "abcd"]
+[thread.start() for thread in threads]
+[thread.join() for thread in threads]
+"""
+
+
+def test_lines_of_many_threads_stay_whole() -> None:
+    done = subprocess.run([sys.executable, "-c", MANY], capture_output=True, text=True, check=True)
+    assert sorted(done.stdout.splitlines()) == sorted(f"{who} {number}" for who in "abcd" for number in range(5000))
