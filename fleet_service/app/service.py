@@ -243,7 +243,8 @@ class Service:
             stop.set()  # then nothing that hangs on a bucket, or on a router, keeps it for long
             self._log_line("followed: another service has the lease; what it did not get its senders keep")
             return
-        if self.engine.holding.leaves:
+        leaves = self.engine.holding.leaves
+        if leaves:
             stop.set()
         deadline = time.monotonic() + LEAVE_S
         while not self.engine.full and time.monotonic() < deadline:
@@ -252,7 +253,8 @@ class Service:
                 break
             self._take(session, messages)
         self._acknowledge(session, self.engine.flush())
-        self._rounds.finish(max(deadline - time.monotonic(), 0.0))
+        if not leaves:  # else they are put by who comes, which puts all tiles
+            self._rounds.finish(max(deadline - time.monotonic(), 0.0))
         self._status(time.monotonic())
 
     def _take(self, session: zenoh.Session, messages: list[Message]) -> None:

@@ -66,10 +66,14 @@ class Holding:
         if self.lease is not None:
             self.lease.lost = True
 
-    def close(self) -> None:
-        """Let the next have it."""
+    def give_free(self) -> None:
+        """Nothing is acknowledged after this, and the next may have the copy."""
         if self.lease is not None:
             self.lease.end(self.to if self.leaves else "")
+
+    def close(self) -> None:
+        """Let the next have it."""
+        self.give_free()
         if self.copy is not None:
             self.copy.close()
         self._lock_file.close()

@@ -1,4 +1,4 @@
-"""Fixtures: a router of this process, a running service, a client."""
+"""Fixtures: a router of this process, a running service, a client, a bucket."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from deploy.router import open_router
 from fleet_service.app.service import Service
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.runtime.zenoh_session import open_session
+from tests.buckets import BucketServer, bucket_server
 from tests.waiting import until
 
 settings.register_profile("compiled", deadline=None)  # the first example waits for the compiler
@@ -84,3 +85,11 @@ def service(router: ZenohSettings, tmp_path: Path) -> Iterator[Running]:
 def start(router: ZenohSettings) -> Callable[..., object]:
     """Start a service on a given archive: `with start(root): ...`."""
     return lambda root, **changed: running(router, root, **changed)
+
+
+@pytest.fixture
+def bucket(tmp_path: Path) -> Iterator[BucketServer]:
+    """An S3 server that is a process of its own."""
+    pytest.importorskip("obstore", reason="pip install 'gripmap[objects]'")
+    with bucket_server(tmp_path / "objects") as server:
+        yield server

@@ -23,6 +23,7 @@ from schemas import wire
 from schemas.config import ZenohSettings
 from schemas.runtime.commandline import Command
 from schemas.runtime.zenoh_session import open_session
+from tests.buckets import BucketServer
 from tests.faults.processes import Part
 from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.conftest import Running, running
@@ -167,7 +168,11 @@ import sys, threading
 from fleet_service.app import service
 from fleet_service.app.jobs import Job
 from fleet_service.cli import main
-service.archive_jobs = lambda *_: [Job("hangs", .001, lambda _: print("hangs", flush=True) or threading.Event().wait())]
+from schemas.runtime.process import print_line
+def hangs(_):
+    print_line("hangs", sys.stdout)
+    threading.Event().wait()
+service.archive_jobs = lambda *_: [Job("hangs", .001, hangs)]
 {more}
 sys.exit(main(sys.argv[1:]))
 """
@@ -190,6 +195,26 @@ def test_a_service_that_has_to_be_ended_says_with_its_exit_code_whether_all_was_
         assert ("IndexError: list index out of range" in service.lines()) == bool(more)
     finally:
         service.kill()
+
+
+def test_a_service_that_has_to_be_ended_gives_its_lease_free(
+    tmp_path: Path, router: ZenohSettings, bucket: BucketServer
+) -> None:
+    config = tmp_path / "service.json"
+    archive = {"path": str(tmp_path / "archive"), **bucket.settings}
+    config.write_text(json.dumps({"zenoh": router.model_dump(), "archive": archive}))
+    words = ["run", "--config", str(config)]
+    service = Part("service", [sys.executable, "-c", HANGS.format(more=""), *words], tmp_path)
+    service.start()
+    try:
+        service.line_with("hangs")
+        service.line_with("ready: ")
+        assert service.stop() == 0
+        assert "left at last: a session or a job did not end in time" in service.lines()
+    finally:
+        service.kill()
+    (lease,) = bucket.place("lease").glob("*.json")
+    assert json.loads(lease.read_text())["released"] is True
 
 
 def test_the_service_waits_for_a_router_and_survives_its_restart(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from fleet_service.replay import checkpoints
 from schemas import wire
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.wire import Batch, Kind
-from tests.buckets import SECRET, BucketServer, bucket_server, held
+from tests.buckets import SECRET, BucketServer, held
 from tests.fleet_service.app.test_erasing import MONTH, pseudonyms_of
 from tests.fleet_service.app.test_kill import archived, identities
 from tests.fleet_service.app.test_service import Fleet
@@ -35,13 +35,6 @@ from tests.waiting import until
 
 PATIENCE_S = 120.0  # a start, on a machine that is busy
 VEHICLES, BATCHES = 4, 12
-
-
-@pytest.fixture
-def bucket(tmp_path: Path) -> Iterator[BucketServer]:
-    pytest.importorskip("obstore", reason="pip install 'gripmap[objects]'")
-    with bucket_server(tmp_path / "objects") as server:
-        yield server
 
 
 def settings(bucket: BucketServer) -> ServiceConfig:

@@ -23,19 +23,12 @@ from fleet_service.archive.retention import retire
 from schemas.config import ServiceConfig, load
 from schemas.errors import InputError
 from schemas.wire import Kind
-from tests.buckets import SECRET, BucketServer, bucket_server, held
+from tests.buckets import SECRET, BucketServer, held
 from tests.fleet_service.archive.rows import identities, rows_of
 from tests.waiting import until
 
 NAME = "shard-0"
 Make = Callable[[Path], Copy]
-
-
-@pytest.fixture
-def bucket(tmp_path: Path) -> Iterator[BucketServer]:
-    pytest.importorskip("obstore", reason="pip install 'gripmap[objects]'")
-    with bucket_server(tmp_path / "objects") as server:
-        yield server
 
 
 @pytest.fixture

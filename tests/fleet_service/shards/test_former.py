@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
-
-import pytest
 
 from fleet_service.archive import witnesses
 from fleet_service.archive.witnesses import Witnesses
@@ -15,16 +12,9 @@ from fleet_service.fusion import Fusion
 from fleet_service.ingest.weather import WeatherInbox, WeatherMessage, gather
 from fleet_service.ingest.weather import archived as archived_weather
 from schemas import keys, weather, wire
-from tests.buckets import BucketServer, bucket_server
+from tests.buckets import BucketServer
 from tests.fleet_service.shards.test_successor import Machine
 from tests.standbys import restored
-
-
-@pytest.fixture
-def bucket(tmp_path: Path) -> Iterator[BucketServer]:
-    pytest.importorskip("obstore", reason="pip install 'gripmap[objects]'")
-    with bucket_server(tmp_path / "objects") as server:
-        yield server
 
 
 def test_what_a_former_holder_puts_late_takes_the_place_of_nothing(bucket: BucketServer, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from fleet_service.shards.holding import hold
 from fleet_service.shards.lease import Lease
 from fleet_service.shards.serving import standing_by
 from schemas.config import ServiceConfig, ZenohSettings
-from tests.buckets import BucketServer, bucket_server
+from tests.buckets import BucketServer
 from tests.fleet_service.app.test_copy import BATCHES, known, reports
 from tests.fleet_service.app.test_service import Fleet
 from tests.fleet_service.shards.test_successor import driven
@@ -26,13 +26,6 @@ from tests.waiting import until
 
 PATIENCE_S = 120.0
 EVERYWHERE = "*/*/*"
-
-
-@pytest.fixture
-def bucket(tmp_path: Path) -> Iterator[BucketServer]:
-    pytest.importorskip("obstore", reason="pip install 'gripmap[objects]'")
-    with bucket_server(tmp_path / "objects") as server:
-        yield server
 
 
 class Machine:

@@ -6,7 +6,7 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,7 +24,7 @@ from fleet_service.shards.lease import Lease, holder_of
 from schemas.config import ServiceConfig, ZenohSettings
 from schemas.errors import InputError
 from schemas.wire import Batch, Kind
-from tests.buckets import BucketServer, bucket_server
+from tests.buckets import BucketServer
 from tests.fleet_service.app.test_copy import BATCHES, PATIENCE_S, reports
 from tests.fleet_service.app.test_kill import archived, identities
 from tests.fleet_service.app.test_service import Fleet
@@ -33,14 +33,6 @@ from tests.fleet_service.archive.rows import rows_of
 from tests.schemas.runtime.test_metrics import fetch
 from tests.standbys import Host, hosts, restored
 from tests.waiting import until
-
-
-@pytest.fixture
-def bucket(tmp_path: Path) -> Iterator[BucketServer]:
-    pytest.importorskip("obstore", reason="pip install 'gripmap[objects]'")
-    with bucket_server(tmp_path / "objects") as server:
-        yield server
-
 
 RESEND_S = 1.0
 LEASE_S = 4.0  # of who is no process: a request may take a quarter of it
