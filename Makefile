@@ -8,7 +8,7 @@ PAPERS := .venv/.papers
 TESTS := $(BIN)/python -m pytest -q --numprocesses $$(( $$(getconf _NPROCESSORS_ONLN) + 1 )) --dist loadfile
 export PYTHONDONTWRITEBYTECODE :=  # what was parsed once is kept: tests start hundreds of processes
 
-.PHONY: setup demo test test-all test-shuffled check package docs lint types faults faults-quick cluster-faults soak bench tune proto lock clean analytics-bench spark-test usability figures roads-bench page-bench ahead-bench browser-test batch-bench image kube
+.PHONY: setup demo test test-all test-shuffled check package docs lint types faults faults-quick cluster-faults soak bench tune proto lock clean analytics-bench spark-test usability figures roads-bench page-bench ahead-bench browser-test batch-bench image kube country-bench
 
 setup: $(STAMP)  ## make .venv and install everything, pinned
 
@@ -98,6 +98,9 @@ batch-bench: setup  ## Iceberg tables beside the archive, Spark beside this mach
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[spark]'
 	$(BIN)/python -m tests.benchmarks.batch
 
+country-bench: setup  ## SUMO's traffic for 300 of our vehicles, then 100 000 for ten minutes; writes .country/figures.json
+	$(BIN)/python -m tests.benchmarks.country
+
 analytics-bench: setup  ## archive and analytics on ten million rows, Spark beside; writes .analytics/figures.json
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[spark]'
 	$(BIN)/python -m tests.benchmarks.analytics
@@ -117,4 +120,4 @@ lock: setup  ## write the installed versions to constraints.txt
 	$(BIN)/python -m pip freeze --exclude-editable --exclude gripmap > constraints.txt
 
 clean:
-	rm -rf .venv .demo .docs dist .bench .analytics .evaluation .faults .usability .roads .page .batch build *.egg-info
+	rm -rf .venv .demo .docs dist .bench .analytics .evaluation .faults .usability .roads .page .batch .country build *.egg-info

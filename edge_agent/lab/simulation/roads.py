@@ -57,7 +57,8 @@ class Network:
     """Lanes in one table of points, columns L (points, 8); lane k has `size[k]` points from `first[k]` on.
 
     `ways[k]` (MOST_WAYS,) are the lanes one may go on to, -1 where there are fewer; `spacing[k]` [m] between points.
-    Lanes before number `roads` are roads, the others connectors.
+    Lanes before number `roads` are roads, the others connectors. `starts` (vehicles,) are the lanes at whose beginnings
+    vehicles start; None: they are spread over the roads.
     """
 
     points: FloatArray
@@ -66,6 +67,7 @@ class Network:
     spacing: FloatArray
     ways: IntArray
     roads: int
+    starts: IntArray | None = None
 
     @property
     def road_length(self) -> float:
@@ -106,7 +108,7 @@ def build_network(junctions: dict[str, tuple[float, float]], roads: tuple[Road, 
                 ways.append([j])
         if not 1 <= len(ways[k]) <= MOST_WAYS:
             raise InputError("roads", f"lane {k} has {len(ways[k])} ways to go on", f"join 2 to {MOST_WAYS + 1} roads")
-    return _network(lanes, ways, count)
+    return network_of(lanes, ways, count)
 
 
 def rounded(corners: list[tuple[float, float]], radius: float) -> FloatArray:
@@ -168,7 +170,16 @@ def _within(line: FloatArray, setback: float) -> IntArray:
     return np.flatnonzero((run >= setback) & (run <= run[-1] - setback))
 
 
-def _network(lanes: list[FloatArray], ways: list[list[int]], roads: int) -> Network:
+def network_of(
+    lanes: list[FloatArray], ways: list[list[int]], roads: int, allowed: list[FloatArray] | None = None
+) -> Network:
+    """Lanes with headings, curvatures and profiles.
+
+    Args:
+        lanes: equally spaced points of each, (n, 2) [m]; the first `roads` of them are roads, the others connectors.
+        ways: lanes that one may go on to from each; none where all drives end before it does.
+        allowed: v²/q [m] that traffic leaves at each point of each lane, (n,); None: as bends and junctions allow.
+    """
     size = np.array([len(lane) for lane in lanes])
     spacing = np.array([_run(lane)[-1] / (len(lane) - 1) for lane in lanes])
     onward = np.full((len(lanes), MOST_WAYS), -1)
@@ -178,6 +189,8 @@ def _network(lanes: list[FloatArray], ways: list[list[int]], roads: int) -> Netw
     limits = [np.maximum(np.abs(table[:, LanePoint.CURVATURE]), STRAIGHTEST) ** -1 for table in tables]
     for k in range(roads, len(lanes)):
         limits[k] = np.minimum(limits[k], YIELD_M)
+    if allowed is not None:
+        limits = [np.minimum(own, given) for own, given in zip(limits, allowed, strict=True)]
     _plan(tables, limits, ways, spacing)
     return Network(np.concatenate(tables), np.cumsum(size) - size, size, spacing, onward, roads)
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from edge_agent.lab.simulation import SCENARIOS, Scenario
+from edge_agent.lab.simulation import SCENARIOS, Scenario, SimulatedFleet
 from edge_agent.lab.simulation.friction import ICE, Patch
-from edge_agent.lab.simulation.roads import BRAKING, LanePoint, Network, Road, build_network, rounded
+from edge_agent.lab.simulation.roads import BRAKING, LanePoint, Network, Road, build_network, network_of, rounded
 from schemas.errors import InputError
 
 EVERY = pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS.keys())
@@ -127,3 +129,22 @@ def test_patches_that_cover_nothing_or_have_no_friction_are_refused() -> None:
         Patch("void", 0.0, 0.0, 1.0, 1.0, 0.0)
     with pytest.raises(InputError, match="^patch: "):
         Patch("line", 0.0, 0.0, 1.0, 0.0, 0.5)
+
+
+def test_vehicles_start_on_the_lanes_that_are_given_and_keep_the_speed_that_traffic_leaves_them() -> None:
+    """Two straight lanes side by side: 13 m/s are allowed on the one, 6 m/s on the other, to a driver of 5 m/s²."""
+    x = np.arange(0.0, 400.0)
+    lanes = [np.column_stack([x, np.full(400, y)]) for y in (0.0, 50.0)]
+    allowed = [np.full(400, speed**2 / 5.0) for speed in (13.0, 6.0)]
+    given = replace(network_of(lanes, [[0], [1]], 2, allowed), starts=np.array([1, 0, 1]))
+
+    class Given(Scenario):
+        network = given
+
+    fleet = SimulatedFleet(Given("two", "lanes", {}, (), 0.9, ()), 3, 5, 100.0)
+    fleet.step(1)
+    np.testing.assert_allclose(fleet.truth.x[0], 0.0, atol=0.1)
+    np.testing.assert_allclose(fleet.truth.y[0], [50.0, 0.0, 50.0], atol=0.1)
+    fleet.step(1500)
+    assert fleet.truth.vx[:, 1].max() > 1.5 * fleet.truth.vx[:, [0, 2]].max()
+    np.testing.assert_allclose(fleet.truth.y[-1], [50.0, 0.0, 50.0], atol=1.0)

@@ -1,0 +1,57 @@
+"""`make country-bench`: a city on SUMO's routes, then a country of a hundred thousand vehicles for ten minutes.
+
+Writes `.country/figures.json`, `.country/country.png`, and prints the table. `--city DIR` takes the observations of a
+city that was driven before.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+from typing import Final
+
+from schemas.runtime import figures
+from schemas.runtime.figures import Figure
+from tests.benchmarks.country.city import PREFIX, city
+from tests.benchmarks.country.coefficients import coefficients
+from tests.benchmarks.country.nation import nation
+from tests.benchmarks.country.paper import million
+from tests.benchmarks.country.plot import draw
+from tests.benchmarks.sumo import Sumo
+
+FOLDER: Final = Path(".country")
+SEED: Final = 30_000
+
+
+def main() -> int:
+    """Drive, send, judge; 1 where a bar does not hold."""
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks.country", description="A city and a country.")
+    parser.add_argument("--city", type=Path, help="folder with observations.parquet; default: drive the city first")
+    given: Path | None = parser.parse_args().city
+    FOLDER.mkdir(exist_ok=True)
+    found: list[Figure] = []
+    if given is None:
+        print("1/3 city: three hundred vehicles on SUMO's routes", flush=True)
+        found += city(Sumo(FOLDER), FOLDER, SEED)
+    print("2/3 coefficients: what a vehicle and a cell cost", flush=True)
+    each = coefficients()
+    print("3/3 country: a hundred thousand vehicles, thirteen minutes", flush=True)
+    with tempfile.TemporaryDirectory() as name:
+        course = Path(name)
+        found += nation(given or FOLDER / PREFIX, course, SEED, each)
+        draw(course, FOLDER / "country.png")
+    found += [
+        Figure("country.vehicle_bytes", each.vehicle_bytes, "bytes of a service's memory for a vehicle"),
+        Figure("country.cell_bytes", each.cell_bytes, "bytes of it for a cell's sector"),
+        Figure("country.pair_bytes", each.pair_bytes, "bytes of it for each of these that a vehicle visited lately"),
+    ]
+    found += million({figure.name: figure.value for figure in found})
+    figures.write(FOLDER / "figures.json", "country", [SEED], found)
+    print(f"\n{figures.markdown(found)}\n\n{FOLDER}/figures.json, {FOLDER}/country.png")
+    return 0 if all(figure.holds for figure in found) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,39 @@
+"""A city: vehicles with the default estimator on SUMO's routes, their observations fused beside the truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+from deploy.end_to_end import RATE_HZ, write
+from edge_agent.lab.simulation import SimulatedFleet
+from fleet_service.lab.end_to_end import World, measure
+from schemas.runtime.figures import Figure
+from tests.benchmarks.country.streets import drives, town
+from tests.benchmarks.sumo import Sumo
+
+VEHICLES: Final = 300
+SECONDS: Final = 240
+ROUGH: Final = 0.5  # half of the vehicles are as real cars are
+PREFIX: Final = "country.city"
+
+
+def city(sumo: Sumo, folder: Path, seed: int) -> list[Figure]:
+    """Drive, fuse and judge; the observations stay in `folder`/NAME for the country."""
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def drive(into: Path) -> None:
+        into.mkdir(exist_ok=True)
+        streets = town(drives(sumo, VEHICLES, SECONDS, seed), seed)
+        write(SimulatedFleet(streets, VEHICLES, seed, RATE_HZ, rough=ROUGH), SECONDS, into)
+
+    found = measure(drive, folder, World("helsinki", ROUGH, PREFIX, seed))
+    cells = f"of {found[f'{PREFIX}.cells']:.0f} cells with two vehicles or more"
+    return [
+        Figure(f"{PREFIX}.observations", found[f"{PREFIX}.observations"], f"of {VEHICLES} vehicles in {SECONDS} s"),
+        Figure(f"{PREFIX}.coverage90", found[f"{PREFIX}.coverage90"], cells, 0.85, "more"),
+        Figure(f"{PREFIX}.rmse", found[f"{PREFIX}.rmse"], "where a friction is given"),
+        Figure(f"{PREFIX}.measured", found[f"{PREFIX}.cells.measured"], "cells where a friction is given"),
+        Figure(f"{PREFIX}.false_ice", found[f"{PREFIX}.false_ice"], "alerts far from anything slippery", 0),
+        Figure(f"{PREFIX}.alerts", found[f"{PREFIX}.alerts"], "alerts"),
+    ]

@@ -1,0 +1,87 @@
+"""What one more vehicle, cell, and cell of a vehicle cost a service in memory: an engine in a process of its own.
+
+The same number of observations goes through it each time, as do the same messages but for what is varied, so that the
+window of late observations is alike.
+"""
+
+from __future__ import annotations
+
+import gc
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from fleet_service.app.engine import Engine
+from fleet_service.fusion.store.records import PAIRS
+from fleet_service.ingest.inbox import Message
+from schemas.config import ServiceConfig
+from schemas.wire import Kind
+from tests.benchmarks.ingest import messages
+
+MANY: Final = 40_000  # messages of each part
+ROWS: Final = 10
+FEW: Final = 400  # vehicles
+REGIONS: Final = 10  # in which the cells are, where there are many
+TURN: Final = 512
+
+
+class Coefficients(NamedTuple):
+    """Bytes of a service's memory."""
+
+    vehicle_bytes: float
+    cell_bytes: float
+    pair_bytes: float  # of a vehicle and a cell's sector that it visited in the last three to four hours
+
+
+def coefficients() -> Coefficients:
+    """Measured now."""
+    few, vehicles, cells = (_measured(kind) for kind in ("few", "vehicles", "cells"))
+    return Coefficients((vehicles[0] - few[0]) / (MANY - FEW), (cells[0] - few[0]) / (cells[1] - few[1]), few[2])
+
+
+def _measured(kind: str) -> tuple[float, float, float]:
+    """Bytes that the stream added, cells at the end, and bytes of the table of pairs for each of them, by a process."""
+    command = [sys.executable, "-m", "tests.benchmarks.country.coefficients", kind]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    grown, cells, pair = done.stdout.split()[-3:]
+    return float(grown), float(cells), float(pair)
+
+
+def _resident() -> int:
+    gc.collect()
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:")) * 1024
+
+
+def _stream(kind: str) -> list[Message]:
+    now = time.time_ns()
+    if kind == "cells":
+        parts = (messages(MANY // REGIONS, ROWS, now, FEW // REGIONS, 0, east) for east in range(REGIONS))
+        return [message for part in parts for message in part]
+    return messages(MANY, ROWS, now, MANY if kind == "vehicles" else FEW)
+
+
+def main(kind: str) -> None:
+    """Take the stream of that kind, and print what it added."""
+    sent = _stream(kind)
+    with tempfile.TemporaryDirectory() as folder, closing(Engine(ServiceConfig(), Path(folder))) as engine:
+        warm = messages(FEW, ROWS, time.time_ns(), FEW, 0, REGIONS)
+        engine.ingest(warm, time.time_ns())
+        engine.flush()
+        before = _resident()
+        for at in range(0, len(sent), TURN):
+            engine.ingest(sent[at : at + TURN], time.time_ns())
+            if at % (16 * TURN) == 0:
+                engine.flush()
+        engine.flush()
+        assert engine.counts[Kind.OBSERVATION] == (MANY + FEW) * ROWS, engine.counts
+        state = engine.fusion.store.state
+        print(_resident() - before, engine.fusion.size, state.pairs.nbytes / state.used[PAIRS])
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

@@ -1,0 +1,229 @@
+"""A country's stream into several services at once: how far behind they are, what grows, and who does how much.
+
+Router, services and the vehicles' sender are processes of their own, on the machine's two cores together; what
+another machine would do (router and sender of a fleet) is told apart by processor time.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import sys
+import time
+import urllib.request
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from schemas.config import ServiceConfig, ZenohSettings
+from schemas.numeric import FloatArray
+from schemas.runtime.figures import Figure
+from tests.benchmarks.country.coefficients import Coefficients
+from tests.benchmarks.country.replayed import PERIOD_S, RATE, ROWS, VEHICLES, ZONES, Country
+from tests.benchmarks.country.sender import EVERY_S as SAYS_S
+from tests.faults.processes import Part
+from tests.faults.soak import memory_mb, slope
+
+WARM_S: Final = 180.0  # all vehicles have been heard, all their cells visited, and the window is full
+MEASURED_S: Final = 600.0
+EVERY_S: Final = 5.0
+COMPACT_S: Final = 240.0  # twice in the ten minutes, once before
+SERVICES: Final = ("west", "middle", "east")
+_TICKS: Final = os.sysconf("SC_CLK_TCK")
+
+
+class Look(NamedTuple):
+    """One moment: time since the beginning [s]; of each process memory [MB], but the sender's, and processor time [s];
+    of each service cells, rows admitted, messages that wait."""
+
+    time: float
+    memory: list[float]
+    spent: list[float]
+    cells: list[float]
+    rows: list[float]
+    queued: list[float]
+
+
+def spent_s(part: Part) -> float:
+    """Processor time of a process and of those that it began and that have ended."""
+    fields = Path(f"/proc/{part.pid}/stat").read_text().rpartition(")")[2].split()
+    return sum(int(field) for field in fields[11:15]) / _TICKS
+
+
+class Service(NamedTuple):
+    """A service of the country, and where its metrics are."""
+
+    part: Part
+    archive: Path
+    metrics: str
+
+    def values(self) -> dict[str, float]:
+        """Its metrics now, by name and labels."""
+        with urllib.request.urlopen(f"{self.metrics}/metrics", timeout=30.0) as page:
+            lines = page.read().decode().splitlines()
+        return {line.rpartition(" ")[0]: float(line.rpartition(" ")[2]) for line in lines if not line.startswith("#")}
+
+    def archived(self) -> int:
+        """Rows of observations in its archive, by the files' own words."""
+        files = [*self.archive.glob("inbox/**/*.parquet"), *self.archive.glob("observations/**/*.parquet")]
+        return sum(pq.read_metadata(file).num_rows for file in files)
+
+
+def started(folder: Path, endpoint: str, name: str, region: str) -> Service:
+    """A service that is ready."""
+    config = ServiceConfig(
+        name=name, regions=[region], zenoh=ZenohSettings(connect=[endpoint]), metrics_port=0, compact_s=COMPACT_S
+    )
+    path, archive = folder / f"{name}.json", folder / name
+    path.write_text(config.model_dump_json(include={"name", "regions", "zenoh", "metrics_port", "compact_s"}))
+    words = ("-m", "fleet_service.cli", "run", "--archive", str(archive), "--config", str(path))
+    part = Part(name, [sys.executable, *words], folder)
+    part.start()
+    return Service(part, archive, part.line_with("ready: ").split()[-1])
+
+
+def nation(city: Path, folder: Path, seed: int, coefficients: Coefficients) -> list[Figure]:
+    """Drive the country and measure; its course stays in `folder`/course.npz."""
+    country = Country(city, seed)
+    seconds = WARM_S + MEASURED_S
+    with ExitStack() as stack:
+        router = Part("router", [sys.executable, "-m", "deploy.router", "--listen", "tcp/127.0.0.1:0"], folder)
+        stack.callback(router.kill)
+        router.start()
+        endpoint = router.line_with("router: ").split()[1]
+        services = []
+        for name, region in zip(SERVICES, country.expressions(), strict=True):
+            services.append(started(folder, endpoint, name, region))
+            stack.callback(services[-1].part.kill)
+        words = [endpoint, str(city), str(folder / "waits.npz"), "--seconds", str(seconds)]
+        words += ["--vehicles", str(VEHICLES), "--seed", str(seed)]
+        sender = Part("sender", [sys.executable, "-m", "tests.benchmarks.country.sender", *words], folder)
+        stack.callback(sender.kill)
+        sender.start()
+        sender.line_with("{")
+        looks = _watched([*(one.part for one in services), router, sender], services, sender)
+        sent = _last_line(sender)
+        counts = [one.values() for one in services]
+        codes = [one.part.stop() for one in services]
+        archived = sum(one.archived() for one in services)
+        size = sum(file.stat().st_size for one in services for file in one.archive.glob("observations/**/*.parquet"))
+        compacted = sum(
+            pq.read_metadata(file).num_rows
+            for one in services
+            for file in one.archive.glob("observations/**/*.parquet")
+        )
+    _kept(folder, looks)
+    if any(codes):
+        raise RuntimeError(f"services left with {codes}")
+    with np.load(folder / "waits.npz") as waits:
+        found = _waits(waits["put"], waits["wait"], waits["region"])
+    return [
+        *found,
+        *_growth(looks, coefficients),
+        *_shares(looks, int(sent["observations"])),
+        Figure("country.unacknowledged", sent["unacknowledged"], "batches, half a minute after the last", 0),
+        Figure("country.missing", sent["observations"] - archived, "observations that the archives do not hold", 0),
+        Figure("country.not_fused", _not_fused(counts), "observations that were archived only"),
+        Figure("country.archive_bytes", size / max(compacted, 1), "bytes of a compacted observation"),
+    ]
+
+
+def _watched(parts: Sequence[Part], services: Sequence[Service], sender: Part) -> list[Look]:
+    """Look every EVERY_S until the sender, the last of the parts, has ended."""
+    looks: list[Look] = []
+    began = time.monotonic() - SAYS_S
+    while sender.alive:
+        values = [one.values() for one in services]
+        looks.append(Look(
+            time.monotonic() - began, [memory_mb(part) for part in parts[:-1]], [spent_s(part) for part in parts],
+            [value["gripmap_cells"] for value in values],
+            [value['gripmap_rows_total{kind="observation"}'] for value in values],
+            [value["gripmap_queue_messages"] for value in values],
+        ))  # fmt: skip
+        if len(looks) % 6 == 0:
+            now, last = looks[-1], _last_line(sender)
+            memory = ", ".join(f"{value:.0f}" for value in now.memory)
+            waits = f"oldest {last.get('oldest_s', 0.0):.1f} s, p99 {last.get('p99_s', 0.0):.2f} s"
+            late = f"sender {last.get('late_s', 0.0):.1f} s late"
+            print(f"  {now.time:4.0f} s: {sum(now.cells):.0f} cells, {memory} MB, {waits}, {late}", flush=True)
+        time.sleep(max(began + SAYS_S + len(looks) * EVERY_S - time.monotonic(), 0.0))
+    return looks
+
+
+def _last_line(sender: Part) -> dict[str, float]:
+    """What it said last, of lines that are whole."""
+    whole = [line for line in sender.lines() if line.endswith("}")]
+    said: dict[str, float] = json.loads(whole[-1])
+    return said
+
+
+def _kept(folder: Path, looks: Sequence[Look]) -> None:
+    time_s, memory, spent, cells, rows, queued = (np.array(column) for column in zip(*looks, strict=True))
+    np.savez(folder / "course.npz", time=time_s, memory=memory, spent=spent, cells=cells, rows=rows, queued=queued)
+
+
+def _waits(put: FloatArray, wait: FloatArray, region: FloatArray) -> list[Figure]:
+    """Of the batches that were put in the ten minutes: how long they waited, and in which regions longest."""
+    measured = (put >= WARM_S) & (put < WARM_S + MEASURED_S)
+    waits = np.where(np.isnan(wait), np.inf, wait)
+    of_region = np.array([
+        np.quantile(waits[:, region == k][measured[:, region == k]], 0.99) for k in range(sum(ZONES))
+    ])  # fmt: skip
+    rate = measured.sum() * ROWS / MEASURED_S
+    return [
+        Figure("country.rate", float(rate), "observations/s that were sent", 0.98 * RATE, "more"),
+        Figure("country.lag_s", float(waits[measured].max()), "s, the longest that any batch waited for its ack", 5),
+        Figure("country.ack_p99_s", float(np.quantile(waits[measured], 0.99)), "s"),
+        Figure("country.ack_p50_s", float(np.median(waits[measured])), "s"),
+        Figure(
+            "country.region_p99_ratio", float(of_region.max() / of_region.min()), "slowest region over the fastest", 1.5
+        ),
+    ]
+
+
+def _growth(looks: Sequence[Look], coefficients: Coefficients) -> list[Figure]:
+    """Of the services' memory over the ten minutes, and what of it are new cells."""
+    time_s = np.array([look.time for look in looks])
+    late = time_s >= WARM_S
+    memory, cells = (np.array([getattr(look, name) for look in looks])[late] for name in ("memory", "cells"))
+    grown = sum(slope(time_s[late], memory[:, k]) for k in range(len(SERVICES)))
+    new = float(cells[-1].sum() - cells[0].sum())
+    beyond = grown - new * coefficients.cell_bytes / 1e6
+    return [
+        Figure("country.growth_mb_per_10min", beyond, f"MB of all services, beyond {new:.0f} new cells", 5),
+        Figure("country.grown_mb", grown, "MB in the ten minutes with them"),
+        Figure("country.cells", float(cells[-1].sum()), "cells of the country"),
+        Figure("country.memory_mb", float(memory[-1, : len(SERVICES)].sum()), "MB of all services at the end"),
+        Figure("country.memory_largest_mb", float(memory[:, : len(SERVICES)].max()), "MB of one of them, at the most"),
+    ]
+
+
+def _shares(looks: Sequence[Look], observations: int) -> list[Figure]:
+    """What each process did in the ten minutes."""
+    late = [look for look in looks if look.time >= WARM_S]
+    first, last = late[0], late[-1]
+    apart = last.time - first.time
+    rows, spent = np.array(last.rows) - first.rows, (np.array(last.spent) - first.spent) / apart
+    per_row = spent[: len(SERVICES)] * apart / rows
+    return [
+        Figure("country.observations", float(observations), f"of {VEHICLES} vehicles, one batch each {PERIOD_S:.0f} s"),
+        Figure(
+            "country.busiest_rows", float(rows.max() / rows.min()), "rows of the busiest service over the least", 1.2
+        ),
+        Figure("country.busiest_cores", float(spent[: len(SERVICES)].max()), "cores of the busiest service"),
+        Figure("country.cores", float(spent[: len(SERVICES)].sum()), "cores of all services"),
+        Figure("country.router_cores", float(spent[-2]), "cores of the router"),
+        Figure("country.sender_cores", float(spent[-1]), "cores of the vehicles' sender"),
+        Figure("country.service_us", float(1e6 * per_row.mean()), "us of a service an observation"),
+        Figure("country.router_us", float(1e6 * spent[-2] * apart * ROWS / rows.sum()), "us of the router a batch"),
+    ]
+
+
+def _not_fused(counts: Sequence[dict[str, float]]) -> float:
+    wanted = re.compile(r"gripmap_(late|implausible_moves|too_many_places)_total")
+    return sum(value for one in counts for name, value in one.items() if wanted.fullmatch(name))

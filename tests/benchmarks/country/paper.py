@@ -1,0 +1,37 @@
+"""What ten times the vehicles would take, on paper: the country's measured costs, each times what there would be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Final
+
+from fleet_service.fusion.constants import FORGOTTEN_S
+from schemas.runtime.figures import Figure
+from tests.benchmarks.country.replayed import ROWS
+
+VEHICLES: Final = 1_000_000
+FACTOR: Final = 10  # times the country that was measured: its vehicles, stream and cells
+USED: Final = 0.6  # of a core at the most, so that a service catches up after an outage
+DAY_S: Final = 86_400.0
+HOUR_S: Final = 3600.0  # between two times that what is forgotten is dropped
+NEW_PLACES: Final = 1.0  # of the visits, those where their vehicle was not in the last hours: nobody turns round
+
+
+def million(found: Mapping[str, float]) -> list[Figure]:
+    """A million vehicles at the country's rate each, from what was measured."""
+    rate, cells = FACTOR * found["country.rate"], FACTOR * found["country.cells"]
+    cores = rate * found["country.service_us"] * 1e-6
+    pairs = rate * NEW_PLACES * (FORGOTTEN_S + HOUR_S / 2)
+    per_day = rate * DAY_S * found["country.archive_bytes"] / 1e9
+    return [
+        Figure("country.million.per_s", rate, f"observations/s of {VEHICLES} vehicles"),
+        Figure("country.million.cores", cores, "cores of all services"),
+        Figure("country.million.services", math.ceil(cores / USED), f"services, {USED:.0%} of a core each"),
+        Figure("country.million.router_cores", rate / ROWS * found["country.router_us"] * 1e-6, "cores of routers"),
+        Figure("country.million.cells", cells, "cells' sectors"),
+        Figure("country.million.cells_gb", cells * found["country.cell_bytes"] / 1e9, "GB of memory for them"),
+        Figure("country.million.vehicles_gb", VEHICLES * found["country.vehicle_bytes"] / 1e9, "GB for vehicles"),
+        Figure("country.million.pairs_gb", pairs * found["country.pair_bytes"] / 1e9, "GB for where each was lately"),
+        Figure("country.million.gb_per_day", per_day, "GB of archive a day"),
+    ]

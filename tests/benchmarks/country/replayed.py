@@ -1,0 +1,149 @@
+"""A country of copies of one town: where its vehicles are, and what each of them reports when.
+
+    regions    17, 17 and 16 in three zones side by side, a service for each zone
+    towns      four in a region; regions are unlike in size, as 1/sqrt(rank)
+    vehicles   each has a piece of the drive of one of the city's, moved by whole tiles, and drives it again and again;
+               those of one town with one drive are spread evenly over it
+    reports    each sends ROWS visits every PERIOD_S, in turn; they take that long: traffic is slow
+
+The same for who sends it and for who looks at it; nothing but the seed and the city's observations is needed.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from fleet_service.lab.end_to_end import OBSERVATIONS, read
+from schemas import grid, keys, wire
+from schemas.numeric import FloatArray, IntArray
+from schemas.thresholds import NS
+from schemas.wire import Kind
+
+VEHICLES: Final = 100_000
+RATE: Final = 20_000.0  # observations/s
+ROWS: Final = 10  # of a batch
+PERIOD_S: Final = VEHICLES * ROWS / RATE
+ZONES: Final = (17, 17, 16)  # regions in each
+TOWNS: Final = ((2, 2), (9, 2), (2, 9), (9, 9))  # tiles from a region's corner
+ALIKE: Final = 8  # vehicles that share a drive in one town
+LOOP: Final = 3  # batches of a piece: a vehicle has soon been everywhere, and what grows afterwards is no new place
+_TILES: Final = 1 << (grid.TILE_ZOOM - grid.REGION_ZOOM)  # of a region's side
+_REGIONS: Final = 1 << (grid.REGION_ZOOM - grid.ZONE_ZOOM)  # of a zone's side
+_CELLS: Final = 1 << (grid.CELL_ZOOM - grid.TILE_ZOOM)  # of a tile's side
+
+
+class Chunk(NamedTuple):
+    """ROWS visits that one vehicle made one after the other.
+
+    Attributes:
+        message: its batch, all but who, where and when.
+        x, y: of the positions, columns and rows of cells from the north-western tile of the town, with their fractions.
+        cell_x, cell_y: of the cells that were named, likewise.
+        enter, leave: before the last, as a share of the time that all of them took.
+    """
+
+    message: Any
+    x: FloatArray
+    y: FloatArray
+    cell_x: IntArray
+    cell_y: IntArray
+    enter: FloatArray
+    leave: FloatArray
+
+
+class Country:
+    """Who lives where and repeats which drive.
+
+    Args:
+        folder: of the city's observations.
+        seed: of who lives where.
+        vehicles: how many.
+    """
+
+    def __init__(self, folder: Path, seed: int, vehicles: int = VEHICLES) -> None:
+        columns = read(folder / OBSERVATIONS)
+        x, y = grid.deinterleave(columns["cell"])
+        corner = np.array([x.min(), y.min()]) // _CELLS * _CELLS
+        assert max(np.ptp(x), np.ptp(y)) < 6 * _CELLS, "the town does not fit between its neighbours"
+        self._home = grid.deinterleave(grid.zone_of(columns["cell"][:1]))
+        self.drives = [_chunks(columns, who, corner) for who in np.unique(columns["vehicle"])]
+        self.drives = [drive for drive in self.drives if drive]
+        self.regions = [self._region(zone, k) for zone, count in enumerate(ZONES) for k in range(count)]
+        weight = np.concatenate([_shares(count) for count in ZONES])
+        rng = np.random.default_rng(seed)
+        self.region = rng.choice(len(weight), vehicles, p=weight / weight.sum())
+        self.town = rng.integers(0, len(TOWNS), vehicles)
+        self.drive, self.begin = np.zeros((2, vehicles), np.int64)
+        for place in np.unique(self.region * len(TOWNS) + self.town):
+            who = np.flatnonzero(self.region * len(TOWNS) + self.town == place)
+            many = max(1, min(len(who) // ALIKE, len(self.drives)))
+            chosen = rng.permutation(len(self.drives))[:many]
+            self.drive[who] = chosen[np.arange(len(who)) % many]
+            for one in chosen:
+                same = who[self.drive[who] == one]
+                self.begin[same] = np.arange(len(same)) * len(self.drives[one]) // len(same)
+
+    def _region(self, zone: int, k: int) -> tuple[int, int]:
+        """Column and row of the k-th region of a zone, among all regions of the world."""
+        zone_x, zone_y = (int(side[0]) for side in self._home)
+        return (zone_x + zone - 1) * _REGIONS + k % _REGIONS, zone_y * _REGIONS + 2 + k // _REGIONS
+
+    def expressions(self) -> list[str]:
+        """The regions of each service, as key expressions of zones."""
+        first = [sum(ZONES[:zone]) for zone in range(len(ZONES))]
+        parts = [keys.chunks(int(self.region_id(k)), grid.REGION_ZOOM).split("/") for k in first]
+        return ["/".join((*part[:2], "*")) for part in parts]
+
+    def region_id(self, k: int) -> int:
+        """The quadint of region k of the country."""
+        x, y = self.regions[k]
+        return int(grid.interleave(np.array([x]), np.array([y]))[0])
+
+    def batch(self, vehicle: int, turn: int, boot: int) -> tuple[str, bytes]:
+        """Key and bytes of what a vehicle reports in its turn, just now."""
+        drive = self.drives[self.drive[vehicle]]
+        chunk = drive[(self.begin[vehicle] + turn % LOOP) % len(drive)]
+        k = int(self.region[vehicle])
+        (region_x, region_y), (east, south) = self.regions[k], TOWNS[self.town[vehicle]]
+        x0, y0 = (region_x * _TILES + east) * _CELLS, (region_y * _TILES + south) * _CELLS
+        side, now = 1 << grid.CELL_ZOOM, time.time_ns()
+        message = chunk.message
+        message.vehicle, message.boot, message.region = f"car-{vehicle:06}", boot, self.region_id(k)
+        message.seq = message.first_held = turn + 1
+        message.cell[:] = grid.interleave(chunk.cell_x + x0, chunk.cell_y + y0).tolist()
+        message.longitude[:] = ((chunk.x + x0) / side * 360.0 - 180.0).tolist()
+        message.latitude[:] = np.degrees(np.arctan(np.sinh(np.pi * (1.0 - 2.0 * (chunk.y + y0) / side)))).tolist()
+        message.enter_time[:] = (now - (chunk.enter * PERIOD_S * NS).astype(np.int64)).tolist()
+        message.leave_time[:] = (now - (chunk.leave * PERIOD_S * NS).astype(np.int64)).tolist()
+        return keys.observation_key(message.region, message.vehicle), message.SerializeToString()
+
+
+def _shares(count: int) -> FloatArray:
+    share = 1.0 / np.sqrt(np.arange(1, count + 1))
+    return np.asarray(share / share.sum())
+
+
+def _chunks(columns: dict[str, Any], who: int, corner: IntArray) -> list[Chunk]:
+    """The visits of one vehicle in the order of time, ROWS at a time; the last few, if there are less, are left out."""
+    mine = np.flatnonzero(columns["vehicle"] == who)
+    mine = mine[np.argsort(columns["leave_time"][mine], kind="stable")]
+    return [_chunk(columns, mine[at : at + ROWS], corner) for at in range(0, len(mine) - ROWS + 1, ROWS)]
+
+
+def _chunk(columns: dict[str, Any], rows: IntArray, corner: IntArray) -> Chunk:
+    side = 1 << grid.CELL_ZOOM
+    phi = np.radians(columns["latitude"][rows])
+    x = (columns["longitude"][rows] + 180.0) / 360.0 * side - corner[0]
+    y = (1.0 - np.arcsinh(np.tan(phi)) / np.pi) / 2.0 * side - corner[1]
+    cell_x, cell_y = grid.deinterleave(columns["cell"][rows])
+    last = columns["leave_time"][rows[-1]]
+    spent = max(int(last - columns["enter_time"][rows[0]]), 1)
+    taken = {name: columns[name][rows] for name in wire.column_types(Kind.OBSERVATION)}
+    batch = wire.Batch(Kind.OBSERVATION, "car-000000", 1, 0, 1, 1, taken, "aco-fckf")
+    message = wire.MESSAGES[Kind.OBSERVATION].FromString(wire.encode(batch))
+    enter, leave = ((last - columns[name][rows]) / spent for name in ("enter_time", "leave_time"))
+    return Chunk(message, x, y, cell_x - corner[0], cell_y - corner[1], enter, leave)

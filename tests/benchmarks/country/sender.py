@@ -1,0 +1,94 @@
+"""The country's vehicles: a process that sends what they report, and knows how long each batch waited for its ack."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import zenoh
+
+from schemas import keys, wire
+from schemas.config import ZenohSettings
+from schemas.runtime.zenoh_session import open_session
+from schemas.wire import Kind
+from tests.benchmarks.country.replayed import PERIOD_S, ROWS, Country
+
+EVERY_S: Final = 10.0  # between two lines
+PATIENCE_S: Final = 30.0  # for what is not acknowledged at the end
+_BLOCK: Final = zenoh.CongestionControl.BLOCK
+
+
+class Waits:
+    """When each vehicle's batches were put and acknowledged [s], each (turns, vehicles); NaN: not yet."""
+
+    def __init__(self, session: zenoh.Session, vehicles: int, turns: int) -> None:
+        self.put, self.acked = np.full((2, turns, vehicles), np.nan)
+        self._subscriber = session.declare_subscriber(keys.ack_key("*"), self._hear)
+
+    def _hear(self, sample: zenoh.Sample) -> None:
+        now = time.monotonic()
+        name, streams = wire.decode_ack(sample.payload.to_bytes())
+        vehicle = int(name.partition("-")[2])
+        for stream in streams:
+            for first, last in stream.durable:
+                self.acked[first - 1 : last, vehicle] = now
+
+    def line(self, since: float) -> dict[str, float]:
+        """What was put, and what waits; of what was put since then, the 99 % quantile of waits that have ended [s]."""
+        put, acked, now = self.put, self.acked.copy(), time.monotonic()  # a copy: it is written meanwhile
+        waits = np.isfinite(put) & np.isnan(acked)
+        ended = (acked - put)[(put >= since) & np.isfinite(acked)]
+        return {
+            "put": float(np.isfinite(put).sum()), "acked": float(np.isfinite(acked).sum()),
+            "oldest_s": float(now - put[waits].min()) if waits.any() else 0.0,
+            "p99_s": float(np.quantile(ended, 0.99)) if len(ended) else float("nan"),
+        }  # fmt: skip
+
+
+def main() -> int:
+    """Send for so long, wait for the last acknowledgements, write the waits."""
+    parser = argparse.ArgumentParser(prog="sender")
+    parser.add_argument("endpoint")
+    parser.add_argument("city", type=Path, help="folder of the city's observations")
+    parser.add_argument("out", type=Path, help="file for the waits")
+    parser.add_argument("--seconds", type=float, required=True)
+    parser.add_argument("--vehicles", type=int, required=True)
+    parser.add_argument("--seed", type=int, required=True)
+    asked = parser.parse_args()
+    country = Country(asked.city, asked.seed, asked.vehicles)
+    session = open_session(ZenohSettings(connect=[asked.endpoint]))
+    assert session is not None
+    turns = int(asked.seconds / PERIOD_S) + 1
+    waits, boot = Waits(session, asked.vehicles, turns), time.time_ns()
+    rate, encoding = asked.vehicles / PERIOD_S, wire.ENCODING[Kind.OBSERVATION]
+    began = said = time.monotonic()
+    late = 0.0
+    for number in range(int(asked.seconds * rate)):
+        due = began + number / rate
+        if (ahead := due - time.monotonic()) > 0.002:  # a few at a time
+            time.sleep(ahead)
+        late = max(late, -ahead)
+        turn, vehicle = divmod(number, asked.vehicles)
+        key, payload = country.batch(vehicle, turn, boot)
+        waits.put[turn, vehicle] = time.monotonic()
+        session.put(key, payload, encoding=encoding, congestion_control=_BLOCK)
+        if time.monotonic() - said >= EVERY_S:
+            line = waits.line(said) | {"late_s": late, "payload": float(len(payload))}
+            print(json.dumps(line), flush=True)
+            said, late = time.monotonic(), 0.0
+    deadline = time.monotonic() + PATIENCE_S
+    while (left := np.isfinite(waits.put) & np.isnan(waits.acked)).any() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    np.savez(asked.out, put=waits.put - began, wait=waits.acked - waits.put, region=country.region)
+    print(json.dumps({"unacknowledged": int(left.sum()), "observations": int(np.isfinite(waits.put).sum()) * ROWS}))
+    session.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

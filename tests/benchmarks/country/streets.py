@@ -1,0 +1,111 @@
+"""SUMO's traffic as lanes for our own plant: each vehicle has a lane of its own, with the speeds that it had there.
+
+SUMO gives routes and speeds, no more: what the tyres do on the way is the plant's. A driver keeps SUMO's speed where he
+believes the road dry, and less where he does not; where SUMO has him wait, he creeps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from edge_agent.lab.simulation import Scenario
+from edge_agent.lab.simulation.driver import SLOWEST
+from edge_agent.lab.simulation.friction import DRY, ICE, SNOW, WET, Patch
+from edge_agent.lab.simulation.place import Origin
+from edge_agent.lab.simulation.roads import Network, network_of, resampled
+from edge_agent.lab.simulation.scenarios import drawn
+from schemas.numeric import FloatArray
+from tests.benchmarks.sumo import Sumo
+
+HELSINKI: Final = Origin(60.17, 24.94)
+STEP_S: Final = 0.5
+TRIPS: Final = ("--intermediate", "3")  # places that a trip leads over: three kilometres and more
+CHANGE_S: Final = ("--lanechange.duration", "3")  # not a leap to the side
+LEAP_M: Final = 20.0  # between two steps: SUMO has taken it out of a jam
+SMOOTH_M: Final = 13  # over which a driver opens his path
+USUAL_Q: Final = 5.0  # [m/s^2] budget of the middle one of the plant's drivers: at it he keeps SUMO's speed
+WET_AREAS, SNOW_AREAS, ICE_PATCHES = 4, 2, 24
+
+
+class Drive(NamedTuple):
+    """One vehicle's path: points a metre apart (n, 2) [m], and its speed there (n,) [m/s]."""
+
+    line: FloatArray
+    speed: FloatArray
+
+
+@dataclass(frozen=True)
+class Streets(Scenario):
+    """A scenario whose lanes are given."""
+
+    lanes: Network | None = None
+
+    @property
+    def network(self) -> Network:
+        """The lanes."""
+        assert self.lanes is not None
+        return self.lanes
+
+
+def drives(sumo: Sumo, vehicles: int, seconds: int, seed: int) -> list[Drive]:
+    """Paths of the first `vehicles` whose way is long enough for so many seconds.
+
+    Raises:
+        RuntimeError: there were fewer.
+    """
+    sumo.trips(6 * vehicles, 2.0, seed, *TRIPS)
+    fixes = pd.read_parquet(sumo.fixes(6 * vehicles + 900, STEP_S, seed, *CHANGE_S))
+    found = [_drive(rows) for _, rows in fixes.groupby("vehicle_id", sort=False)]
+    least = seconds * float(np.quantile(fixes.vehicle_speed[fixes.vehicle_speed > SLOWEST], 0.9))
+    long = [one for one in found if one is not None and len(one.line) >= least]
+    if len(long) < vehicles:
+        raise RuntimeError(f"{len(long)} of {vehicles} trips are {least:.0f} m long")
+    return long[:vehicles]
+
+
+def _drive(rows: pd.DataFrame) -> Drive | None:
+    """The path of one vehicle; None of one that leapt, or went nowhere."""
+    x, y = HELSINKI.from_latlon(rows.vehicle_y.to_numpy(), rows.vehicle_x.to_numpy())
+    step = np.hypot(np.diff(x), np.diff(y))
+    moves = np.r_[True, step > 0.05]
+    if moves.sum() < 10 or step.max() > LEAP_M:
+        return None
+    line, speed = np.column_stack([x, y])[moves], rows.vehicle_speed.to_numpy(float)[moves]
+    run = np.r_[0.0, np.cumsum(np.hypot(*np.diff(line, axis=0).T))]
+    even = np.arange(0.0, run[-1], 1.0)
+    window = np.hanning(SMOOTH_M + 2)[1:-1]
+    window /= window.sum()
+    smooth = [
+        np.convolve(np.pad(np.interp(even, run, one), SMOOTH_M // 2, mode="edge"), window, mode="valid")
+        for one in (*line.T, speed)
+    ]
+    path = resampled(np.column_stack(smooth[:2]))
+    return Drive(path, np.interp(np.linspace(0.0, 1.0, len(path)), np.linspace(0.0, 1.0, len(even)), smooth[2]))
+
+
+def town(found: list[Drive], seed: int) -> Streets:
+    """The streets of these drives on drawn hills, wet and snowy in parts, with ice here and there on a way."""
+    allowed = [np.maximum(one.speed, SLOWEST) ** 2 / USUAL_Q for one in found]
+    lanes = network_of([one.line for one in found], [[k] for k in range(len(found))], len(found), allowed)
+    usual, rng = drawn(seed), np.random.default_rng(seed)
+    points = np.concatenate([one.line for one in found])
+    patches = []
+    for kind, mu, count, size in (("wet", WET, WET_AREAS, 500.0), ("snow", SNOW, SNOW_AREAS, 300.0)):
+        for k in range(count):
+            x, y = points[rng.integers(len(points))]
+            patches.append(Patch(f"{kind} {k}", x, y, size, size, mu * rng.uniform(0.85, 1.15), looks=mu))
+    for k in range(ICE_PATCHES):
+        line = found[rng.integers(len(found))].line
+        at = rng.integers(5, len(line) - 5)
+        along, (x, y) = line[at + 3] - line[at - 3], line[at]
+        angle = float(np.arctan2(along[1], along[0]))
+        patches.append(Patch(f"ice {k}", x, y, 40.0, 14.0, ICE * rng.uniform(0.6, 1.1), angle))
+    return Streets(
+        name="helsinki", about="the centre of Helsinki", junctions={}, roads=(), background=DRY * rng.uniform(0.9, 1.1),
+        patches=tuple(patches), relief=usual.relief, origin=HELSINKI,
+        lanes=replace(lanes, starts=np.arange(len(found))),
+    )  # fmt: skip
