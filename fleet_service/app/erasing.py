@@ -6,8 +6,8 @@
 
 Checkpoints, snapshots, retention and compaction are of the same thread, so that none of them meets a half of it; others
 wait for the lock of compaction. Messages wait for as long as a start from a checkpoint takes. A service that dies amid
-of it finds the question at its next start, and no checkpoint with the vehicle in it. What the vehicle sends afterwards
-is new.
+of it finds the question at its next start, and no checkpoint with the vehicle in it. What the vehicle measures
+afterwards is new.
 """
 
 from __future__ import annotations

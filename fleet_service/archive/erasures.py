@@ -1,9 +1,11 @@
-"""Months that were forgotten: what was measured in them is not let in again.
+"""Months, and vehicles in a month, that were forgotten: what was measured in them is not let in again.
 
-    keys/2026-01.UNTIL.erased   empty; of that month, what was measured before UNTIL [ns]
+    keys/2026-01.UNTIL.erased             empty; of that month, what was measured before UNTIL [ns]
+    keys/2026-01.PSEUDONYM.UNTIL.erased   likewise, of the vehicle that had this pseudonym; goes with the month's key
 
 Without the month's key nobody can tell which batches are there already, so that one which is sent again would count
-twice. UNTIL is the end of the month, or in a month that goes on the newest that the archive holds: no clock decides.
+twice; and of a vehicle whose rows were removed nothing tells either that they were there. UNTIL is the end of the
+month, or in a month that goes on the newest that the archive holds: no clock decides.
 """
 
 from __future__ import annotations
@@ -17,12 +19,13 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fleet_service.archive.layout import DAY_NS
+from fleet_service.archive.pseudonyms import number
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, IntArray
 from schemas.runtime.durable import sync_directory
 from schemas.tables import US_STEP
 
-_NAME: Final = re.compile(r"(\d{4}-\d{2})\.(\d{1,19})\.erased")
+_NAME: Final = re.compile(r"(\d{4}-\d{2})\.(?:([0-9a-f]{16})\.)?(\d{1,19})\.erased")
 _EPOCH: Final = date(1970, 1, 1)
 
 
@@ -56,22 +59,41 @@ def span_of(month: str) -> Span:
     return Span((first - _EPOCH).days * DAY_NS, (following - _EPOCH).days * DAY_NS)
 
 
-def note(folder: Path, month: str, newest: int) -> None:
-    """Let nothing of a month in again that was measured until `newest` [ns], the newest that the archive holds; durable
-    when it returns.
+def note(folder: Path, month: str, newest: int, pseudonym: str | None = None) -> None:
+    """Let nothing of a month, or of one vehicle in it, in again that was measured until `newest` [ns], the newest that
+    the archive holds; durable when it returns.
 
     Raises:
         OSError: the disk is full or broken.
     """
     until = min(newest + US_STEP, span_of(month).until)  # the archive keeps times in whole steps
-    (folder / f"{month}.{max(until, 0)}.erased").touch(0o600)
+    whose = month if pseudonym is None else f"{month}.{pseudonym}"
+    (folder / f"{whose}.{max(until, 0)}.erased").touch(0o600)
+    if pseudonym is None:
+        for path in folder.glob(f"{month}.{'[0-9a-f]' * 16}.*.erased"):  # the month's says more
+            path.unlink()
     sync_directory(folder)
 
 
-def read(folder: Path) -> list[Span]:
-    """What is not let in again."""
-    found = [_NAME.fullmatch(path.name) for path in sorted(folder.glob("*.erased"))]
-    return [Span(span_of(name[1]).begin, int(name[2])) for name in found if name is not None]
+class Erased(NamedTuple):
+    """What is not let in again: spans of all vehicles, and until when [ns] of a pseudonym, by its number."""
+
+    months: list[Span]
+    vehicles: dict[int, int]
+
+
+def read(folder: Path) -> Erased:
+    """As the folder of the keys has it."""
+    months, vehicles = list[Span](), dict[int, int]()
+    for path in sorted(folder.glob("*.erased")):
+        if (name := _NAME.fullmatch(path.name)) is None:
+            continue
+        month, pseudonym, until = name[1], name[2], int(name[3])
+        if pseudonym is None:
+            months.append(Span(span_of(month).begin, until))
+        else:
+            vehicles[number(pseudonym)] = max(until, vehicles.get(number(pseudonym), 0))
+    return Erased(months, vehicles)
 
 
 def within(spans: Sequence[Span], time: IntArray) -> BoolArray:

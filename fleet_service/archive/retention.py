@@ -120,6 +120,15 @@ def _newest(root: Path, month: str) -> int:
     return newest
 
 
+def _newest_of(root: Path, pseudonym: str, days: tuple[int, int]) -> int:
+    """Newest first time of a record of one vehicle that the archive holds [ns], -1 if of none."""
+    where, newest = [Between("vehicle", pseudonym, pseudonym)], -1
+    for kind, name in layout.FIRST_TIME.items():
+        for table in reading.read(root, kind, [name, "vehicle"], where, days):
+            newest = max(newest, int(nanoseconds(table[name]).max(initial=-1)))
+    return newest
+
+
 class Forgotten(NamedTuple):
     """What forgetting a vehicle changed: rows removed, files rewritten or removed."""
 
@@ -130,7 +139,8 @@ class Forgotten(NamedTuple):
 
 def forget_vehicle(root: Path, vehicle: str, month: str) -> Forgotten:
     """Remove the rows of one vehicle in one month, and what could tell of them: lines of few vehicles in the month's
-    snapshots, files that were set aside, checkpoints. Roll-ups are made anew from what stays.
+    snapshots, files that were set aside, checkpoints. Roll-ups are made anew from what stays. What it measured in that
+    month until the newest of them does not come in again.
 
     Raises:
         InputError: the month's key is gone, or a service runs on the archive (it remembers more than its files).
@@ -155,6 +165,8 @@ def erased(root: Path, vehicle: str, month: str) -> Iterator[Forgotten]:
     compact(root)
     begin, end = _days(month)
     pseudonym = _pseudonym(root, vehicle, month)
+    if (newest := _newest_of(root, pseudonym, (begin, end))) >= 0:
+        erasures.note(root / _KEYS, month, newest, pseudonym)
     rows, files, cells = 0, [*root.rglob(f"*{BAD}")], set[int]()
     with compacting(root):
         drop_checkpoints(root)  # what it reported is in them

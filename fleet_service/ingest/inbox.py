@@ -9,6 +9,7 @@ from __future__ import annotations
 import queue
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from itertools import compress
 from threading import Lock
 from time import sleep
@@ -192,11 +193,21 @@ class BatchIntake:
             else:
                 self._refuse(str(owners[place].name), found.heads.at(place), rules[broken[place]])
         good = broken < 0
-        for place in np.flatnonzero(good & erasures.within(self._erased, time)).tolist():
+        for place in np.flatnonzero(good & self._forgotten(owners, time)).tolist():
             good[place] = False
             self._refuse(str(owners[place].name), found.heads.at(place), validation.ERASED)
         new = self._new(kind, found.heads, time, good)
         return self._rows(kind, new, found, clock) if new else AcceptedBatches([], {})
+
+    def _forgotten(self, owners: Sequence[Parsed], time: IntArray) -> BoolArray:
+        """Which batches (n,) are of a time that was forgotten, of everybody or of their vehicle."""
+        out = erasures.within(self._erased.months, time)
+        if self._erased.vehicles:
+            for place in np.flatnonzero(~out).tolist():
+                with suppress(OSError):  # without its month's key it is not let in either
+                    pseudonym = self._pseudonyms.of(str(owners[place].name), int(time[place]))
+                    out[place] = int(time[place]) < self._erased.vehicles.get(number(pseudonym), 0)
+        return out
 
     def _tell_time(self, owners: Sequence[Parsed], time: IntArray) -> None:
         for owner, measured in zip(owners, time.tolist(), strict=True):

@@ -153,7 +153,7 @@ def check_rows(kind: Kind, columns: Columns, region: IntArray, clock: Clock) -> 
     return _first(broken), tuple(rules)
 
 
-ERASED: Final = Refusal("erased", BATCH, "time: its month was erased; delete it")
+ERASED: Final = Refusal("erased", BATCH, "time: its month, or its vehicle in it, was erased; delete it")
 TOO_LONG: Final = Refusal("time", BATCH, "time: more than an hour between the batch's records; send one each second")
 
 

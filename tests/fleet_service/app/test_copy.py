@@ -235,6 +235,7 @@ def test_an_erased_vehicle_leaves_the_bucket_too(
         others = pseudonyms_of(new)
         assert len(others) == 3 * BATCHES * (VEHICLES - 1)
         assert gone not in others
+        assert list((new / "keys").glob(f"{MONTH}.{gone}.*.erased")), "and it does not come in again"
     kept = {name: content for name, content in bucket.objects().items() if not name.startswith("observations/")}
     assert not any(bytes.fromhex(gone) in content for name, content in kept.items() if name.endswith(".witnesses"))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import closing
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -111,7 +112,7 @@ def test_a_destroyed_key_makes_the_way_back_to_a_name_unknown(tmp_path: Path) ->
 
 NOON = int(datetime(2026, 1, 31, 12, tzinfo=UTC).timestamp()) * SECOND
 DAY = 86_400 * SECOND
-ERASED = "time: its month was erased; delete it"
+ERASED = "time: its month, or its vehicle in it, was erased; delete it"
 
 
 def told(engine: Engine, sent: Batch, now: int) -> list[str]:
@@ -144,6 +145,27 @@ def test_what_was_measured_in_a_forgotten_month_does_not_come_in_again_over_rest
             assert engine.fusion.live.visits[: engine.fusion.size].sum() == 2
             keep(engine, tmp_path)
     assert not list((tmp_path / "keys").glob("2026-01.key"))
+
+
+def test_what_a_forgotten_vehicle_measured_does_not_come_in_again_over_restarts(tmp_path: Path) -> None:
+    """A spool that was brought back from a copy may hold what was acknowledged long ago."""
+    old, other, late = (batch(f"car-00{k}", 1, NOON + k * SECOND, [0.8]) for k in (1, 2, 3))
+    late = replace(late, vehicle="car-001", boot=2)
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        for one in (old, other):
+            assert told(engine, one, NOON + DAY) == ["durable"]
+    assert retention.forget_vehicle(tmp_path, "car-001", "2026-01").rows == 1
+    for _ in range(2):
+        with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+            assert told(engine, replace(old, boot=9), NOON + DAY) == [ERASED], "told as a new one"
+            assert told(engine, other, NOON + DAY) == ["durable"], "known, and counted once"
+            assert told(engine, late, NOON + DAY) == ["durable"], "measured since"
+            assert engine.counts["refused.erased"] == 1
+        assert rows_kept(tmp_path) == 2
+    (mark,) = (tmp_path / "keys").glob("*.erased")
+    assert Pseudonyms(tmp_path / "keys").of("car-001", NOON) in mark.name
+    retention.forget_period(tmp_path, "2026-01")
+    assert [path.name.count(".") for path in (tmp_path / "keys").glob("*.erased")] == [2], "it goes with the key"
 
 
 def test_of_a_month_that_goes_on_all_is_forgotten_until_the_newest_there_is(tmp_path: Path) -> None:
