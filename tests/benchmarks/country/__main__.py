@@ -7,6 +7,7 @@ city that was driven before.
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
 import tempfile
 from pathlib import Path
@@ -37,11 +38,12 @@ def main() -> int:
         found += city(Sumo(FOLDER), FOLDER, SEED)
     print("2/3 coefficients: what a vehicle and a cell cost", flush=True)
     each = coefficients()
-    print("3/3 country: a hundred thousand vehicles, thirteen minutes", flush=True)
+    print("3/3 country: a hundred thousand vehicles, fifteen minutes", flush=True)
     with tempfile.TemporaryDirectory() as name:
         course = Path(name)
         found += nation(given or FOLDER / PREFIX, course, SEED, each)
         draw(course, FOLDER / "country.png")
+        shutil.copy(course / "course.npz", FOLDER)
     found += [
         Figure("country.vehicle_bytes", each.vehicle_bytes, "bytes of a service's memory for a vehicle"),
         Figure("country.cell_bytes", each.cell_bytes, "bytes of it for a cell's sector"),
