@@ -28,6 +28,7 @@ NAMED: Final = 5  # regions that a sentence names
 PAST_S: Final = 60.0  # a moment of the past is rebuilt from the archive
 EVERYWHERE: Final = f"{keys.ROOT}/map/**"
 SERVED_S: Final = 1.0  # for a router to say who answers
+FALLS_S: Final = 0.1  # a router ends questions to a service that was killed, and tells then that its token fell
 SHOWN: Final = ("latitude", "longitude", "sector", "mu", "mu_lower", "mu_upper", "p_slippery", "basis", "vehicles",
                 "observations", "age_s")  # fmt: skip
 
@@ -75,6 +76,7 @@ def ask(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
     with joined(connection) as session, tokens.watched(session) as services:
         before = services.here
         payloads = sorted(replies(session, EVERYWHERE, parameters))
+        time.sleep(FALLS_S)
         after = services.asked(session)  # who came meanwhile may not have been asked
         # and who went may have been asked in place of who followed it, even if it is back
         withdrawn = {token.region for token in services.fell | (before - after)}

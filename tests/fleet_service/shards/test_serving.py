@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -254,6 +255,24 @@ def test_who_goes_while_it_is_asked_may_have_been_asked_in_place_of_who_followed
         assert ask(router, bbox=inside).gap is None
         if comes_back:
             again.__exit__(None, None, None)
+
+
+def test_of_a_service_that_is_killed_while_it_is_asked_the_token_may_fall_after_the_answer(
+    router: ZenohSettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inside = f"{WEST + 0.001},{SOUTH + 0.001},{EAST - 0.001},{NORTH - 0.001}"
+    with zenoh_session(router) as other, zenoh_session(router) as third:
+        held = serving(other, frozenset({keys.Served(NAMES[1], "killed", "1f")}))
+        held.__enter__()
+        until(lambda: len(tokens.standing(third)) == 1)
+
+        def falls(_: float) -> None:
+            held.__exit__(None, None, None)
+            until(lambda: not tokens.standing(third))
+
+        monkeypatch.setattr(map_client, "replies", lambda *_: iter(()))
+        monkeypatch.setattr(map_client, "time", SimpleNamespace(sleep=falls))
+        assert ask(router, bbox=inside).gap is not None
 
 
 @contextmanager
