@@ -51,6 +51,7 @@ CAMPAIGNS: Final = {
     "bench": Campaign("make bench", ".bench", "bench"),
     "faults": Campaign("make faults", ".faults", "faults"),
     "kube": Campaign("make kube", ".kube", "kube"),
+    "cluster": Campaign("make cluster-faults", ".faults/cluster", "cluster"),
     "country": Campaign("make country-bench", ".country", "country"),
     "page": Campaign("make page-bench", ".page", "page"),
     "roads": Campaign("make roads-bench", ".roads", "roads"),

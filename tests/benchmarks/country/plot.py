@@ -35,6 +35,6 @@ def draw(course: Path, out: Path) -> None:
     below.set(xlabel="time [s]", ylabel="wait for the ack [s]", ylim=(0, None))
     for axes in (above, middle, below):
         axes.axvline(WARM_S, color="0.7", linewidth=1, linestyle=":")
-        axes.legend(frameon=False, ncols=3, loc="upper left")
+        axes.legend(frameon=False, ncols=3, loc="lower right" if axes is middle else "upper right")
         axes.set_xlim(0, None)
     canvas.savefig(out, dpi=130)
