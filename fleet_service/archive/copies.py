@@ -243,8 +243,7 @@ class Copy:
             ]  # fmt: skip
             new.sort(key=lambda name: name.endswith(_LAST))
             vanished = [name for name in new if not self._put_there(name)]
-            absent = [name for name in known if name not in local and not self._aside(name).exists()]
-            removed = [] if vanished else absent
+            removed = [name for name in known if not (vanished or name in local or self._aside(name).exists())]
             removed.sort(key=lambda name: not name.endswith(_LAST))
             if strays := [name for name in new if not self._fence.passes(name)]:  # compacted by who began before
                 self._put_fence(self._term, self._fence._replace(names=self._fence.names.union(strays)))

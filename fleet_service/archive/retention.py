@@ -5,6 +5,7 @@ Only these two rewrite or remove compacted files, one file for one.
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_service.archive import erasures, iceberg, layout, reading, rollup, snapshots, witnesses
-from fleet_service.archive.between import Between
+from fleet_service.archive.between import Between, Where
 from fleet_service.archive.compaction import compact, compacting
 from fleet_service.archive.files import COMPACTED, MAP, lock, put_in_place
 from fleet_service.archive.layout import TABLES
@@ -90,7 +91,8 @@ def forget_period(root: Path, month: str) -> None:
     """
     with lock(root):
         key_of(root, month)
-        destroy_key(root, month, _newest(root, month))
+        begin, until = erasures.span_of(month)
+        destroy_key(root, month, _newest(root, (begin // layout.DAY_NS, None), until=until))
 
 
 def destroy_key(root: Path, month: str, newest: int) -> None:
@@ -108,24 +110,15 @@ def destroy_key(root: Path, month: str, newest: int) -> None:
     sync_directory(key.parent)
 
 
-def _newest(root: Path, month: str) -> int:
-    """Newest first time of a record that the archive holds of a month or after it [ns], -1 if of neither."""
-    begin, until = erasures.span_of(month)
+def _newest(root: Path, days: tuple[int, int | None], where: Where = (), until: float = math.inf) -> int:
+    """Newest first time of a record that the archive holds of these days [ns], -1 if of none; one that is not before
+    `until` will do."""
     newest = -1
     for kind, name in layout.FIRST_TIME.items():
-        for table in reading.read(root, kind, [name], days=(begin // layout.DAY_NS, None)):
+        for table in reading.read(root, kind, [name, *(one.column for one in where)], where, days):
             newest = max(newest, int(nanoseconds(table[name]).max(initial=-1)))
             if newest >= until:
                 return newest
-    return newest
-
-
-def _newest_of(root: Path, pseudonym: str, days: tuple[int, int]) -> int:
-    """Newest first time of a record of one vehicle that the archive holds [ns], -1 if of none."""
-    where, newest = [Between("vehicle", pseudonym, pseudonym)], -1
-    for kind, name in layout.FIRST_TIME.items():
-        for table in reading.read(root, kind, [name, "vehicle"], where, days):
-            newest = max(newest, int(nanoseconds(table[name]).max(initial=-1)))
     return newest
 
 
@@ -165,7 +158,7 @@ def erased(root: Path, vehicle: str, month: str) -> Iterator[Forgotten]:
     compact(root)
     begin, end = _days(month)
     pseudonym = _pseudonym(root, vehicle, month)
-    if (newest := _newest_of(root, pseudonym, (begin, end))) >= 0:
+    if (newest := _newest(root, (begin, end), [Between("vehicle", pseudonym, pseudonym)])) >= 0:
         erasures.note(root / _KEYS, month, newest, pseudonym)
     rows, files, cells = 0, [*root.rglob(f"*{BAD}")], set[int]()
     with compacting(root):
