@@ -27,7 +27,7 @@ def cores(count: int) -> Iterator[Any]:
     os.environ.setdefault("PYSPARK_PYTHON", sys.executable)  # as `spark.session` does, for what it then finds
     # of the environment, Spark looks only at what it holds when its Java starts: the second session would be the first
     builder = SparkSession.builder.master(f"local[{count},{TRIES}]").config("spark.ui.showConsoleProgress", "false")
-    found = builder.config(map=spark.SETTINGS).getOrCreate()
+    found = builder.config(map={**spark.SETTINGS}).getOrCreate()
     try:
         yield spark.session()
     finally:

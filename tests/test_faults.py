@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from fleet_service.app.engine import Engine
+from fleet_service.archive import pseudonyms
 from fleet_service.archive.segments import Writer
 from fleet_service.ingest.inbox import Message
 from schemas import wire
@@ -23,6 +24,7 @@ from tests.faults.bars import BARS, figure
 from tests.faults.campaigns import CAMPAIGNS
 from tests.faults.census import take, told
 from tests.faults.crash_model import history
+from tests.faults.crash_service import ServiceHistory
 from tests.faults.crash_spool import spool_history
 from tests.faults.frame import RAISED, Campaign, Site, conduct
 from tests.fleet_service.examples import SECOND, batch, key
@@ -118,3 +120,20 @@ def test_no_history_on_a_disk_that_forgets_loses_or_doubles_anything() -> None:
 def test_the_disk_that_forgets_catches_a_log_that_does_not_sync(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Writer, "sync", lambda self: None)
     assert any("is lost" in problem for number in range(12) for problem in history(number))
+
+
+def served(number: int, folder: Path) -> list[str]:
+    (folder / str(number)).mkdir()
+    return ServiceHistory(number, folder / str(number)).violations()
+
+
+def test_no_history_of_a_service_on_a_disk_that_forgets_loses_doubles_or_brings_back_anything(tmp_path: Path) -> None:
+    found_bugs = (45, 84)  # a forgotten vehicle's last rows came in again; rows of a month ago were fused twice
+    assert [problem for number in (*range(3), *found_bugs) for problem in served(number, tmp_path)] == []
+
+
+def test_the_disk_that_forgets_catches_a_service_that_does_not_sync_its_keys(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pseudonyms, "sync_directory", lambda folder: None)
+    assert any("key is lost" in problem for number in range(6) for problem in served(number, tmp_path))

@@ -67,11 +67,15 @@ def note(folder: Path, month: str, newest: int, pseudonym: str | None = None) ->
         OSError: the disk is full or broken.
     """
     until = min(newest + US_STEP, span_of(month).until)  # the archive keeps times in whole steps
-    whose = month if pseudonym is None else f"{month}.{pseudonym}"
-    (folder / f"{whose}.{max(until, 0)}.erased").touch(0o600)
-    if pseudonym is None:
-        for path in folder.glob(f"{month}.{'[0-9a-f]' * 16}.*.erased"):  # the month's says more
-            path.unlink()
+    if pseudonym is not None:
+        (folder / f"{month}.{pseudonym}.{max(until, 0)}.erased").touch(0o600)
+    else:  # the month's says more than those of its vehicles; what these forgot may be newer than all that is there
+        names = [name for path in folder.glob(f"{month}.*.erased") if (name := _NAME.fullmatch(path.name)) and name[2]]
+        until = max([until, *(int(name[3]) for name in names)])
+        (folder / f"{month}.{max(until, 0)}.erased").touch(0o600)
+        sync_directory(folder)
+        for name in names:
+            (folder / name[0]).unlink()
     sync_directory(folder)
 
 

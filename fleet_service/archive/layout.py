@@ -30,6 +30,8 @@ TIME: Final = {Kind.OBSERVATION: "leave_time", Kind.STATE: "time"}  # of the mea
 FIRST_TIME: Final = {Kind.OBSERVATION: "enter_time", Kind.STATE: "time"}  # by which a batch is too old, and its month
 CHECKPOINTS: Final = "checkpoints"  # a folder
 DAY_NS: Final = 86_400_000_000_000
+# Days of observations that show in the map, and of batches that may come again (ServiceConfig.oldest_s is 30 days).
+MAP_DAYS: Final = 31
 _EPOCH: Final = date(1970, 1, 1)
 _TERM: Final = re.compile(r"\.\d{10}$")
 _NAMED: Final = re.compile(r"(\.(?P<term>\d{10}))?-(?P<epoch>\d{10,})-\d{8,}\.parquet$")

@@ -125,7 +125,9 @@ def load_groups(
         for group in groups(file.metadata, where):
             if own and not any(those(part, own).num_rows for part in _batches(file, group, looked)):
                 continue
-            take(pa.concat_tables([those(conformed(part, known), where) for part in _batches(file, group, names)]))
+            parts = [those(conformed(part, known), where) for part in _batches(file, group, names)]
+            if parts:  # none, of a file whose only vehicle was forgotten
+                take(pa.concat_tables(parts))
         return file.schema_arrow.empty_table().select(names)
 
     return _content(path, read, damaged, BUFFER_BYTES) is not None

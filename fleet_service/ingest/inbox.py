@@ -19,7 +19,7 @@ import numpy as np
 import zenoh
 
 from fleet_service.archive import erasures
-from fleet_service.archive.layout import FIRST_TIME, TIME
+from fleet_service.archive.layout import DAY_NS, FIRST_TIME, MAP_DAYS, TIME
 from fleet_service.archive.pseudonyms import Pseudonyms, number, texts
 from fleet_service.archive.segments import Rows, stepped
 from fleet_service.archive.witnesses import Witnesses
@@ -49,8 +49,8 @@ STEP_BYTES: Final = 768 * 1024
 GATHER_S: Final = 0.01
 GATHERED: Final = 64  # messages
 QUEUE_BYTES: Final = 64 << 20  # that wait at the most: half a minute's work, whatever the number of messages
-DAY_NS: Final = 86_400 * NS
 FORGET_NS: Final = 600 * NS  # between two looks for streams too old to matter
+KNOWN_NS: Final = (MAP_DAYS + 2) * DAY_NS  # a restart reads whole days again, and asks which of them it knows
 
 
 class Message(NamedTuple):
@@ -151,7 +151,7 @@ class BatchIntake:
         self._now = clock.now / NS
         if abs(clock.now - self._forgot) > FORGET_NS:
             self._forgot = clock.now
-            self._streams.forget(clock.horizon)
+            self._streams.forget(min(clock.horizon, self._streams.newest - KNOWN_NS))
             for known in self._known.values():
                 known.clear()
         out = {}

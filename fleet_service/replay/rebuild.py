@@ -38,8 +38,6 @@ COLUMNS: Final = [
 ]  # of what the fusion takes
 FILTERED: Final = ("longitude", "received_at")  # beside them, where not all rows are wanted
 Box = tuple[float, float, float, float]  # west, south, east, north [deg]
-# Days of observations that show in the map, and of batches that may come again (ServiceConfig.oldest_s is 30 days).
-MAP_DAYS: Final = 31
 PART_ROWS: Final = 4_000_000  # of a day that are held at once, 200 MB; twice, while the next are read
 CHUNK_ROWS: Final = 100_000  # that are fused at once: what is made of them on the way takes four times their memory
 _PACKED: Final = pa.ipc.IpcWriteOptions(compression="lz4")
@@ -151,7 +149,7 @@ def past(
         OSError: the archive cannot be read.
     """
     fusion = weathered(root, lateness_s, until)
-    begin = Begin(until // layout.DAY_NS - MAP_DAYS)
+    begin = Begin(until // layout.DAY_NS - layout.MAP_DAYS)
     wanted, heard = Since(begin, until=until, box=box, most=most), nobody if listener is None else listener(fusion)
     for _ in replay(root, fusion, wanted, heard=heard):
         pass  # the alerts of then are history
@@ -159,12 +157,12 @@ def past(
 
 
 def first_day(root: Path) -> int | None:
-    """The first day that matters to a service: MAP_DAYS before the last that the archive has rows of.
+    """The first day that matters to a service: layout.MAP_DAYS before the last that the archive has rows of.
 
     Neither batches that are older come again (ServiceConfig.oldest_s), nor does anything of them show in the map.
     """
     found = [layout.day_of(folder) for kind in Kind for folder in layout.days(root, layout.TABLES[kind])]
-    return max(found) - MAP_DAYS if found else None
+    return max(found) - layout.MAP_DAYS if found else None
 
 
 def replay(
@@ -369,7 +367,7 @@ def rows_near(root: Path, until: int, box: Box | None, most: int) -> int:
     """
     last = until // layout.DAY_NS + 1
     found = sum(path.stat().st_size for path in segments.paths(root, Kind.OBSERVATION)) // SEGMENT_ROW_BYTES
-    for path in layout.compacted(root, Kind.OBSERVATION, last - MAP_DAYS - 1, last):
+    for path in layout.compacted(root, Kind.OBSERVATION, last - layout.MAP_DAYS - 1, last):
         if found > most:
             break
         zone = grid.bounds(np.array([layout.partition_of(path).zone]), grid.ZONE_ZOOM)

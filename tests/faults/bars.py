@@ -29,6 +29,7 @@ BARS: Final = {
     "faults.compaction.batches": Bar("batches", 500, "more"),
     "faults.crash_model.violations": Bar("histories", 0),
     "faults.crash_model.acknowledged": Bar("batches before a power loss", 100, "more"),
+    "faults.crash_model.service_acknowledged": Bar("of these by a whole service", 20, "more"),
     "faults.truncation.lost_rows": Bar("rows", 0),
     "faults.truncation.damages": Bar("segments cut or changed", 100, "more"),
     "faults.router_down.lost": Bar("batches", 0),

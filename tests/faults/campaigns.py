@@ -27,7 +27,14 @@ from tests.faults import (
 from tests.faults.frame import Campaign
 
 CAMPAIGNS: Final = (
-    Campaign("crash-model", crash_model.run, ("faults.crash_model.violations", "faults.crash_model.acknowledged")),
+    Campaign(
+        "crash-model",
+        crash_model.run,
+        (
+            *("faults.crash_model.violations", "faults.crash_model.acknowledged"),
+            "faults.crash_model.service_acknowledged",
+        ),
+    ),
     Campaign(
         "compaction",
         compaction.run,

@@ -1,9 +1,10 @@
 """A disk that forgets: while it is in use, power can go at any operation of the code under test.
 
 The files are real and lie in a folder; what the code does with them goes through here (`os.fsync`, `os.rename`,
-`os.unlink`, `os.mkdir`, `os.open`, `Path.open`). After power loss only what was synced is sure: the bytes of a file at
-its last fsync, and the names in a folder at its own. Of everything later any part may have reached the disk: of the
-bytes a prefix, with or without rubbish behind, and of the changes of names any that keep the order of each name.
+`os.unlink`, `os.mkdir`, `os.rmdir`, `os.open`, `Path.open`, `shutil.rmtree`). After power loss only what was synced is
+sure: the bytes of a file at its last fsync, and the names in a folder at its own. Of everything later any part may have
+reached the disk: of the bytes a prefix, with or without rubbish behind, and of the changes of names any that keep the
+order of each name.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import errno
 import io
 import os
 import random
+import shutil
 import stat
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -68,7 +70,7 @@ class CrashDisk:
 
     def _gone(self, path: Path) -> None:
         """The file is about to lose its name."""
-        if path.exists():
+        if path.is_file():
             self._written[self._number[path.stat().st_ino]] = path.read_bytes()
 
     def _ours(self, path: object) -> bool:
@@ -86,9 +88,10 @@ class CrashDisk:
             "replace": self._rename,
             "open": self._open,
         }
-        calls |= {"unlink": self._unlink, "remove": self._unlink, "mkdir": self._mkdir}
+        calls |= {"unlink": self._unlink, "remove": self._unlink, "mkdir": self._mkdir, "rmdir": self._unlink}
         patches = [mock.patch.object(os, name, call(getattr(os, name))) for name, call in calls.items()]
         patches.append(mock.patch.object(Path, "open", self._path_open(Path.open)))
+        patches.append(mock.patch.object(shutil, "rmtree", _rmtree))
         for patch in patches:
             patch.start()
         try:
@@ -116,10 +119,21 @@ class CrashDisk:
                 self._operate(needs_room=False)
                 self._gone(Path(target))
                 self._changed(source, None)
-                self._changed(target, self._number[Path(source).stat().st_ino])
+                if Path(source).is_dir():
+                    self._moved(str(source), str(target))
+                    self._changed(target, FOLDER)
+                else:
+                    self._changed(target, self._number[Path(source).stat().st_ino])
             real(source, target)
 
         return rename
+
+    def _moved(self, source: str, target: str) -> None:
+        """A folder gets another name: what is durable in it is so under whichever of the two survives."""
+        for path in [path for path in self._names if f"{path}/".startswith(f"{source}/")]:
+            self._names[target + path.removeprefix(source)] = self._names[path].copy()
+        for path in [path for path in self._later if f"{path}/".startswith(f"{source}/")]:
+            self._later[target + path.removeprefix(source)] = self._later[path].copy()
 
     def _unlink(self, real: Callable[..., None]) -> Callable[..., None]:
         def unlink(path: Path, **more: object) -> None:
@@ -138,6 +152,8 @@ class CrashDisk:
             if self._ours(path):
                 self._operate(needs_room=True)
                 real(path, *more, **named)
+                self._names.pop(str(path), None)  # of one that had this name before
+                self._later.pop(str(path), None)
                 self._changed(path, FOLDER)
             else:
                 real(path, *more, **named)
@@ -165,6 +181,8 @@ class CrashDisk:
                 return super().write(data)
 
         def open_(path: Path, mode: str = "r", *more: object, **named: object) -> object:
+            if disk._ours(path) and "+" in mode:
+                disk._operate(needs_room=True)
             if not disk._ours(path) or "w" not in mode:
                 return real(path, mode, *more, **named)
             new = not path.exists()
@@ -205,6 +223,20 @@ class CrashDisk:
             return synced
         kept = written[: self._random.randint(0, len(written))]
         return kept + self._random.randbytes(len(written) - len(kept)) * self._random.randint(0, 1)
+
+
+def _rmtree(path: Path, ignore_errors: bool = False) -> None:
+    """As `shutil.rmtree`, by names and not by handles."""
+    try:
+        for inner in sorted(Path(path).iterdir()):
+            if inner.is_dir():
+                _rmtree(inner)
+            else:
+                inner.unlink()
+        Path(path).rmdir()
+    except OSError:
+        if not ignore_errors:
+            raise
 
 
 def _apply(names: dict[str, int], name: str, number: int | None) -> None:

@@ -1,8 +1,12 @@
-"""Histories of a log on a disk that forgets: power lost at any operation, torn writes, a full disk, compaction.
+"""Histories on a disk that forgets: power lost at any operation, torn writes, a full disk.
 
-A history is a few lives of one archive. In each, batches are let in, segments written, compacted; then the power goes
-at a random operation, and the next life finds what the disk kept. What was acknowledged must be there, each row once,
-and a batch may only count as held if it is. In the last life everything that was not acknowledged is sent again.
+Of the log and its compaction here, thousands; of the agent's outbox in `crash_spool`; of a whole service with its keys,
+checkpoints, weather, retention and forgetting in `crash_service`.
+
+A history of the log is a few lives of one archive. In each, batches are let in, segments written, compacted; then the
+power goes at a random operation, and the next life finds what the disk kept. What was acknowledged must be there, each
+row once, and a batch may only count as held if it is. In the last life everything that was not acknowledged is sent
+again.
 """
 
 from __future__ import annotations
@@ -32,6 +36,7 @@ from schemas.runtime.figures import Figure
 from schemas.wire import Kind
 from tests.faults.bars import figure
 from tests.faults.crash_disk import CrashDisk, PowerLoss
+from tests.faults.crash_service import ServiceHistory
 from tests.faults.crash_spool import spool_history
 from tests.faults.frame import Site
 
@@ -173,27 +178,37 @@ def _stored(number: int) -> tuple[list[str], int]:
     return spool_history(number), 0
 
 
+def _served(number: int) -> tuple[list[str], int]:
+    """The same of a whole service."""
+    with tempfile.TemporaryDirectory(prefix="crash-", dir=_memory()) as folder:
+        one = ServiceHistory(number, Path(folder))
+        return one.violations(), one.at_stake
+
+
 def _memory() -> str | None:
     """A folder in memory, where there is one: the disk that forgets is ours, not the machine's."""
     return "/dev/shm" if Path("/dev/shm").is_dir() else None
 
 
 def run(site: Site) -> list[Figure]:
-    """5 000 histories of the log and 500 of the outbox; in a quick run, a hundred and ten."""
-    logs, outboxes = site.of(5000, 100), site.of(500, 10)
+    """5 000 histories of the log, 500 of the outbox and 600 of a service; in a quick run, 120 of all."""
+    logs, outboxes, services = site.of(5000, 100), site.of(500, 10), site.of(600, 10)
     first, bad, acknowledged = site.seed * 1_000_000, 0, 0
+    kinds = (("log", _lived, logs), ("spool", _stored, outboxes), ("service", _served, services))
     with ProcessPoolExecutor(mp_context=get_context("spawn"), initializer=_quiet) as pool:
-        for kind, one, count in (("log", _lived, logs), ("spool", _stored, outboxes)):
+        for kind, one, count in kinds:
+            safe_before = acknowledged
             for number, (found, safe) in enumerate(pool.map(one, range(first, first + count), chunksize=10)):
                 bad, acknowledged = bad + bool(found), acknowledged + safe
                 for problem in found[:3]:
                     site.say(f"{kind} history {first + number}: {problem}")
-                if (number + 1) % 500 == 0:
+                if (number + 1) % 200 == 0:
                     site.say(f"{number + 1} histories of the {kind}, {bad} with a violation so far")
     return [
         figure("faults.crash_model.violations", bad),
         figure("faults.crash_model.acknowledged", acknowledged),
-        Figure("faults.crash_model.histories", logs + outboxes, "histories"),
+        figure("faults.crash_model.service_acknowledged", acknowledged - safe_before),
+        Figure("faults.crash_model.histories", logs + outboxes + services, "histories"),
     ]
 
 

@@ -53,6 +53,7 @@ CAMPAIGNS: Final = {
     "kube": Campaign("make kube", ".kube", "kube"),
     "cluster": Campaign("make cluster-faults", ".faults/cluster", "cluster"),
     "country": Campaign("make country-bench", ".country", "country"),
+    "batch": Campaign("make batch-bench", ".batch", "batch"),
     "page": Campaign("make page-bench", ".page", "page"),
     "roads": Campaign("make roads-bench", ".roads", "roads"),
     "usability": Campaign("make usability", ".usability", "usability"),

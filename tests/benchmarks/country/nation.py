@@ -32,14 +32,16 @@ from tests.faults.soak import memory_mb, slope
 WARM_S: Final = 300.0  # all have been everywhere, the window is full, and a checkpoint has given its memory back
 MEASURED_S: Final = 600.0
 EVERY_S: Final = 5.0
+MEMORY_S: Final = 0.25
 COMPACT_S: Final = 240.0  # twice in the ten minutes, once before
 SERVICES: Final = ("west", "middle", "east")
 _TICKS: Final = os.sysconf("SC_CLK_TCK")
 
 
 class Look(NamedTuple):
-    """One moment: time since the beginning [s]; of each process memory [MB], but the sender's, and processor time [s];
-    of each service cells, rows admitted, messages that wait."""
+    """One moment: time since the beginning [s]; of each process memory [MB], but the sender's (the least since the look
+    before: a segment takes and gives back twenty), and processor time [s]; of each service cells, rows admitted,
+    messages that wait."""
 
     time: float
     memory: list[float]
@@ -137,10 +139,11 @@ def _watched(parts: Sequence[Part], services: Sequence[Service], sender: Part) -
     """Look every EVERY_S until the sender, the last of the parts, has ended."""
     looks: list[Look] = []
     began = time.monotonic() - SAYS_S
+    least = [float("inf")] * (len(parts) - 1)
     while sender.alive:
         values = [one.values() for one in services]
         looks.append(Look(
-            time.monotonic() - began, [memory_mb(part) for part in parts[:-1]], [spent_s(part) for part in parts],
+            time.monotonic() - began, _least(least, parts), [spent_s(part) for part in parts],
             [value["gripmap_cells"] for value in values],
             [value['gripmap_rows_total{kind="observation"}'] for value in values],
             [value["gripmap_queue_messages"] for value in values],
@@ -151,8 +154,16 @@ def _watched(parts: Sequence[Part], services: Sequence[Service], sender: Part) -
             waits = f"oldest {last.get('oldest_s', 0.0):.1f} s, p99 {last.get('p99_s', 0.0):.2f} s"
             late = f"sender {last.get('late_s', 0.0):.1f} s late"
             print(f"  {now.time:4.0f} s: {sum(now.cells):.0f} cells, {memory} MB, {waits}, {late}", flush=True)
-        time.sleep(max(began + SAYS_S + len(looks) * EVERY_S - time.monotonic(), 0.0))
+        least = _least([float("inf")] * len(least), parts)
+        while time.monotonic() < began + SAYS_S + len(looks) * EVERY_S:
+            time.sleep(MEMORY_S)
+            least = _least(least, parts)
     return looks
+
+
+def _least(before: list[float], parts: Sequence[Part]) -> list[float]:
+    """Memory of each process but the last now, or what it was before, if that was less."""
+    return [min(then, memory_mb(part)) for then, part in zip(before, parts[:-1], strict=True)]
 
 
 def _last_line(sender: Part) -> dict[str, float]:
@@ -188,7 +199,7 @@ def _waits(put: FloatArray, wait: FloatArray, region: FloatArray) -> list[Figure
 def _growth(looks: Sequence[Look], coefficients: Coefficients) -> list[Figure]:
     """Of the services' memory over the ten minutes, and what of it are new cells."""
     time_s = np.array([look.time for look in looks])
-    late = time_s >= WARM_S
+    late = (time_s >= WARM_S) & (time_s < WARM_S + MEASURED_S)  # whole minutes: a line goes through the least of each
     memory, cells = (np.array([getattr(look, name) for look in looks])[late] for name in ("memory", "cells"))
     grown = sum(slope(time_s[late], memory[:, k]) for k in range(len(SERVICES)))
     new = float(cells[-1].sum() - cells[0].sum())

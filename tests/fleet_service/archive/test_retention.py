@@ -168,6 +168,28 @@ def test_what_a_forgotten_vehicle_measured_does_not_come_in_again_over_restarts(
     assert [path.name.count(".") for path in (tmp_path / "keys").glob("*.erased")] == [2], "it goes with the key"
 
 
+def test_the_last_of_a_forgotten_vehicle_does_not_come_in_again_when_its_month_is_forgotten_after_it(
+    tmp_path: Path,
+) -> None:
+    other, last = (batch(f"car-00{k}", 1, NOON + k * SECOND, [0.8]) for k in (1, 2))
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        assert [told(engine, one, NOON + DAY) for one in (other, last)] == [["durable"], ["durable"]]
+    retention.forget_vehicle(tmp_path, "car-002", "2026-01")
+    retention.forget_period(tmp_path, "2026-01")
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        assert [told(engine, one, NOON + DAY) for one in (other, last)] == [[ERASED], [ERASED]]
+
+
+def test_a_file_whose_only_vehicle_was_forgotten_is_empty_and_not_damaged(tmp_path: Path) -> None:
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        assert told(engine, batch("car-001", 1, NOON, [0.8]), NOON + DAY) == ["durable"]
+    assert retention.forget_vehicle(tmp_path, "car-001", "2026-01").rows == 1
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        assert engine.counts["files_set_aside"] == 0
+    assert not list(tmp_path.rglob(f"*{BAD}"))
+    assert rows_kept(tmp_path) == 0
+
+
 def test_of_a_month_that_goes_on_all_is_forgotten_until_the_newest_there_is(tmp_path: Path) -> None:
     seen, new = batch("car-001", 1, NOON - DAY, [0.8]), batch("car-001", 2, NOON, [0.8])
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:

@@ -30,6 +30,8 @@ from schemas.wire import Batch, Kind
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, SECOND, batch, key
 from tests.waiting import until
 
+DAY_S = 86_400.0
+
 
 def icy(vehicle: int, seq: int, mu: float) -> Message:
     one = batch(f"sim-{vehicle:03}", seq, time.time_ns() - SECOND, [mu])
@@ -115,6 +117,26 @@ def known(engine: Engine) -> dict[str, NDArray[Any]]:
     columns = {name: rows.cells[name][order] for name in CELL.names or () if name not in ("window", "reporters")}
     times = {"epoch": np.array([fusion.epoch]), "newest": np.array([engine.newest])}
     return {"belief": rows.belief[order], **columns, **times}
+
+
+@pytest.mark.parametrize("oldest_s", [30 * DAY_S, DAY_S])
+def test_a_batch_that_is_too_old_to_come_again_is_not_fused_again_by_a_restart(tmp_path: Path, oldest_s: float) -> None:
+    """What was compacted after the checkpoint lies in one file with what it knows."""
+    config, now = ServiceConfig(oldest_s=oldest_s), time.time_ns()
+    old = now - int(30.5 * DAY_S * SECOND)
+    with closing(Engine(config, tmp_path)) as engine:
+        for vehicle, at in (("sim-001", old), ("sim-002", now)):
+            one = batch(vehicle, 1, at, [0.8])
+            sent = Message(Kind.OBSERVATION, key(vehicle), wire.encode(one), wire.ENCODING[Kind.OBSERVATION])
+            engine.ingest([sent], at + SECOND)
+            engine.flush()
+        keep(engine, tmp_path)
+        engine.ingest([icy(3, 1, 0.8)], now + SECOND)
+        engine.flush()
+        compact(tmp_path)
+        assert engine.fusion.live.visits[: engine.fusion.size].tolist() == [3]
+    with closing(Engine(config, tmp_path)) as again:
+        assert again.fusion.live.visits[: again.fusion.size].tolist() == [3]
 
 
 def test_what_is_known_is_bit_for_bit_the_same_live_from_a_checkpoint_and_from_the_log(tmp_path: Path) -> None:

@@ -1,0 +1,307 @@
+"""Histories of a whole service on a disk that forgets: keys, log, compaction, roll-ups, checkpoints, snapshots,
+weather, retention and forgetting.
+
+A history is a few lives of one archive, days apart. In each the engine takes batches and weather, and what its upkeep
+does is done in any order; between two lives somebody may have a vehicle's month forgotten, or the whole month. The
+power goes at a random operation. What the next life finds must hold what was acknowledged, each row once, and all
+weather that acted; it must know a batch again if and only if it holds it; the map from a checkpoint and the log is the
+map from the log alone; no compacted file is damaged; and what was forgotten does not come back.
+"""
+
+from __future__ import annotations
+
+import random
+import shutil
+import threading
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from datetime import UTC, date, datetime
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from fleet_service.app.engine import Engine
+from fleet_service.app.memory import Memory, remember
+from fleet_service.archive import layout, reading, snapshots
+from fleet_service.archive.compaction import compact
+from fleet_service.archive.load import load
+from fleet_service.archive.pseudonyms import Pseudonyms, number
+from fleet_service.archive.retention import LEAST_DAYS, forget_period, forget_vehicle, retire
+from fleet_service.archive.segments import nanoseconds
+from fleet_service.ingest import weather
+from fleet_service.ingest.inbox import Message
+from fleet_service.replay import checkpoints
+from schemas import grid, keys, tables, wire
+from schemas.config import ServiceConfig
+from schemas.errors import InputError
+from schemas.weather import Report, encode
+from schemas.wire import Kind
+from tests.faults.crash_disk import CrashDisk, PowerLoss
+from tests.fleet_service.examples import LATITUDE, LONGITUDE, REGION, SECOND, batch, key
+
+LIVES: Final = 4
+STEPS: Final = 14
+START: Final = 1_698_500_000 * SECOND  # 2023-10-28: months end within the histories
+AWAY_DAYS: Final = 14  # between two lives, at the most
+VEHICLES: Final = ("car-a", "car-b", "car-c")
+PLACES: Final = 4  # cells in which they are
+NORTH: Final = 0.0003  # degrees from one to the next
+CONFIG: Final = ServiceConfig(name="shard")
+SAME: Final = 1e-6  # probability of a bin
+NEARLY: Final = 0.01  # likewise, of a cell that was dropped for a week's rest and visited again
+
+
+class Sent(NamedTuple):
+    """A batch as its vehicle holds it; `time` of its last row [ns]."""
+
+    vehicle: str
+    seq: int
+    time: int
+    payload: bytes
+
+    @property
+    def rows(self) -> tuple[int, int]:
+        """What its rows are known by in the archive."""
+        return self.time - SECOND, self.time
+
+    @property
+    def month(self) -> str:
+        """That it belongs to."""
+        return f"{datetime.fromtimestamp(self.rows[0] // SECOND, UTC):%Y-%m}"
+
+
+class ServiceHistory:
+    """One history by its number.
+
+    Attributes:
+        at_stake: batches that were acknowledged before a power loss.
+        done: what was done before one, to its end.
+    """
+
+    def __init__(self, number_: int, folder: Path) -> None:
+        self.random, self.folder = random.Random(number_), folder
+        self.acknowledged: set[Sent] = set()
+        self.sent: list[Sent] = []
+        self.weather: set[int] = set()  # times of reports that acted
+        self.forgetting: set[tuple[str, str]] = set()  # month, and vehicle or nothing, whose forgetting began
+        self.gone: set[Sent] = set()  # whose rows were forgotten
+        self.destroyed: set[bytes] = set()  # keys
+        self._nobodys: set[Sent] = set()  # whose rows nobody can tell any more
+        self.retired = -1  # last day whose rows may be gone
+        self.at_stake = 0
+        self.done: Counter[str] = Counter()
+        self._now = START
+
+    def violations(self) -> list[str]:
+        """What was wrong in it."""
+        live = self.folder / "life-0"
+        live.mkdir()
+        found: list[str] = []
+        for life in range(LIVES):
+            last = life == LIVES - 1
+            start = self.random.randint(0, 100)
+            full = range(start, start + self.random.choice((0, 0, 3, 10)))
+            power = None if last else self.random.randint(0, 250)
+            disk = CrashDisk(live, self.random, power, range(0) if last else full)
+            self._lived(disk, live, last)
+            if not last:
+                self.at_stake = len(self.acknowledged)
+                live = self.folder / f"life-{life + 1}"
+                disk.image(live)
+            found += [f"life {life}: {problem}" for problem in self._problems(live, last)]
+            self._now += self.random.randint(0, AWAY_DAYS * 86_400) * SECOND
+        return found
+
+    def _lived(self, disk: CrashDisk, root: Path, last: bool) -> None:
+        engine = None
+        with disk.mounted(), suppress(PowerLoss):
+            if self.sent and self.random.random() < 0.4:
+                self._forget(root)
+            with suppress(OSError):  # a service that finds the disk full at its start says so and ends
+                engine = Engine(CONFIG, root)
+                for _ in range(STEPS):
+                    self._step(engine, root)
+                if last:
+                    self._take(engine, self.sent)
+                    self._flush(engine)
+        if engine is not None:
+            engine.holding.close()
+
+    def _forget(self, root: Path) -> None:
+        """Nobody serves: a vehicle's month, or the whole month, is forgotten."""
+        one, whole = self.random.choice(self.sent), self.random.random() < 0.3
+        key = root / "keys" / f"{one.month}.key"
+        if not key.exists():
+            return
+        secret = key.read_bytes()
+        self.forgetting.add((one.month, "" if whole else one.vehicle))
+        with suppress(OSError):
+            if whole:
+                forget_period(root, one.month)
+                self.destroyed.add(secret)
+                self._nobodys.update(sent for sent in self.sent if sent.month == one.month)
+            else:
+                forget_vehicle(root, one.vehicle, one.month)
+                theirs = {sent for sent in self.acknowledged if (sent.month, sent.vehicle) == (one.month, one.vehicle)}
+                self.gone |= theirs - self._nobodys
+            self.done["forgetting"] += 1
+
+    def _step(self, engine: Engine, root: Path) -> None:
+        self._now += self.random.randint(5, 3000) * SECOND
+        jobs = {"batches": 8, "flush": 5, "compaction": 2, "checkpoint": 2, "weather": 1, "retention": 1}
+        job = self.random.choices([*jobs], [*jobs.values()])[0]
+        with suppress(OSError):  # upkeep counts it and goes on
+            if job == "batches":
+                new = [self._batch() for _ in range(self.random.randint(1, 3))]
+                self._take(engine, new + self.random.sample(self.sent, min(2, len(self.sent))))
+            elif job == "weather":
+                self._report(engine)
+            elif job == "compaction":
+                weather.gather(root)
+                compact(root, round_rows=self.random.choice((1, 5, 1000)))
+            elif job == "retention":
+                self._retire(root)
+            else:
+                self._flush(engine)  # what upkeep wants is done right after a segment
+                if job == "checkpoint":
+                    self._checkpoint(engine, root)
+            self.done[job] += 1
+
+    def _checkpoint(self, engine: Engine, root: Path) -> None:
+        """Wanted by upkeep, taken by the worker after a segment."""
+        stop = threading.Event()
+        with ThreadPoolExecutor(1) as upkeep:
+            coming = upkeep.submit(engine.checkpoint, stop)
+            try:
+                while not coming.done():
+                    self._flush(engine)
+            finally:
+                stop.set()
+        taken = coming.result()
+        if taken is not None:
+            checkpoints.save(root, taken)
+            snapshots.write(root, engine.whole_map(self._now), self._now)
+
+    def _batch(self) -> Sent:
+        vehicle, self._now = self.random.choice(VEHICLES), self._now + 5 * SECOND
+        seq = 1 + sum(one.vehicle == vehicle for one in self.sent)
+        latitude = np.full(2, LATITUDE + NORTH * self.random.randrange(PLACES))
+        mu = self.random.choice((0.15, 0.5, 0.85))
+        made = batch(vehicle, seq, self._now, [mu, mu], latitude=latitude, cell=grid.cell_of(latitude, LONGITUDE))
+        self.sent.append(Sent(vehicle, seq, self._now, wire.encode(made)))
+        return self.sent[-1]
+
+    def _take(self, engine: Engine, batches: list[Sent]) -> None:
+        wanted = [Message(Kind.OBSERVATION, key(one.vehicle), one.payload, wire.ENCODING[Kind.OBSERVATION])
+                  for one in batches]  # fmt: skip
+        engine.ingest(wanted, self._now)
+
+    def _flush(self, engine: Engine) -> None:
+        durable = {
+            (vehicle, seq)
+            for vehicle, payload in engine.flush()
+            for stream in wire.decode_ack(payload)[1]
+            for first, end in stream.durable
+            for seq in range(first, end + 1)
+        }
+        self.acknowledged.update(one for one in self.sent if (one.vehicle, one.seq) in durable)
+
+    def _report(self, engine: Engine) -> None:
+        report = Report(self._now, 0.5, 0.5, 0.5)
+        failures = engine.counts["weather_failures"]
+        engine.weather.enqueue(weather.WeatherMessage(keys.weather_key(REGION), encode(report), wire.WEATHER_ENCODING))
+        engine.update_weather(self._now)
+        if engine.counts["weather_failures"] == failures:
+            self.weather.add(report.time)
+
+    def _retire(self, root: Path) -> None:
+        today = datetime.fromtimestamp(self._now // SECOND, UTC).date()
+        self.retired = max(self.retired, (today - date(1970, 1, 1)).days - LEAST_DAYS - 1)
+        with suppress(InputError):
+            retire(root, LEAST_DAYS, today)
+            weather.retire(root, self._now // layout.DAY_NS - LEAST_DAYS - 1)
+
+    def _problems(self, root: Path, last: bool) -> list[str]:
+        """Of the archive as the next life finds it."""
+        rows: Counter[int] = Counter()
+        with suppress(FileNotFoundError):
+            for table in reading.read(root, Kind.OBSERVATION, ["leave_time"]):
+                rows.update(nanoseconds(table["leave_time"]).tolist())
+        found = [f"{time} is there {count} times" for time, count in rows.items() if count > 1]
+        found += self._lost(rows, last) + self._came_back(root, rows)
+        reports = (load(path, tables.WEATHER_ARCHIVE, ["time"]) for path in weather.files(root))
+        there = {time for table in reports if table is not None for time in nanoseconds(table["time"]).tolist()}
+        found += [f"the weather of {time} is lost" for time in sorted(self.weather - there)
+                  if time // layout.DAY_NS > self.retired]  # fmt: skip
+        found += self._known(root, rows)
+        return found
+
+    def _lost(self, rows: Counter[int], last: bool) -> list[str]:
+        """Acknowledged, and neither there nor given up; in the last life everything that may come was sent again."""
+        owed = [one for one in self.sent if one in self.acknowledged or (last and self._may_come(one))]
+        return [f"{one.vehicle} {one.seq} is lost" for one in owed
+                if not self._given_up(one) and not all(rows[time] for time in one.rows)]  # fmt: skip
+
+    def _may_come(self, one: Sent) -> bool:
+        return self._now - one.time < CONFIG.oldest_s * SECOND - layout.DAY_NS
+
+    def _given_up(self, one: Sent) -> bool:
+        marks = {(one.month, ""), (one.month, one.vehicle)}
+        return one.rows[0] // layout.DAY_NS <= self.retired or bool(marks & self.forgetting)
+
+    def _came_back(self, root: Path, rows: Counter[int]) -> list[str]:
+        """What was forgotten, and is there nevertheless."""
+        found = [f"{one.vehicle} {one.seq} came back" for one in self.gone if any(rows[time] for time in one.rows)]
+        keys = (path.read_bytes() for path in (root / "keys").glob("*.key"))
+        return found + ["the key of a month came back" for key in keys if key in self.destroyed]
+
+    def _known(self, root: Path, rows: Counter[int]) -> list[str]:
+        """The map and the batches that are known, from a checkpoint and from the log alone."""
+        if not (root / "inbox").is_dir():
+            return []
+        same, bare = (root.with_name(f"{root.name}-{name}") for name in ("same", "bare"))
+        for copy in (same, bare):
+            shutil.copytree(root, copy)
+        shutil.rmtree(bare / layout.CHECKPOINTS, ignore_errors=True)
+        damaged: list[Path] = []
+        begun, whole = (remember(copy, CONFIG, lambda path, _: damaged.append(path)) for copy in (same, bare))
+        found = _different(begun, whole, self._now)
+        for copy in (same, bare):
+            shutil.rmtree(copy)
+        pseudonyms = Pseudonyms(root / "keys")
+        for one in self.sent:
+            if (one.month, "") in self.forgetting or not self._may_come(one):
+                continue  # nobody can tell, and it is not let in; or it is too old
+            if not (root / "keys" / f"{one.month}.key").exists():
+                if rows[one.time]:
+                    found.append(f"{one.vehicle} {one.seq} is there, its key is lost")
+                continue
+            first = one.rows[0]
+            name = number(pseudonyms.of(one.vehicle, first)), pseudonyms.boot(one.vehicle, _boot(one.vehicle), first)
+            names = np.array([[*name, REGION, one.seq]], np.int64)
+            for memory, by in ((begun, "the checkpoint"), (whole, "the log")):
+                held = bool(rows[one.time])
+                if bool(memory.streams.accepted(Kind.OBSERVATION, names)[0]) != held:
+                    found.append(f"{one.vehicle} {one.seq} is {'un' if held else ''}known by {by}")
+        return found
+
+
+def _boot(vehicle: str) -> int:
+    """As `examples.batch` has it."""
+    return 1 + sum(vehicle.encode())
+
+
+def _different(begun: Memory, whole: Memory, now: int) -> list[str]:
+    """What two memories of one archive believe otherwise."""
+    if not whole.fusion.size:
+        return []
+    slots = np.arange(whole.fusion.size)
+    there = begun.fusion.slots_of(whole.fusion.cell[slots], whole.fusion.sector[slots].astype(np.int64))
+    if (there < 0).any():
+        return [f"{int((there < 0).sum())} cells are not in the checkpoint's map"]
+    apart = np.abs(begun.fusion.beliefs(there, now) - whole.fusion.beliefs(slots, now)).max(axis=1)
+    anew = begun.fusion.live.visits[there] < whole.fusion.live.visits[slots]  # dropped meanwhile, when it was at rest
+    wrong = apart > np.where(anew, NEARLY, SAME)
+    return [f"the maps differ by {apart[wrong].max():.2g}"] if wrong.any() else []
