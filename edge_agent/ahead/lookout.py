@@ -1,4 +1,4 @@
-"""The lookout: vehicles' ears and eyes ahead, once a second in a thread of its own, and at once when alerts change.
+"""The lookout: what vehicles hear and see ahead, once a second in a thread of its own, and at once when alerts change.
 
 The estimation loop only says where it is (`see`), which cannot block.
 """
@@ -16,8 +16,8 @@ import numpy as np
 import zenoh
 
 from edge_agent.ahead.asking import FURTHER_M
-from edge_agent.ahead.ears import Ears
 from edge_agent.ahead.horizon import Horizon, horizon_length, look_ahead
+from edge_agent.ahead.map_subscriber import MapSubscriber
 from edge_agent.ahead.path import GivenRoute, Path, Pose, corridor
 from edge_agent.ahead.prior import MapPrior
 from edge_agent.ahead.roads import ways_on
@@ -39,7 +39,7 @@ RouteOf = Callable[[int], GivenRoute | None]
 @dataclass
 class _Watcher:
     name: str
-    ears: Ears | None = None
+    subscriber: MapSubscriber | None = None
     active: tuple[Active, ...] = ()
     due: float = 0.0
     looked: float = -1.0
@@ -56,15 +56,17 @@ class LookoutCounts:
     warnings: int = 0
     failures: int = 0
     busy_s: float = 0.0  # of the processor, by the thread that looks
-    ears: dict[str, Ears] = field(default_factory=dict)
+    subscribers: dict[str, MapSubscriber] = field(default_factory=dict)
 
     def heard(self, what: str) -> int:
-        """Sum of a count of all ears."""
-        return sum(ears.counts[what] for ears in self.ears.values())
+        """Sum of a count of all subscribers."""
+        return sum(one.counts[what] for one in self.subscribers.values())
 
     def values(self) -> dict[str, float]:
         """For the last line of a drive."""
-        refused = sum(n for ears in self.ears.values() for name, n in ears.counts.items() if name.startswith("refused"))
+        refused = sum(
+            n for one in self.subscribers.values() for name, n in one.counts.items() if name.startswith("refused")
+        )
         return {
             "warnings": self.warnings, "looks": self.looks, "look_s": round(self.busy_s, 3),
             "heard_bytes": self.heard("bytes"), "heard_alerts": self.heard("alerts"), "heard_refused": refused,
@@ -104,7 +106,8 @@ class Lookout:
         k = self._number.get(name)
         if k is not None:
             watcher = self._watchers[k]
-            watcher.ears = self.counts.ears[name] = Ears(name, session, lambda places: self._urge(watcher, places))
+            subscriber = MapSubscriber(name, session, lambda places: self._urge(watcher, places))
+            watcher.subscriber = self.counts.subscribers[name] = subscriber
 
     def see(self, poses: Sequence[Pose]) -> None:
         """Where the vehicles are now; row k is vehicle k."""
@@ -121,14 +124,14 @@ class Lookout:
             return
         map_beliefs: dict[int, FloatArray | None] = {}
         for k in self._prior.enters(places):
-            ears = self._watchers[k].ears if k in self._watchers else None
-            if ears is None or places[k] < 0:
+            subscriber = self._watchers[k].subscriber if k in self._watchers else None
+            if subscriber is None or places[k] < 0:
                 map_beliefs[k] = None
-            elif ears.looking().acquire(blocking=False):  # the loop does not wait: it asks again at the next block
+            elif subscriber.looking().acquire(blocking=False):  # the loop does not wait: it asks again at the next
                 try:
-                    map_beliefs[k] = ears.known.belief(int(places[k]), time.time_ns())
+                    map_beliefs[k] = subscriber.known.belief(int(places[k]), time.time_ns())
                 finally:
-                    ears.looking().release()
+                    subscriber.looking().release()
         informed = self._prior.step(places, *beliefs, map_beliefs)
         self._here = np.column_stack([mugrid.quantiles(informed, q) for q in (0.5, 0.05, 0.95)])
 
@@ -174,7 +177,7 @@ class Lookout:
         watcher.due = now + LOOK_S * ((k * 0.618034) % 1.0 if first else 1.0)
         watcher.looked, watcher.urgent = now, False
         poses = self._poses
-        if watcher.ears is None or k >= len(poses):
+        if watcher.subscriber is None or k >= len(poses):
             return
         pose = poses[k]
         if not np.isfinite([pose.latitude, pose.longitude, pose.yaw, pose.speed]).all():
@@ -182,17 +185,17 @@ class Lookout:
         if time.time_ns() - pose.time > STALE_S * NS:
             return
         try:
-            self._look(k, watcher, watcher.ears, pose)
+            self._look(k, watcher, watcher.subscriber, pose)
         except Exception:  # whatever it is: the car drives on, and so must this thread
             self.counts.failures += 1
             log.exception("a look ahead of %s failed; going on", watcher.name)
 
-    def _look(self, k: int, watcher: _Watcher, ears: Ears, pose: Pose) -> None:
+    def _look(self, k: int, watcher: _Watcher, subscriber: MapSubscriber, pose: Pose) -> None:
         length = horizon_length(pose.speed)
-        with ears.looking():
-            paths = paths_ahead(pose, self._route_of(k), ears, length + FURTHER_M)
-            horizons = [look_ahead(path.near(length), ears.known, pose.time) for path in paths]
-            watcher.active, issued = warn(watcher.active, horizons, pose, ears.known)
+        with subscriber.looking():
+            paths = paths_ahead(pose, self._route_of(k), subscriber, length + FURTHER_M)
+            horizons = [look_ahead(path.near(length), subscriber.known, pose.time) for path in paths]
+            watcher.active, issued = warn(watcher.active, horizons, pose, subscriber.known)
         watcher.places = frozenset(np.concatenate([path.places.ravel() for path in paths]).tolist())
         self.counts.looks += 1
         for warning in issued:
@@ -204,17 +207,17 @@ class Lookout:
             (*(one.warning for one in watcher.active), *ended), runs(horizons[0]),
             tuple(self._here[k].tolist()),
         )  # fmt: skip
-        ears.follow(paths, pose, length)
+        subscriber.follow(paths, pose, length)
         outlook = watcher.outlook
-        ears.tell(lambda: encode_ahead(outlook))
+        subscriber.tell(lambda: encode_ahead(outlook))
 
 
-def paths_ahead(pose: Pose, route: GivenRoute | None, ears: Ears, length: float) -> list[Path]:
-    """The ways on: the given route, else the roads that the map shows, else straight on; hold the ears' lock."""
+def paths_ahead(pose: Pose, route: GivenRoute | None, subscriber: MapSubscriber, length: float) -> list[Path]:
+    """The ways on: the given route, else the roads that the map shows, else straight on; hold the subscriber's lock."""
     given = route.ahead(pose, length) if route is not None else None
     if given is not None:
         return [given]
-    return ways_on(pose, ears.known.keys(), length) or [corridor(pose, length)]
+    return ways_on(pose, subscriber.known.keys(), length) or [corridor(pose, length)]
 
 
 def runs(horizon: Horizon) -> Runs:

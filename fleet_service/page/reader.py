@@ -1,4 +1,5 @@
-"""The page's ear: a reader's session. Hears tiles and alerts, asks for what it missed, sees which regions are served.
+"""The page's subscriber: a reader's session. Hears tiles and alerts, asks for what it missed, sees which regions
+are served.
 
 What it puts: nothing. What it may not hear of (tokens, where the access list holds) it does without.
 """

@@ -123,9 +123,9 @@ def _answers(endpoint: str, client: zenoh.Session, tile: str) -> tuple[list[floa
     words = [sys.executable, "-c", f"from tests.benchmarks.tiles import read; read({endpoint!r})"]
     readers = [subprocess.Popen(words, stdout=subprocess.PIPE, text=True) for _ in range(READERS)]
     got: list[list[int]] = [[] for _ in readers]
-    ears = [threading.Thread(target=_count, args=pair) for pair in zip(readers, got, strict=True)]
-    for ear in ears:
-        ear.start()
+    threads = [threading.Thread(target=_count, args=pair) for pair in zip(readers, got, strict=True)]
+    for thread in threads:
+        thread.start()
     waits: list[float] = []
     pause, deadline = threading.Event(), time.monotonic() + 2 * PATIENCE_S
     try:
@@ -138,8 +138,8 @@ def _answers(endpoint: str, client: zenoh.Session, tile: str) -> tuple[list[floa
         for reader in readers:
             reader.terminate()
             reader.wait()
-        for ear in ears:
-            ear.join()
+        for thread in threads:
+            thread.join()
     return waits, min(map(sum, got))
 
 

@@ -41,18 +41,17 @@ NEAR: Final = f"{LONGITUDE},{LATITUDE + 0.011},{LONGITUDE + 0.01},{LATITUDE + 0.
 
 
 def run(site: Site) -> list[Figure]:
-    """Twenty million observations and twice as many states; in a quick run, eighty thousand."""
+    """Twenty million observations and twice as many states, and a tenth and a third of them; in a quick run, eighty
+    thousand."""
     millions = site.of(2000, 8) / 100
-    root = _made(site, round(millions * 1e6))
+    shares = (0.1,) if site.quick else (0.1, 0.3)
+    smaller = [_smaller(site, millions * share) for share in shares]
+    root = _made(site, (site.folder if site.quick else site.folder.parent) / "age-archive", round(millions * 1e6))
     shutil.rmtree(root / CHECKPOINTS, ignore_errors=True)
     cold = _measured("ready", root)
     site.say(f"from Parquet alone: {cold}")
-    _measured("checkpoint", root)
-    synthetic.write(root, SyntheticFleet(SINCE, 1, vehicles=50, seed=int(time.time())), SEGMENT)
-    warm = _measured("ready", root)
-    site.say(f"from a checkpoint: {warm}")
-    then = _measured("past", root, _asked(root))
-    site.say(f"a question about the past: {then}")
+    warm, then = _asked_of(root)
+    site.say(f"from a checkpoint: {warm}; a question about the past: {then}")
     young, old = (_last_day(root, site.folder / name, times) for name, times in (("one", 0), ("old", 2)))
     tries = [(_measured("ready", young), _measured("ready", old)) for _ in range(2)]
     # the least of two: what else the machine does only adds
@@ -67,15 +66,34 @@ def run(site: Site) -> list[Figure]:
         figure("faults.age.cells", min(cold["cells"], warm["cells"])),
         figure("faults.age.at_bytes", then["bytes"]),
         figure("faults.age.old_days", max(aged[name] / alone[name] for name in OWN)),
+        figure(
+            "faults.age.tenfold",
+            max(now["mb"] / before["mb"] for now, before in zip((warm, then), smaller[0], strict=True)),
+        ),
         Figure("faults.age.observations", millions, "10^6 observations"),
         Figure("faults.age.at_s", then["seconds"], "s"),
         Figure("faults.age.cold_processor_s", cold["processor_s"], "s"),
     ]
 
 
-def _made(site: Site, observations: int) -> Path:
-    """The archive, made anew if it is not of this size; the small one of a quick run each time."""
-    root = (site.folder if site.quick else site.folder.parent) / "age-archive"
+def _smaller(site: Site, millions: float) -> tuple[dict[str, float], dict[str, float]]:
+    """`_asked_of` an archive of so many million observations."""
+    root = _made(site, site.folder / f"age-{millions:g}", round(millions * 1e6))
+    ready, past = _asked_of(root)
+    site.say(f"{millions:g} million: from a checkpoint {ready}; a question about the past {past}")
+    shutil.rmtree(root)
+    return ready, past
+
+
+def _asked_of(root: Path) -> tuple[dict[str, float], dict[str, float]]:
+    """What a start from a checkpoint costs, and a question about the past."""
+    _measured("checkpoint", root)
+    synthetic.write(root, SyntheticFleet(SINCE, 1, vehicles=50, seed=int(time.time())), SEGMENT)
+    return _measured("ready", root), _measured("past", root, _asked(root))
+
+
+def _made(site: Site, root: Path, observations: int) -> Path:
+    """An archive, made anew if it is not there in this size."""
     said = root / "size"
     if said.exists() and said.read_text() == str(observations):
         return root

@@ -21,7 +21,7 @@ from schemas import keys, wire
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
 from schemas.runtime.zenoh_session import configuration
-from tests.faults.ground import HONEST, ROGUE, Ears, Ground
+from tests.faults.ground import HONEST, ROGUE, Ground, Listener
 from tests.fleet_service.examples import REGION, TILE, batch, key
 from tests.secured import FREE, READER, ROUTERS, SERVICE, WEATHER, enrolment, registry, settings
 from tests.waiting import until
@@ -134,7 +134,7 @@ def put_by(ground: Ground, session: zenoh.Session, *expressions: str) -> bool:
     for expression in expressions:
         session.put(expression, SECRET + expression.encode())
     ground.passed(session)
-    return any(ears.has(SECRET) for ears in (ground.monitor, ground.reader, ground.honest))
+    return any(listener.has(SECRET) for listener in (ground.monitor, ground.reader, ground.honest))
 
 
 def spoofed(name: str) -> list[str]:
@@ -205,7 +205,7 @@ def delete(ground: Ground) -> bool:
     for place in (key(HONEST), key(ROGUE), keys.map_key(TILE), f"{keys.ROOT}/**", keys.ack_key(HONEST)):
         session.delete(place)
     ground.passed(session)
-    return not all(put for ears in (ground.monitor, ground.reader, ground.honest) for _, put, _ in list(ears.heard))
+    return not all(put for one in (ground.monitor, ground.reader, ground.honest) for _, put, _ in list(one.heard))
 
 
 @attempt
@@ -230,14 +230,14 @@ def spoofed_reply(ground: Ground) -> bool:
 
 def overhears(ground: Ground, session: zenoh.Session) -> bool:
     """Whether a session hears another vehicle's observations or acknowledgements."""
-    ears = Ears(session, (
+    listener = Listener(session, (
         f"{keys.ROOT}/map/**", ALL_OBSERVATIONS, f"{keys.ROOT}/state/**", keys.ack_key(HONEST), f"{keys.ROOT}/ack/*",
         key(HONEST), "**", "gripmap/**", f"{keys.ROOT}/*/**",
     ))  # fmt: skip
     ground.passed(session)
     ground.drive()
-    ground.passed(session, ears)
-    return not all(name.startswith(f"{keys.ROOT}/map/") for name, _, _ in ears.heard)
+    ground.passed(session, listener)
+    return not all(name.startswith(f"{keys.ROOT}/map/") for name, _, _ in listener.heard)
 
 
 @attempt
@@ -324,10 +324,10 @@ def certificates_with_a_wildcard_or_a_tile_for_a_name(ground: Ground) -> bool:
             places = (key(HONEST), f"{keys.ROOT}/obs/1202/310/232/0123", keys.map_key(TILE), "gripmap/v1/ack/*")
             for place in places:
                 session.put(place, SECRET + name.encode())
-            ears = Ears(session, (f"{keys.ROOT}/**",))
+            listener = Listener(session, (f"{keys.ROOT}/**",))
             list(session.get(f"{keys.ROOT}/map/**"))
             ground.drive()
-            through |= bool(ears.heard)
+            through |= bool(listener.heard)
     ground.passed(ground.reader.session)
     return through or ground.monitor.has(SECRET)
 
@@ -390,10 +390,10 @@ def revoked_vehicle(ground: Ground) -> bool:
         network.start(router)
     session = ground.open(ROGUE, ROUTERS[1], **lost)
     session.put(key(ROGUE), SECRET)
-    ears = Ears(session, (f"{keys.ROOT}/**",))
+    listener = Listener(session, (f"{keys.ROOT}/**",))
     list(session.get(f"{keys.ROOT}/map/**"))
     ground.drive()
     ground.drive()
     with suppress(InputError):
         return bool(again.enrol(enrolment()))
-    return ground.monitor.has(SECRET) or bool(ears.heard)
+    return ground.monitor.has(SECRET) or bool(listener.heard)

@@ -88,6 +88,7 @@ BARS: Final = {
     "faults.age.cold_mb": Bar("MB", 1500),
     "faults.age.cells": Bar("cells", 50_000, "more"),
     "faults.age.at_bytes": Bar("bytes of the answer", 10_000, "more"),
+    "faults.age.tenfold": Bar("of memory, a start's and a question's, over those of a tenth of the archive", 1.5),
     "faults.age.old_days": Bar("of the time or memory of a start without days that no longer matter", 1.2),
     "faults.disk.false_acks": Bar("batches", 0),
     "faults.disk.stuck": Bar("times", 0),

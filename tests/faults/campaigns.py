@@ -51,7 +51,7 @@ CAMPAIGNS: Final = (
         (
             *("faults.age.ready_s", "faults.age.ready_mb", "faults.age.at_mb"),
             *("faults.age.cold_s", "faults.age.cold_mb", "faults.age.cells", "faults.age.at_bytes"),
-            "faults.age.old_days",
+            *("faults.age.old_days", "faults.age.tenfold"),
         ),
     ),
     Campaign("truncation", truncation.run, ("faults.truncation.lost_rows", "faults.truncation.damages")),

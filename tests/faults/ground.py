@@ -1,4 +1,4 @@
-"""The ground of the attacks: two routers with TLS and access list, a running service, honest parties, and ears.
+"""The ground of the attacks: two routers with TLS and access list, a running service, honest parties, listeners.
 
 Nothing is waited for by sleeping. Samples of one priority keep their order on each way, so that a marker which is put
 after an attack has gone through, and is heard, shows that nothing of the attack is still to come. What has reached the
@@ -31,7 +31,7 @@ MARKER = f"{keys.ROOT}/map/0000/000/000/0000"
 
 
 @dataclass
-class Ears:
+class Listener:
     """A session and all that it hears on some key expressions."""
 
     session: zenoh.Session
@@ -56,9 +56,9 @@ class Ground:
     def __init__(self, network: Network, service: Service, stack: ExitStack) -> None:
         self.network, self.service, self._stack = network, service, stack
         self.folder = network.folder
-        self.monitor = Ears(self.open(SERVICE), ("gripmap/**",))
-        self.reader = Ears(self.open(READER, ROUTERS[1]), (f"{keys.ROOT}/map/**", f"{keys.ROOT}/alert/**"))
-        self.honest = Ears(self.open(HONEST), (keys.ack_key(HONEST),))
+        self.monitor = Listener(self.open(SERVICE), ("gripmap/**",))
+        self.reader = Listener(self.open(READER, ROUTERS[1]), (f"{keys.ROOT}/map/**", f"{keys.ROOT}/alert/**"))
+        self.honest = Listener(self.open(HONEST), (keys.ack_key(HONEST),))
         self._probe = self.open(SERVICE)
         self._marks = self._seq = 0
 
@@ -104,13 +104,13 @@ class Ground:
         """Return when the service has judged and counted everything that reached it before."""
         self.drive()
 
-    def passed(self, session: zenoh.Session, *ears: Ears) -> None:
-        """Return when everything that `session` did has gone through and the ears heard what it brought."""
+    def passed(self, session: zenoh.Session, *listeners: Listener) -> None:
+        """Return when everything that `session` did has gone through and the listeners heard what it brought."""
         list(session.get(f"{keys.ROOT}/map/**"))
         self._marks += 1
         mark = f"mark {self._marks}".encode()
         self._probe.put(MARKER, mark)
-        for one in (self.monitor, self.reader, *ears):
+        for one in (self.monitor, self.reader, *listeners):
             until(lambda one=one: one.has(mark))  # type: ignore[misc]
 
 

@@ -32,6 +32,7 @@ from schemas.runtime.figures import Figure
 from schemas.runtime.palette import ESTIMATORS, GRIP_RANGE, SURFACES, TRUTH, shade
 from tests.browser import opened
 from tests.faults.processes import Part
+from tests.first_drive import commands, mapped
 from tests.fleet_service.conftest import running
 from tests.fleet_service.page import street
 from tests.fleet_service.page.conftest import page_of
@@ -216,6 +217,20 @@ def alerts_per_stretch(house: House) -> float:
     return float("nan") if value is None else float(value)
 
 
+def first_drive_commands(_: House) -> float:
+    """That README's first drive takes, from the installation to the map."""
+    return float(len(commands()))
+
+
+def first_drive_alerts(house: House) -> float:
+    """That a real minute on a dry motorway raises under three names."""
+    folder = house.folder / "minute"
+    folder.mkdir()
+    cells, alerts = mapped(folder)
+    house.note("first drive", f"{len(cells)} cells, alerts {alerts}")
+    return float(len(set(alerts))) if len(cells) > 30 else float("nan")
+
+
 PARTS: Final[dict[str, tuple[Callable[[House], float], str, float, str]]] = {
     "readme_commands_failed": (readme_commands_failed, "", 0, "less"),
     "pages_with_errors": (pages_with_errors, "", 0, "less"),
@@ -228,6 +243,8 @@ PARTS: Final[dict[str, tuple[Callable[[House], float], str, float, str]]] = {
     "install_to_first_map_s": (install_to_first_map_s, "s", 90, "less"),
     "options_undocumented": (options_undocumented, "", 0, "less"),
     "figures_stale": (figures_stale, "", 0, "less"),
+    "first_drive_commands": (first_drive_commands, "", 5, "less"),
+    "first_drive_alerts": (first_drive_alerts, "of a real minute on a dry motorway, under three names", 0, "less"),
     "alerts_per_stretch": (alerts_per_stretch, "per icy stretch and direction, of the last demo", 2, "less"),
 }
 

@@ -121,14 +121,14 @@ def test_an_alert_is_told_at_once_and_not_with_the_next_look(
 def test_alerts_that_stand_are_asked_for_when_the_car_comes_to_their_tile(router: Router, town: MadeUpService) -> None:
     town.standing = [alert(int(key), time=NOW) for key in keys_on(2600.0, start=2560.0)]
     with driving(router) as car:
-        ears = car.lookout.counts.ears[CAR]
+        subscriber = car.lookout.counts.subscribers[CAR]
         car.until(lambda _: car.lookout.counts.looks > 1)
-        before = set(ears.tiles)
-        assert not ears.counts["alerts"] + car.lookout.counts.warnings
+        before = set(subscriber.tiles)
+        assert not subscriber.counts["alerts"] + car.lookout.counts.warnings
         car.metre = 2500.0
         raised = car.next()
         assert (raised.state, raised.way) == ("raised", "corridor"), "it has left its route"
-        assert set(ears.tiles) - before
+        assert set(subscriber.tiles) - before
 
 
 def test_ice_that_was_found_before_the_car_came_is_asked_for(router: Router, town: MadeUpService) -> None:
@@ -229,11 +229,11 @@ def test_a_map_of_yesterday_neither_warns_nor_advises_and_takes_nothing_from_tha
             assert not seen.runs.basis.any(), "nobody knows what it is like today"
             assert np.isnan(seen.runs.safe_speed).all()
             assert not seen.warnings
-        ears = car.lookout.counts.ears[CAR]
+        subscriber = car.lookout.counts.subscribers[CAR]
         now, key = time.time_ns(), keys.map_key(TILE)
         for when, mu in ((now, 0.15), (now - DAY, 0.85)):
-            with ears.looking():
-                ears.known.take(*heard_cells(key, tile_payload(HERE, mu, when), now), now)
+            with subscriber.looking():
+                subscriber.known.take(*heard_cells(key, tile_payload(HERE, mu, when), now), now)
         assert car.next().mu == pytest.approx(0.15, abs=0.03)
 
 
@@ -262,7 +262,9 @@ def test_a_hostile_alert_is_refused_counted_and_changes_nothing(router: Router, 
         town.session.put(keys.alert_key(tile), b"\xff" * 300)
         far = alert(int(ICE[0]) + (1 << 30), time=NOW)
         town.session.put(keys.alert_key(tile), wire.encode_alert(far))
-        until(lambda: sum(n for name, n in car.lookout.counts.ears[CAR].counts.items() if "refused" in name) >= 2)
+        until(
+            lambda: sum(n for name, n in car.lookout.counts.subscribers[CAR].counts.items() if "refused" in name) >= 2
+        )
         assert car.lookout.counts.values()["heard_refused"] >= 2
         assert car.until(lambda seen: seen.warnings).warnings[0].state == "raised"
 

@@ -1,4 +1,4 @@
-"""One vehicle's ears: alerts of the tiles ahead, the map asked for along the way, over the vehicle's own session.
+"""What one vehicle subscribes to and asks for: alerts of the tiles ahead, the map along the way, over its own session.
 
 Zenoh's threads call back; what was heard lies behind one lock. What is not possible is refused and counted.
 """
@@ -31,7 +31,7 @@ AGAIN_S: Final = (1.0, 3.0, 9.0)
 _TOPIC: Final = keys.TOPICS["ahead"]
 
 
-class Ears:
+class MapSubscriber:
     """What one vehicle hears.
 
     Args:
