@@ -26,6 +26,7 @@ MOST_PANELS: Final = 6
 EDGE: Final = 1.2  # points around each cell: a road of ten metres is seen on a map of ten kilometres
 DAY_S: Final = 86_400.0  # matplotlib counts days since 1970
 PUBLISHED: Final = 0.9  # how often a published interval is to hold
+ARROWS: Final = "→↑←↓"  # of the headings
 _DARK, _LIGHT, _MARK = GRIP[2], GRIP[8], "#d0006f"
 
 
@@ -99,11 +100,10 @@ def _worst(figure: Figure, table: pa.Table) -> None:
     panels = _panels(figure, len(rows))
     for k, (axes, one) in enumerate(zip(panels, rows, strict=False), 1):
         cells = np.array(one["members"], np.int64)
-        sector = np.full(len(cells), one["sector"], np.int64)
-        patches = paint(axes, cell_shapes(cells, sector), np.full(len(cells), one["mu"]))
+        patches = paint(axes, cell_shapes(cells), np.full(len(cells), one["mu"]))  # whole: all head the same way
         axes.set_title(
-            f"{k}: {one['length_m']:.0f} m heading {grid.HEADINGS[one['sector']]}\n"
-            f"{one['share_slippery']:.0%} slippery (≥ {one['share_lower']:.0%}) of {one['values']} values", fontsize=9,
+            f"{k}: {one['length_m']:.0f} m heading {grid.HEADINGS[one['sector']]} {ARROWS[one['sector']]}\n"
+            f"{one['share_slippery']:.0%} slippery (≥ {one['share_lower']:.0%})\n{one['values']} values", fontsize=9,
         )  # fmt: skip
         axes.margins(0.1)
     figure.colorbar(patches, ax=panels, label=f"mean {MU} where slippery", shrink=0.8)

@@ -23,7 +23,7 @@ def drawn(name: str, table: pa.Table) -> Figure:
     return figure
 
 
-def quarters(axes: Axes) -> int:
+def shapes(axes: Axes) -> int:
     return sum(len(one.get_paths()) for one in axes.collections if isinstance(one, PolyCollection))
 
 
@@ -36,9 +36,9 @@ def test_worst_draws_the_cells_of_each_stretch_and_no_line_through_unordered_poi
     one = {"sector": 1, "mu": 0.2, "length_m": 50.0, "share_slippery": 0.9, "share_lower": 0.7, "values": 12}
     figure = drawn("worst", pa.Table.from_pylist([{**one, "members": BENT}, {**one, "members": BENT[:2]}]))
     first, second = (axes for axes in figure.axes if axes.get_xlabel() == "east [m]")
-    assert [quarters(first), quarters(second)] == [5, 2]
+    assert [shapes(first), shapes(second)] == [5, 2]
     assert not first.lines
-    assert first.get_title().startswith("1: 50 m heading ")
+    assert first.get_title().startswith("1: 50 m heading north ↑")
 
 
 def test_grip_of_a_day_has_that_day_and_the_cells_that_only_have_a_bound_on_its_axis() -> None:
@@ -55,7 +55,7 @@ def test_replay_has_a_map_a_moment_and_hatches_what_was_not_measured() -> None:
     table = pa.table({"frame": frames, "cell": [CELL, CELL + 1, CELL], "sector": [0, 0, 0], "mu": [0.3, None, 0.4]})
     maps = [axes for axes in drawn("replay", table).axes if axes.get_xlabel() == "east [m]"]
     assert [axes.get_title() for axes in maps] == ["2026-01-27T12:00:00 UTC", "2026-01-27T12:00:10 UTC"]
-    assert [quarters(axes) for axes in maps] == [2, 1]
+    assert [shapes(axes) for axes in maps] == [2, 1]
     hatched = [one for one in maps[0].collections if isinstance(one, PolyCollection) and one.get_hatch()]
     assert [len(one.get_paths()) for one in hatched] == [1]
 
