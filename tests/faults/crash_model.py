@@ -30,6 +30,7 @@ from fleet_service.archive.compaction import compact
 from fleet_service.archive.log import SegmentLog
 from fleet_service.archive.segments import Rows
 from fleet_service.ingest.dedup import SequenceTrackers
+from fleet_service.replay import restart
 from fleet_service.replay.rebuild import restore_streams
 from schemas import grid
 from schemas.runtime.figures import Figure
@@ -213,4 +214,5 @@ def run(site: Site) -> list[Figure]:
 
 
 def _quiet() -> None:
-    logging.getLogger(load.__name__).setLevel(logging.ERROR)  # torn files are set aside all the time
+    for module in (load, restart):  # torn files are set aside, and checkpoints not begun from, all the time
+        logging.getLogger(module.__name__).setLevel(logging.ERROR)
