@@ -12,7 +12,6 @@ again.
 from __future__ import annotations
 
 import logging
-import random
 import shutil
 import tempfile
 from collections import Counter
@@ -36,13 +35,12 @@ from schemas import grid
 from schemas.runtime.figures import Figure
 from schemas.wire import Kind
 from tests.faults.bars import figure
-from tests.faults.crash_disk import CrashDisk, PowerLoss
+from tests.faults.crash_lives import Lives
 from tests.faults.crash_service import ServiceHistory
 from tests.faults.crash_spool import spool_history
 from tests.faults.frame import Site
 
 VEHICLE: Final = 7
-LIVES: Final = 3
 STEPS: Final = 7
 ROWS: Final = 2  # of a batch: in two zones, so that compaction has partitions to get wrong
 START: Final = 1_728_000_000_000_000_000
@@ -70,35 +68,14 @@ def rows_of(batches: list[Batch]) -> Rows:
     return rows
 
 
-class History:
-    """One history by its number."""
+class History(Lives[Batch]):
+    """A history of the log."""
+
+    lives, operations, full_after = 3, 80, 60
 
     def __init__(self, number: int, folder: Path) -> None:
-        self.random, self.folder = random.Random(number), folder
-        self.acknowledged: set[Batch] = set()
+        super().__init__(number, folder)
         self.sent: list[Batch] = []
-        self.at_stake = 0  # batches that were acknowledged before a power loss
-
-    def violations(self) -> list[str]:
-        """What was wrong in it."""
-        live = self.folder / "life-0"
-        live.mkdir()
-        found: list[str] = []
-        for life in range(LIVES):
-            last = life == LIVES - 1
-            start = self.random.randint(0, 60)
-            full = range(start, start + self.random.choice((0, 0, 3, 10)))
-            disk = CrashDisk(
-                live, self.random, None if last else self.random.randint(0, 80), range(0) if last else full
-            )
-            with disk.mounted(), suppress(PowerLoss):
-                self._live(live, last)
-            if not last:
-                self.at_stake = len(self.acknowledged)
-                live = self.folder / f"life-{life + 1}"
-                disk.image(live)
-            found += [f"life {life}: {problem}" for problem in self._problems(live, last)]
-        return found
 
     def _live(self, root: Path, last: bool) -> None:
         with suppress(OSError):  # a service that finds the disk full at its start says so and ends
@@ -139,7 +116,6 @@ class History:
                 log.add(kind, rows_of(new), new)
 
     def _problems(self, root: Path, last: bool) -> list[str]:
-        """Of the archive as the next life finds it."""
         streams = SequenceTrackers()
         with suppress(FileNotFoundError):
             restore_streams(root, streams)
@@ -194,21 +170,21 @@ def _memory() -> str | None:
 def run(site: Site) -> list[Figure]:
     """5 000 histories of the log, 500 of the outbox and 600 of a service; in a quick run, 120 of all."""
     logs, outboxes, services = site.of(5000, 100), site.of(500, 10), site.of(600, 10)
-    first, bad, acknowledged = site.seed * 1_000_000, 0, 0
+    first, bad, acknowledged = site.seed * 1_000_000, 0, Counter[str]()
     kinds = (("log", _lived, logs), ("spool", _stored, outboxes), ("service", _served, services))
     with ProcessPoolExecutor(mp_context=get_context("spawn"), initializer=_quiet) as pool:
         for kind, one, count in kinds:
-            safe_before = acknowledged
             for number, (found, safe) in enumerate(pool.map(one, range(first, first + count), chunksize=10)):
-                bad, acknowledged = bad + bool(found), acknowledged + safe
+                bad += bool(found)
+                acknowledged[kind] += safe
                 for problem in found[:3]:
                     site.say(f"{kind} history {first + number}: {problem}")
                 if (number + 1) % 200 == 0:
                     site.say(f"{number + 1} histories of the {kind}, {bad} with a violation so far")
     return [
         figure("faults.crash_model.violations", bad),
-        figure("faults.crash_model.acknowledged", acknowledged),
-        figure("faults.crash_model.service_acknowledged", acknowledged - safe_before),
+        figure("faults.crash_model.acknowledged", acknowledged.total()),
+        figure("faults.crash_model.service_acknowledged", acknowledged["service"]),
         Figure("faults.crash_model.histories", logs + outboxes + services, "histories"),
     ]
 

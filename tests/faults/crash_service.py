@@ -10,12 +10,11 @@ map from the log alone; no compacted file is damaged; and what was forgotten doe
 
 from __future__ import annotations
 
-import random
 import shutil
 import threading
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -38,10 +37,9 @@ from schemas.config import ServiceConfig
 from schemas.errors import InputError
 from schemas.weather import Report, encode
 from schemas.wire import Kind
-from tests.faults.crash_disk import CrashDisk, PowerLoss
+from tests.faults.crash_lives import Lives
 from tests.fleet_service.examples import LATITUDE, LONGITUDE, REGION, SECOND, batch, key
 
-LIVES: Final = 4
 STEPS: Final = 14
 START: Final = 1_698_500_000 * SECOND  # 2023-10-28: months end within the histories
 AWAY_DAYS: Final = 14  # between two lives, at the most
@@ -72,17 +70,17 @@ class Sent(NamedTuple):
         return f"{datetime.fromtimestamp(self.rows[0] // SECOND, UTC):%Y-%m}"
 
 
-class ServiceHistory:
-    """One history by its number.
+class ServiceHistory(Lives[Sent]):
+    """A history of a service.
 
     Attributes:
-        at_stake: batches that were acknowledged before a power loss.
-        done: what was done before one, to its end.
+        done: what was done before a power loss, to its end.
     """
 
+    lives, operations, full_after = 4, 250, 100
+
     def __init__(self, number_: int, folder: Path) -> None:
-        self.random, self.folder = random.Random(number_), folder
-        self.acknowledged: set[Sent] = set()
+        super().__init__(number_, folder)
         self.sent: list[Sent] = []
         self.weather: set[int] = set()  # times of reports that acted
         self.forgetting: set[tuple[str, str]] = set()  # month, and vehicle or nothing, whose forgetting began
@@ -90,44 +88,23 @@ class ServiceHistory:
         self.destroyed: set[bytes] = set()  # keys
         self._nobodys: set[Sent] = set()  # whose rows nobody can tell any more
         self.retired = -1  # last day whose rows may be gone
-        self.at_stake = 0
         self.done: Counter[str] = Counter()
         self._now = START
 
-    def violations(self) -> list[str]:
-        """What was wrong in it."""
-        live = self.folder / "life-0"
-        live.mkdir()
-        found: list[str] = []
-        for life in range(LIVES):
-            last = life == LIVES - 1
-            start = self.random.randint(0, 100)
-            full = range(start, start + self.random.choice((0, 0, 3, 10)))
-            power = None if last else self.random.randint(0, 250)
-            disk = CrashDisk(live, self.random, power, range(0) if last else full)
-            self._lived(disk, live, last)
-            if not last:
-                self.at_stake = len(self.acknowledged)
-                live = self.folder / f"life-{life + 1}"
-                disk.image(live)
-            found += [f"life {life}: {problem}" for problem in self._problems(live, last)]
-            self._now += self.random.randint(0, AWAY_DAYS * 86_400) * SECOND
-        return found
+    def _live(self, root: Path, last: bool) -> None:
+        if self.sent and self.random.random() < 0.4:
+            self._forget(root)
+        with suppress(OSError), ExitStack() as held:  # a service that finds the disk full at its start says so and ends
+            engine = Engine(CONFIG, root)
+            held.callback(engine.holding.close)
+            for _ in range(STEPS):
+                self._step(engine, root)
+            if last:
+                self._take(engine, self.sent)
+                self._flush(engine)
 
-    def _lived(self, disk: CrashDisk, root: Path, last: bool) -> None:
-        engine = None
-        with disk.mounted(), suppress(PowerLoss):
-            if self.sent and self.random.random() < 0.4:
-                self._forget(root)
-            with suppress(OSError):  # a service that finds the disk full at its start says so and ends
-                engine = Engine(CONFIG, root)
-                for _ in range(STEPS):
-                    self._step(engine, root)
-                if last:
-                    self._take(engine, self.sent)
-                    self._flush(engine)
-        if engine is not None:
-            engine.holding.close()
+    def _pass_time(self) -> None:
+        self._now += self.random.randint(0, AWAY_DAYS * 86_400) * SECOND
 
     def _forget(self, root: Path) -> None:
         """Nobody serves: a vehicle's month, or the whole month, is forgotten."""
@@ -224,7 +201,6 @@ class ServiceHistory:
             weather.retire(root, self._now // layout.DAY_NS - LEAST_DAYS - 1)
 
     def _problems(self, root: Path, last: bool) -> list[str]:
-        """Of the archive as the next life finds it."""
         rows: Counter[int] = Counter()
         with suppress(FileNotFoundError):
             for table in reading.read(root, Kind.OBSERVATION, ["leave_time"]):

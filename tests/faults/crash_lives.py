@@ -1,0 +1,67 @@
+"""A few lives of one archive on a disk that forgets: each but the last ends by a power loss at a random operation, and
+the next one finds what the disk kept."""
+
+from __future__ import annotations
+
+import random
+from abc import ABC, abstractmethod
+from contextlib import suppress
+from pathlib import Path
+from typing import ClassVar, Generic, TypeVar
+
+from tests.faults.crash_disk import CrashDisk, PowerLoss
+
+BatchType = TypeVar("BatchType")
+
+
+class Lives(ABC, Generic[BatchType]):
+    """One history by its number, in an empty folder.
+
+    Attributes:
+        lives: how many.
+        operations: within so many the power goes.
+        full_after: within so many the disk may become full, for a few.
+        acknowledged: batches.
+        at_stake: how many of these before a power loss.
+    """
+
+    lives: ClassVar[int]
+    operations: ClassVar[int]
+    full_after: ClassVar[int]
+
+    def __init__(self, number: int, folder: Path) -> None:
+        self.random, self.folder = random.Random(number), folder
+        self.acknowledged: set[BatchType] = set()
+        self.at_stake = 0
+
+    def violations(self) -> list[str]:
+        """What was wrong in it."""
+        live = self.folder / "life-0"
+        live.mkdir()
+        found: list[str] = []
+        for life in range(self.lives):
+            last = life == self.lives - 1
+            start = self.random.randint(0, self.full_after)
+            full = range(start, start + self.random.choice((0, 0, 3, 10)))
+            power = None if last else self.random.randint(0, self.operations)
+            disk = CrashDisk(live, self.random, power, range(0) if last else full)
+            with disk.mounted(), suppress(PowerLoss):
+                self._live(live, last)
+            if not last:
+                self.at_stake = len(self.acknowledged)
+                live = self.folder / f"life-{life + 1}"
+                disk.image(live)
+            found += [f"life {life}: {problem}" for problem in self._problems(live, last)]
+            self._pass_time()
+        return found
+
+    @abstractmethod
+    def _live(self, root: Path, last: bool) -> None:
+        """One life, on the disk."""
+
+    @abstractmethod
+    def _problems(self, root: Path, last: bool) -> list[str]:
+        """Of the archive as the next life finds it."""
+
+    def _pass_time(self) -> None:
+        """Between two lives."""
