@@ -23,11 +23,6 @@ def test_the_real_minute_comes_onto_the_map_under_three_names(minute: tuple[Cell
     assert max(int(str(cell["vehicles"])) for cell in cells) == len(VEHICLES)
 
 
-@pytest.mark.xfail(
-    reason="over joints in the road at .14 g of pull (1.7 and 38.4 s) wheels jump by 2 to 4 % for .05 s; the default "
-    "estimator takes that for slip, and reads ice for a second: one cell, one alert",
-    strict=True,
-)
 @pytest.mark.timeout(900)
 def test_a_dry_road_raises_no_alert(minute: tuple[Cells, list[str]]) -> None:
     assert not minute[1]

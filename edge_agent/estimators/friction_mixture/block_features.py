@@ -23,6 +23,7 @@ from edge_agent.estimators.friction_mixture.drive_split import front_share
 from edge_agent.estimators.friction_mixture.memory import BlockSums, MixtureMemory
 from edge_agent.estimators.friction_mixture.trust import strained_noise
 from edge_agent.estimators.friction_mixture.workspace import BlockFeatures
+from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S
 from schemas.thresholds import GRAVITY
@@ -30,6 +31,7 @@ from schemas.thresholds import GRAVITY
 SLOWEST_COMPARED_M_S = 1.0  # slips of two wheels are compared at this speed at least: speeds differ by noise below
 NO_FORCE_SHARE = 0.3  # force over load that may act where nobody has measured any
 ROUNDING = 1 / math.sqrt(12.0)  # standard deviation of rounding to a step
+STEEPEST = 0.3  # least cosine of steering
 CERTAIN = 4.0  # standard deviations of wheel-speed noise that a difference between the sides must exceed,
 LIKELY = 2.0  # and of what is unknown of the radii
 
@@ -159,11 +161,14 @@ def _noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures
     scale = design.scales[0] * memory.factor[0]
     for wheel in range(4):
         samples = max(memory.block.counts[S.OMEGA + wheel], 1)
-        slip = constants.omega_noise / math.sqrt(samples) * row[Parameter.RADIUS] / speed
-        white = row[Parameter.SLOPE_X] * slip
+        noise = constants.omega_noise / math.sqrt(samples) * row[Parameter.RADIUS]
+        step = max(constants.step_noise, ROUNDING * memory.last.omega_step[wheel]) * row[Parameter.RADIUS]
+        linear = row[Parameter.SLOPE_X] / speed
+        slip_variance = linear**2 * (noise**2 + step**2)
+        features.abrupt_noise[wheel] = (
+            linear * constants.abrupt_share * abruptness(memory, constants, features, wheel)
+        ) ** 2
         shape = constants.shape_share * features.force[wheel] ** 2
-        step = max(constants.step_noise, ROUNDING * memory.last.omega_step[wheel])
-        slip_variance = white**2 + (row[Parameter.SLOPE_X] * step * row[Parameter.RADIUS] / speed) ** 2
         variance = 0.5 * slip_variance + constants.floor_x**2 + features.noise_std[wheel] ** 2 + shape**2
         features.noise_std[wheel] = math.sqrt(variance * scale)
         features.slip_noise[wheel] = slip_variance * scale
@@ -183,6 +188,28 @@ def _noise(memory: MixtureMemory, design: MixtureDesign, features: BlockFeatures
         wide = wide_noise(design.rules, math.asin(features.steer_sin[2 * axle])) if design.adaptive else 1.0
         features.noise_std[4 + axle] = math.sqrt(variance * scale * wide)
         features.slip_noise[4 + axle] = angle**2 * scale * wide
+
+
+@compiled
+def abruptness(memory: MixtureMemory, constants: Constants, features: BlockFeatures, wheel: int) -> float:
+    """How far a wheel is from its smoothed speed, moved on by the car's acceleration [m/s]; 0 where it is unknown.
+
+    A wheel that spins up or locks goes on for some blocks, a bump is over within one or two.
+    """
+    now, usual = at_centre(memory.row, features, wheel), memory.usual_rolling
+    expected = usual[wheel] + features.change * features.duration
+    share = 1.0 - math.exp(-features.duration / constants.abrupt_time)
+    usual[wheel] = now if math.isnan(expected) else expected + share * (now - expected)
+    apart = abs(now - expected)
+    return 0.0 if math.isnan(apart) else apart
+
+
+@compiled
+def at_centre(row: FloatArray, features: BlockFeatures, wheel: int) -> float:
+    """Speed ahead [m/s] of the centre of gravity over a wheel that rolls freely; NaN without a reading."""
+    px, py = wheel_position(row, wheel)
+    across = features.steer_sin[wheel] * (row[Parameter.TO_REAR] + px) * features.yaw_rate
+    return float((features.rolling[wheel] - across) / max(features.steer_cos[wheel], STEEPEST) + py * features.yaw_rate)
 
 
 @compiled

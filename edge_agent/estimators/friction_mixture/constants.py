@@ -167,6 +167,10 @@ class Constants(NamedTuple):
     omega_noise: float = 0.03
     # [rad/s] what wheel speeds have wrong beside their noise: steps that cannot be seen, teeth, tyres that wobble
     step_noise: float = 0.06
+    # [1] of slip that came just now: a tyre's force needs .3 m, and a bump changes the radius that it rolls on
+    abrupt_share: float = 0.5
+    # [s] in which it has become usual: a bump lasts .05 s, a wheel locks or spins up in .1 to .3
+    abrupt_time: float = 0.15
     # [rad] white noise of steering in a block (vehicle)
     angle_std: float = 0.0003
     # [1] steering ratio, compliance and how the wheels of an axle point, of the angle: gains are 3 % off

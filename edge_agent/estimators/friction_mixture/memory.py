@@ -132,6 +132,7 @@ class MixtureMemory:
     stated: float  # as theoretical of the axles, with R as the constants state it
     factor: Annotated[FloatArray, 2]  # adapted over nominal R
     last_side: Annotated[FloatArray, 2]  # side force over load of the axles in the block before [1]
+    usual_rolling: Annotated[FloatArray, 4]  # speed ahead by each wheel, smoothed [m/s]
     usual_force: Annotated[FloatArray, 6]  # force over load of wheels and axles, smoothed [1]
     drive_odds: Annotated[FloatArray, 3]  # of a car that drives its rear axle, all wheels, its front axle
     rolling: RollingMotion
@@ -154,5 +155,6 @@ def new_filters(rows: FloatArray, nominal: Nominal, spreads: FloatArray) -> Reco
     filters = records(MixtureMemory, len(rows))
     prior = filters["nominal"]
     prior["mean"], prior["std"], prior["time"] = nominal.mean, spreads, nominal.time
-    filters["row"], filters["factor"], filters["last_side"] = rows, 1.0, np.nan
+    filters["row"], filters["factor"] = rows, 1.0
+    filters["last_side"] = filters["usual_rolling"] = np.nan
     return filters

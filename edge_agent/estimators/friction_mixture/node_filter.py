@@ -81,7 +81,7 @@ def update_node(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, 
             variance += node.deviation[r, column] ** 2
         theoretical[r] = variance + noise
         excess = node.residual[r] ** 2 / constants.huber**2 - variance
-        node.inflated[r] = max(noise * (inflation if r < 4 else across), excess) + node.nonlinearity[r]
+        node.inflated[r] = max(noise * (inflation if r < 4 else across), excess) + node.nonlinearity[r] + node.abrupt[r]
         if not math.isnan(node.residual[r]):
             ratio = node.residual[r] ** 2 / theoretical[r]
             square += ratio
@@ -180,10 +180,12 @@ def weigh_slopes(
             along = slope_along(curve, g_x, g_y, mu)
             across += features.load_share[wheel] * slope_along(curve, g_y, g_x, mu)
             node.noise[wheel] = features.noise_std[wheel] ** 2 - unfelt(along) * features.slip_noise[wheel]
+            node.abrupt[wheel] = (0.5 - unfelt(along)) * features.abrupt_noise[wheel]
             if not math.isnan(features.rolling[wheel]):
                 price -= min(math.log(along / flat), 0.0)
         side = 4 + axle
         node.noise[side] = features.noise_std[side] ** 2 - unfelt(across) * features.slip_noise[side]
+        node.abrupt[side] = 0.0
     return price
 
 

@@ -11,8 +11,7 @@ from __future__ import annotations
 import math
 
 from edge_agent.dynamics.parameters import Parameter
-from edge_agent.dynamics.slip import wheel_position
-from edge_agent.estimators.friction_mixture.block_features import ROUNDING, mean_or
+from edge_agent.estimators.friction_mixture.block_features import ROUNDING, at_centre, mean_or
 from edge_agent.estimators.friction_mixture.constants import Constants, NodeState
 from edge_agent.estimators.friction_mixture.design import MixtureDesign
 from edge_agent.estimators.friction_mixture.memory import MixtureMemory
@@ -31,7 +30,6 @@ SLOW_M_S = 3.0  # a faster car that stands has locked its wheels, or the filter 
 LOCKED_S = 2.0  # no car slides on four locked wheels for longer
 AGREE_FLOOR = 0.15  # [m/s] within which wheels always agree
 TURN_SHARE = 0.05  # of the speed difference of the sides in a turn: track and yaw rate
-STEEPEST = 0.3  # least cosine of steering
 SIDE_SHARE = 0.5  # share by which sideslip differs from the side force over nominal stiffness
 LEFT_FLOOR = 0.03  # [m/s]
 TURNING = 1.5  # v*r against a_y: both must be small
@@ -50,10 +48,8 @@ def watch_wheels(memory: MixtureMemory, constants: Constants, features: BlockFea
         speed = features.rolling[wheel]
         if math.isnan(speed):
             continue
-        px, py = wheel_position(row, wheel)
-        across = features.steer_sin[wheel] * (row[Parameter.TO_REAR] + px) * features.yaw_rate
-        at_centre = (speed - across) / max(features.steer_cos[wheel], STEEPEST) + py * features.yaw_rate
-        least, most, total, seen = min(least, at_centre), max(most, at_centre), total + at_centre, seen + 1
+        ahead = at_centre(row, features, wheel)
+        least, most, total, seen = min(least, ahead), max(most, ahead), total + ahead, seen + 1
         fastest = max(fastest, abs(speed))
         step = max(step, memory.last.omega_step[wheel] * ROUNDING * row[Parameter.RADIUS])
     _stand(memory, constants, features, seen >= 3 and fastest < STANDING_RAD_S * row[Parameter.RADIUS])

@@ -41,6 +41,7 @@ class BlockFeatures:
     side_unit: Annotated[FloatArray, 2]  # its derivative by a_y [s^2/m]
     noise_std: Annotated[FloatArray, ROWS]  # nominal, of a residual where the curve rises [1]
     slip_noise: Annotated[FloatArray, ROWS]  # variance of slip, as linear force over load; half of it is in noise_std
+    abrupt_noise: Annotated[FloatArray, 4]  # variance of slip that came within the block, likewise
     informs_x: Annotated[FloatArray, 2]  # how much the force of an axle's wheels informs of stiffness, 0 to 1
     axle_scale: float  # R of the axles over R as the constants state it
     informs_y: Annotated[FloatArray, 2]
@@ -72,7 +73,8 @@ class NodeWorkspace:
     derivative: Annotated[FloatArray, ACTIVE, ROWS]
     deviation: Annotated[FloatArray, ROWS, ACTIVE]
     noise: Annotated[FloatArray, ROWS]  # variance of the rows' noise
-    inflated: Annotated[FloatArray, ROWS]  # the same for correlation in time and for outliers
+    abrupt: Annotated[FloatArray, ROWS]  # variance of what came within the block: a bump says nothing of later ones
+    inflated: Annotated[FloatArray, ROWS]  # of the noise, for correlation in time, for outliers and what was abrupt
 
 
 class Scratch:

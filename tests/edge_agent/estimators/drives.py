@@ -8,8 +8,10 @@ import numpy as np
 
 from edge_agent.lab.simulation import simulate_manoeuvre
 from schemas.numeric import FloatArray
-from schemas.signals import CHANNELS
+from schemas.signals import CHANNELS, S
 from schemas.vehicle import Vehicle
+
+TORQUE, OMEGA = slice(S.TORQUE, S.TORQUE + 4), slice(S.OMEGA, S.OMEGA + 4)
 
 
 @cache
@@ -29,3 +31,25 @@ def joined(*parts: tuple[FloatArray, FloatArray, Vehicle]) -> tuple[FloatArray, 
         rows.append(signals)
         end = clock[-1][-1] + 0.01
     return np.concatenate(clock), np.concatenate(rows)
+
+
+def jointed() -> tuple[FloatArray, FloatArray, Vehicle]:
+    """A gentle pull over joints in a dry motorway, without torque: the wheels of an axle jump by 3 to 4 % for 50 ms.
+
+    As in the minute of tests/data/rav4.blf, at 1.7 and 38.4 s.
+    """
+    vehicle, rng = drive("straight", 0.85)[2], np.random.default_rng(4)
+    t = np.arange(0.0, 12.0, 0.01)
+    signals = np.zeros((len(t), len(CHANNELS)))
+    signals[:, :3] = rng.normal(0.0, (0.05, 0.05, 0.002), (len(t), 3))
+    signals[:, S.AX] += 1.4
+    signals[:, TORQUE] = np.nan
+    speed = 25.0 + 1.4 * t
+    signals[:, OMEGA] = (speed / vehicle.wheel_radius * (1.0 + 0.14 / 20.0))[:, None]
+    signals[:, OMEGA] += rng.normal(0.0, 0.03, (len(t), 4))
+    for joint in range(300, 1100, 150):
+        for first, wheels in ((joint, slice(0, 2)), (joint + 10, slice(2, 4))):
+            signals[first : first + 5, OMEGA][:, wheels] *= 1.03 if wheels.start == 0 else 1.04
+            signals[first : first + 3, S.AX] -= 2.5
+            signals[first + 3 : first + 6, S.AX] += 2.5
+    return t, signals, vehicle

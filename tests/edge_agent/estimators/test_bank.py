@@ -247,10 +247,10 @@ def test_on_a_road_of_one_friction_the_wheels_have_it() -> None:
 @pytest.mark.parametrize("name", ["gaining-lane-changes", "gaining-slalom"])
 def test_gaining_speed_gently_tells_no_ice(name: str) -> None:
     """Four wheels that slide a little would explain the slip as well, with a stiffness or an offset to match."""
-    for seed in range(3):
+    for seed in range(6):
         t, signals, vehicle = drive(name, 0.9, seed)
         reported = bank_of("aco-fckf", [vehicle]).advance(t[:, None], signals[:, None])
-        assert reported.mu_upper.min() > 0.85
+        assert reported.mu_upper.min() > 0.8
 
 
 @pytest.mark.parametrize("size", [60.0, 5.0])

@@ -18,12 +18,11 @@ from edge_agent.lab.simulation import simulate_manoeuvre
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S
 from schemas.vehicle import Vehicle
-from tests.edge_agent.estimators.drives import drive, joined
+from tests.edge_agent.estimators.drives import OMEGA, TORQUE, drive, joined, jointed
 
 SAMPLES = 400  # of the short drives
 FIRST = 100  # sample from which figures are taken
 CUT = 20  # samples between two looks into the filters
-TORQUE, OMEGA = slice(S.TORQUE, S.TORQUE + 4), slice(S.OMEGA, S.OMEGA + 4)
 SHORT: dict[str, float | None] = {
     "j-turn": 0.4, "braking": 0.3, "acceleration": 0.3, "gaining-slalom": 0.9, "pulses": 0.6, "slalom": 0.3,
     "split-braking": None,
@@ -51,13 +50,15 @@ MOVES = {
     "diffusion": Move("width", "acceleration", 1.15),
     "split_prior": Move("one friction's probability", "split-braking", 0.85),
     "split_hazard": Move("one friction's probability", "split-braking", 1.5),
-    "split_asymmetry": Move("split probability", "split-braking", 0.97),  # they wake later
+    "split_asymmetry": Move("split probability", "split-braking", 0.985),  # they wake later
     # how much a block counts
     "demand_half": Move("width", "constant-radius", 1.5),  # the same force tells less
     "demand_power": Move("penalty", "acceleration", 0.5),  # above the threshold all is evidence, nothing is charged
     "plausible_loss": Move("least probabilities", "constant-radius", 1.1),
     "largest_loss": Move("least probabilities", "j-turn", 0.3),
     "steady_time": Move("width", "constant-radius", 0.9),  # the force is new for longer
+    "abrupt_share": Move("upper", "joints", 0.9, LESS),  # a bump reads as slip
+    "abrupt_time": Move("upper", "joints", 0.99, LESS),  # ... sooner
     "steady_half": Move("width", "constant-radius", 1.12),
     "steady_share": Move("width", "constant-radius", 0.9),
     "sliding_slope": Move("upper", "constant-radius", 1.2),  # more nodes pay for sliding: those of little friction
@@ -78,7 +79,7 @@ MOVES = {
     "stiffness_time": Move("std STEER", "turn and straight", 0.88),
     "stiffness_power_x": Move("nis", "acceleration", 0.6),  # the residual of a stiff tyre is divided by more
     "stiffness_power_y": Move("nis", "turn and straight", 0.94),
-    "informing_x": Move("std LN_KX", "j-turn", 1.08),
+    "informing_x": Move("std LN_KX", "j-turn", 1.07),
     "informing_y": Move("std LN_KY", "pulses", 1.15),
     "gain_std": Move("width", "acceleration", 1.1),
     # sensors
@@ -109,11 +110,11 @@ MOVES = {
     "angle_std": Move("nis", "side force without turning", 0.97),
     "angle_share": Move("std STEER", "slalom", 1.25),
     "gyro_std": Move("vy_std", "gaining-slalom", 1.15),
-    "floor_x": Move("nis", "standing", 0.8),
+    "floor_x": Move("nis", "acceleration", 0.9),
     "floor_y": Move("nis", "j-turn", 0.86),
     "force_share": Move("nis", "split-braking", 0.75),
     "axle_share": Move("nis", "j-turn", 0.91),
-    "shape_share": Move("nis", "split-braking", 0.92),
+    "shape_share": Move("nis", "acceleration", 0.92),
     "lag": Move("nis", "turn and straight", 0.94),
     "no_torque_share": Move("nis", "braking without torque", 0.7),
     "no_torque_floor": Move("nis", "pulses", 0.89),
@@ -163,6 +164,8 @@ def driven(name: str) -> tuple[FloatArray, FloatArray, Vehicle]:
         signals = signals.copy()
         signals[:, TORQUE] = np.nan
         return t[:SAMPLES], signals[:SAMPLES], vehicle
+    if name == "joints":
+        return jointed()
     if name == "constant-radius":
         return drive(name, 0.5)
     if name == "turn and straight":

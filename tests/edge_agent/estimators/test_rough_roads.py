@@ -9,11 +9,11 @@ from edge_agent.adaptation.memberships import Memberships
 from edge_agent.estimators import Estimates, create
 from schemas.numeric import FloatArray
 from schemas.signals import Health, S
-from tests.edge_agent.estimators.drives import drive
+from tests.edge_agent.estimators.drives import OMEGA, TORQUE, drive, jointed
 
 GRAVITY = 9.81
 PRIOR_WIDTH = 0.9 * 1.15
-TORQUE, OMEGA, DELTA = slice(S.TORQUE, S.TORQUE + 4), slice(S.OMEGA, S.OMEGA + 4), slice(S.DELTA, S.DELTA + 2)
+DELTA = slice(S.DELTA, S.DELTA + 2)
 
 
 def run(t: FloatArray, signals: FloatArray, vehicle: object) -> Estimates:
@@ -63,6 +63,11 @@ def test_a_slope_without_torque_is_no_ice_and_wheels_that_agree_are_the_speed() 
     rolling = vehicle.wheel_radius * climbing[:, OMEGA].mean(axis=1)
     assert np.abs(said.vx[200:, 0] - rolling[200:]).max() < 0.3
     assert said.mu_upper.min() > 0.7
+
+
+def test_joints_in_the_road_are_no_ice() -> None:
+    said = run(*jointed())
+    assert said.mu_upper[50:].min() > 0.7
 
 
 def test_no_upper_end_lies_below_the_grip_in_use_even_beyond_the_grid() -> None:
