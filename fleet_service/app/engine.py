@@ -20,7 +20,7 @@ import pyarrow as pa
 
 from fleet_service.app.clock import TimeNow
 from fleet_service.app.memory import SLOTS, Memory, remember, visited
-from fleet_service.app.past import PastQuery, ask
+from fleet_service.app.past import PastMaps, PastQuery
 from fleet_service.app.precompile import warm_up
 from fleet_service.app.tasks import Tasks
 from fleet_service.archive.bucket import CopyError
@@ -77,7 +77,7 @@ class Engine:
     """
 
     def __init__(self, config: ServiceConfig, root: Path, holding: Holding | None = None) -> None:
-        self._config, self._root = config, root
+        self._config, self._root, self._past = config, root, PastMaps(root)
         self.holding = holding or alone(config, root)  # before anything is read: an empty disk is filled from the copy
         self.copy = self.holding.copy
         try:
@@ -171,6 +171,7 @@ class Engine:
 
     def close(self) -> None:
         """Give the archive free."""
+        self._past.close()
         self.survived()
         self._log.close()
         self.holding.close()
@@ -369,7 +370,7 @@ class Engine:
         if at > now:
             raise InputError("at", "lies in the future", "give a time that has been")
         past = PastQuery(query, at, self._config.lateness_s, only, self._config.public_vehicles)
-        return ask(self._root, past, wanted)
+        return self._past.ask(past, wanted)
 
     def size(self, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None) -> AnswerSize:
         """What an answer may have at the most; errors as of `answer`."""

@@ -1,7 +1,7 @@
 """The map of a past moment, rebuilt in a process of its own: its memory is bounded before it reads, and goes with it.
 
-That process (`past_process`) reads the question as JSON and writes the replies, each after its tile and length; an
-error is a tile of -1.
+That process (`past_process`) reads questions, a line of JSON each, and writes the replies, each after its tile and
+length; the last of a question is a tile of -1, an error, or of -2, the end.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ import struct
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
+from select import select
 from typing import BinaryIO, Final, NamedTuple
 
 import pyarrow as pa
@@ -26,11 +27,14 @@ from fleet_service.serve.visitors import Visitors
 from schemas import grid
 from schemas.errors import InputError
 from schemas.query import MapQuery
+from schemas.runtime.process import trim_memory
 
 MOST_ROWS: Final = 500_000  # that are fused: some seconds, and 100 MB
 LOOKED_ROWS: Final = 20_000_000  # of row groups near the box, by the files' footers, read one at a time: half a minute
+IDLE_S: Final = 60.0  # for which a process waits for the next question
+ANSWERS: Final = 100  # after which it leaves: what it holds back of memory goes with it
 _HEAD: Final = struct.Struct("<qQ")
-_ERROR: Final = -1
+_ERROR, _END = -1, -2
 
 
 class PastQuery(NamedTuple):
@@ -44,35 +48,98 @@ class PastQuery(NamedTuple):
     public: int = 1
 
 
-def ask(root: Path, question: PastQuery, wanted: Callable[[int], bool]) -> Iterator[tuple[int, bytes]]:
-    """Tile and payload of every reply, from a process of its own.
+class PastMaps:
+    """Answers about the past. A process is kept for the next question for IDLE_S: it takes a second to begin.
 
-    Raises:
-        InputError: it would have to read too much, or the archive cannot be read.
-        ChildProcessError: the process died.
+    Args:
+        root: of the archive.
     """
-    box = box_of(question)
-    most = MOST_ROWS if box is None else LOOKED_ROWS
-    if rows_near(root, question.at, box, most) > most:
-        raise too_much()
-    command = [sys.executable, "-m", "fleet_service.app.past_process", str(root)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
-        assert child.stdin
-        assert child.stdout
-        with child.stdin as pipe:
-            pipe.write(encoded(question))
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self._idle: _Process | None = None
+
+    def ask(self, question: PastQuery, wanted: Callable[[int], bool]) -> Iterator[tuple[int, bytes]]:
+        """Tile and payload of every reply.
+
+        Raises:
+            InputError: it would have to read too much, or the archive cannot be read.
+            ChildProcessError: the process died.
+        """
+        box = box_of(question)
+        most = MOST_ROWS if box is None else LOOKED_ROWS
+        if rows_near(self._root, question.at, box, most) > most:
+            raise too_much()
+        process, head = self._asked(question)
+        ended = False
         try:
-            while head := child.stdout.read(_HEAD.size):
+            while not ended:
                 tile, size = _HEAD.unpack(head)
-                payload = child.stdout.read(size)
+                payload = process.out.read(size)
+                ended = tile in (_ERROR, _END)
                 if tile == _ERROR:
                     raise InputError(*json.loads(payload))
-                if wanted(tile):
+                if not ended and wanted(tile):
                     yield tile, payload
+                head = b"" if ended else process.head()
         finally:
-            child.kill()
-    if child.returncode not in (0, -9):
-        raise ChildProcessError(f"the past could not be rebuilt ({child.returncode})")
+            if left := self._kept(process) if ended else process:
+                left.end()
+
+    def close(self) -> None:
+        """End the process that waits."""
+        if process := self._kept(None):
+            process.end()
+
+    def _asked(self, question: PastQuery) -> tuple[_Process, bytes]:
+        """A process that answers the question, and the head of its first reply."""
+        if process := self._kept(None):
+            with suppress(BrokenPipeError, ChildProcessError):  # it has just left
+                return process, process.ask(question)
+            process.end()
+        process = _Process(self._root)
+        try:
+            return process, process.ask(question)
+        except BaseException:
+            process.end()
+            raise
+
+    def _kept(self, process: _Process | None) -> _Process | None:
+        """Keep a process for the next question, or none; returns what was kept before."""
+        self._idle, before = process, self._idle
+        return before
+
+
+class _Process:
+    """One that answers a question after the other, and leaves when none comes for a while."""
+
+    def __init__(self, root: Path) -> None:
+        command = [sys.executable, "-m", "fleet_service.app.past_process", str(root)]
+        self._child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        assert self._child.stdin
+        assert self._child.stdout
+        self._in, self.out = self._child.stdin, self._child.stdout
+
+    def ask(self, question: PastQuery) -> bytes:
+        """Ask; returns the head of the first reply."""
+        self._in.write(encoded(question))
+        self._in.flush()
+        return self.head()
+
+    def head(self) -> bytes:
+        """The head of the next reply; ChildProcessError: it is gone."""
+        head = self.out.read(_HEAD.size)
+        if len(head) < _HEAD.size:
+            raise ChildProcessError(f"the past could not be rebuilt ({self._child.wait()})")
+        return head
+
+    def end(self) -> None:
+        """End it, whatever it does."""
+        self._child.kill()
+        with suppress(BrokenPipeError):
+            self._in.close()
+        self.out.close()
+        self._child.wait()
 
 
 def box_of(question: PastQuery) -> Box | None:
@@ -109,20 +176,30 @@ def replies(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
 
 
 def encoded(question: PastQuery) -> bytes:
-    """A question for `answer_one`."""
-    return json.dumps({**question._asdict(), "query": question.query.model_dump_json()}).encode()
+    """A question as a line, for `answer_line`."""
+    return json.dumps({**question._asdict(), "query": question.query.model_dump_json()}).encode() + b"\n"
 
 
-def answer_one(root: Path, asked: BinaryIO, out: BinaryIO) -> None:
-    """Answer the one question of a process that was begun for it."""
-    pa.set_cpu_count(1)
-    pa.set_io_thread_count(1)  # each thread that reads keeps memory of its own: 20 MB
-    heard = json.loads(asked.read())
+def answer_line(root: Path, line: bytes, out: BinaryIO) -> None:
+    """Answer a question."""
+    heard = json.loads(line)
     question = PastQuery(**{**heard, "query": MapQuery.model_validate_json(heard["query"])})
     try:
         for tile, payload in replies(root, question):
             out.write(_HEAD.pack(tile, len(payload)) + payload)
+        out.write(_HEAD.pack(_END, 0))
     except InputError as error:
         payload = json.dumps([error.field, error.problem, error.fix]).encode()
         out.write(_HEAD.pack(_ERROR, len(payload)) + payload)
     out.flush()
+
+
+def answer_all(root: Path, asked: BinaryIO, out: BinaryIO) -> None:
+    """Answer until nobody asks for IDLE_S, ANSWERS at the most."""
+    pa.set_cpu_count(1)
+    pa.set_io_thread_count(1)  # each thread that reads keeps memory of its own: 20 MB
+    for _ in range(ANSWERS):
+        if not select([asked], [], [], IDLE_S)[0] or not (line := asked.readline()):
+            return
+        answer_line(root, line, out)
+        trim_memory()

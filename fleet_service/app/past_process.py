@@ -1,4 +1,4 @@
-"""`python -m fleet_service.app.past_process ARCHIVE`: one question about the past from stdin, its replies to stdout."""
+"""`python -m fleet_service.app.past_process ARCHIVE`: questions about the past from stdin, their replies to stdout."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from schemas.runtime.process import limit_memory
 
 
 def main() -> int:
-    """Answer it."""
+    """Answer them."""
     limit_memory(*UNUSED)  # before anything loads what it keeps out: 40 MB
-    from fleet_service.app.past import answer_one
+    from fleet_service.app.past import answer_all
 
-    answer_one(Path(sys.argv[1]), sys.stdin.buffer, sys.stdout.buffer)
+    answer_all(Path(sys.argv[1]), sys.stdin.buffer, sys.stdout.buffer)
     return 0
 
 

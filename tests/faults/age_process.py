@@ -31,10 +31,10 @@ def main() -> None:
 
 
 def _past(root: Path) -> dict[str, float]:
-    from fleet_service.app.past import answer_one
+    from fleet_service.app.past import answer_line
 
     out = BytesIO()
-    answer_one(root, sys.stdin.buffer, out)
+    answer_line(root, sys.stdin.buffer.read(), out)
     return {"bytes": len(out.getvalue())}
 
 

@@ -15,6 +15,7 @@ from tests.faults import (
     disk,
     flood,
     fuzz,
+    fuzz_wire,
     insider,
     kill,
     outages,
@@ -128,6 +129,14 @@ CAMPAIGNS: Final = (
         (
             *("faults.fuzz.crashes", "faults.fuzz.admitted_out_of_range", "faults.fuzz.honest_lost"),
             *("faults.fuzz.refused", "faults.fuzz.answered", "faults.fuzz.pasts"),
+        ),
+    ),
+    Campaign(
+        "fuzz-wire",
+        fuzz_wire.run,
+        (
+            *("faults.fuzz_wire.crashes", "faults.fuzz_wire.honest_lost", "faults.fuzz_wire.doubled"),
+            *("faults.fuzz_wire.honest", "faults.fuzz_wire.refused", "faults.fuzz_wire.answered"),
         ),
     ),
     Campaign(

@@ -62,7 +62,7 @@ class Mutants:
             for _ in range(r.choice((1, 1, 2, 5))):
                 _change_field(r, message)
             return message.SerializeToString(), wire.ENCODING[kind]
-        return _changed_bytes(r, message.SerializeToString()), wire.ENCODING[kind]
+        return changed_bytes(r, message.SerializeToString()), wire.ENCODING[kind]
 
     def _valid(self, kind: Kind, name: str) -> Any:  # noqa: ANN401 protobuf messages are untyped
         self._seq += 1
@@ -130,7 +130,8 @@ _QUERY: Final = {
 }  # fmt: skip
 
 
-def _changed_bytes(r: Random, data: bytes) -> bytes:
+def changed_bytes(r: Random, data: bytes) -> bytes:
+    """Bytes with a few of them changed, left out, repeated or put in."""
     out = bytearray(data)
     for _ in range(r.choice((1, 1, 1, 2, 4, 16))):
         at = r.randrange(len(out)) if out else 0

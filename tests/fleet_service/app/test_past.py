@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
 import time
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -47,6 +49,12 @@ def question(**parameters: str) -> past.PastQuery:
     return past.PastQuery(query.parse(parameters), time.time_ns(), 120.0, None)
 
 
+@pytest.fixture
+def asker(root: Path) -> Iterator[past.PastMaps]:
+    with closing(past.PastMaps(root)) as asker:
+        yield asker
+
+
 def test_rows_are_counted_before_any_is_read(root: Path) -> None:
     now = time.time_ns()
     assert rows_near(root, now, None, 10**6) == 400
@@ -55,17 +63,17 @@ def test_rows_are_counted_before_any_is_read(root: Path) -> None:
 
 
 def test_what_would_read_too_much_is_refused_and_a_narrower_box_is_not(
-    root: Path, monkeypatch: pytest.MonkeyPatch
+    root: Path, asker: past.PastMaps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(past, "MOST_ROWS", 399)
     with pytest.raises(InputError, match="at: would have to read too much of the archive; narrow bbox"):
-        list(past.ask(root, question(), lambda _: True))
-    assert list(past.ask(root, question(bbox="0,0,1,1"), lambda _: True)) == []
+        list(asker.ask(question(), lambda _: True))
+    assert list(asker.ask(question(bbox="0,0,1,1"), lambda _: True)) == []
     with pytest.raises(InputError, match="at: would have to read too much of the archive; narrow bbox"):
         list(past.replies(root, question(bbox=NEAR)))  # as many lie in the box itself
     monkeypatch.setattr(past, "LOOKED_ROWS", 399)
     with pytest.raises(InputError, match="at: would have to read too much"):
-        list(past.ask(root, question(bbox=NEAR), lambda _: True))
+        list(asker.ask(question(bbox=NEAR), lambda _: True))
 
 
 @pytest.mark.parametrize("group", [1, 7, 400])
@@ -101,10 +109,55 @@ def test_a_filter_finds_the_same_rows_however_they_are_grouped(
     assert 0 < wanted[0][1].sum() < 400
 
 
-def test_the_answer_of_the_other_process_is_that_of_this_one(root: Path) -> None:
+def test_the_answer_of_the_other_process_is_that_of_this_one(root: Path, asker: past.PastMaps) -> None:
     asked = question(bbox=NEAR)
     (mine,) = past.replies(root, asked)
-    (theirs,) = past.ask(root, asked, lambda _: True)
+    (theirs,) = asker.ask(asked, lambda _: True)
     assert theirs == mine
     assert mine[0] == TILE
-    assert list(past.ask(root, asked, lambda _: False)) == []
+    assert list(asker.ask(asked, lambda _: False)) == []
+
+
+@pytest.fixture
+def begun(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
+    """The processes that were begun."""
+    found: list[subprocess.Popen[bytes]] = []
+
+    real = subprocess.Popen
+
+    def noted(command: list[str], stdin: int, stdout: int) -> subprocess.Popen[bytes]:
+        found.append(real(command, stdin=stdin, stdout=stdout))
+        return found[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", noted)
+    return found
+
+
+def test_a_process_answers_one_question_after_the_other(
+    asker: past.PastMaps, begun: list[subprocess.Popen[bytes]]
+) -> None:
+    answers = [list(asker.ask(question(bbox=box), lambda _: True)) for box in (NEAR, "0,0,1,1", NEAR)]
+    assert [len(answer) for answer in answers] == [1, 0, 1]
+    assert len(begun) == 1
+    asker.close()
+    assert begun[0].poll() is not None
+
+
+def test_a_process_that_died_while_nobody_asked_is_begun_anew(
+    asker: past.PastMaps, begun: list[subprocess.Popen[bytes]]
+) -> None:
+    for _ in range(2):
+        assert len(list(asker.ask(question(bbox=NEAR), lambda _: True))) == 1
+        begun[-1].kill()
+        begun[-1].wait()
+    assert len(begun) == 2
+
+
+def test_an_answer_that_nobody_reads_to_its_end_is_not_read_by_the_next(
+    asker: past.PastMaps, begun: list[subprocess.Popen[bytes]]
+) -> None:
+    left = asker.ask(question(bbox=NEAR), lambda _: True)
+    next(left)
+    left.close()  # type: ignore[attr-defined]  # a generator
+    assert len(list(asker.ask(question(bbox=NEAR), lambda _: True))) == 1
+    assert len(begun) == 2

@@ -1,0 +1,124 @@
+"""Malformed messages, weather, questions and acknowledgements through a real router, into a service and vehicles.
+
+What `fuzz` hands to the engine in its own process goes the whole way here: Zenoh's threads, the bounded queue, what a
+vehicle may send, the queryables, the worker's turns. Vehicles report amid it through the agent's publisher and outbox.
+No acknowledgement that is put here can be read: a forged one is what certificates are for (`security`).
+"""
+
+from __future__ import annotations
+
+import random
+import time
+import urllib.request
+from typing import Final
+
+import zenoh
+
+from schemas import grid, keys, wire
+from schemas.config import ZenohSettings
+from schemas.errors import WireError
+from schemas.runtime.figures import Figure
+from schemas.runtime.zenoh_session import open_session
+from tests.faults.bars import figure
+from tests.faults.census import take
+from tests.faults.frame import Site
+from tests.faults.mutants import Mutants, changed_bytes
+from tests.faults.processes import Stage, stage
+from tests.fleet_service.examples import LATITUDE, LONGITUDE, REGION
+
+TURN: Final = 200  # malformed messages between two questions
+HONEST: Final = tuple(f"sim-{number:03}" for number in range(10))
+RATE: Final = 5.0  # observations/s of each
+DRAIN_S: Final = 60.0
+ANSWER_S: Final = 30.0
+LONGEST_ENCODING: Final = 255
+MAP: Final = f"{keys.ROOT}/map/**"
+TILE: Final = int(grid.tile_of(grid.cell_of(LATITUDE, LONGITUDE)))
+ASKED: Final = (MAP, keys.map_key(TILE), f"{keys.ROOT}/alert/**", keys.alert_key(TILE), f"{keys.ROOT}/**")
+
+
+def run(site: Site) -> list[Figure]:
+    """Two hundred thousand of them, or four thousand in a quick run."""
+    r, sent, answers = random.Random(site.seed), 0, 0
+    with stage(site.folder, metrics_port=0) as there:
+        there.load(HONEST, RATE, flush_s=0.5).start()
+        there.loads[0].line_with("ready: ")
+        session = open_session(ZenohSettings(connect=[there.endpoint]))
+        assert session is not None
+        with session:
+            mutants = Mutants(site.seed, time.time_ns())
+            for turn in range(site.of(200_000, 4_000) // TURN):
+                mutants.now = time.time_ns()
+                sent += sum(_put(session, *_message(r, mutants)) for _ in range(TURN))
+                answers += _ask(session, r, mutants)
+                if not turn % 50:
+                    site.say(f"{sent} malformed, {answers} answers")
+            alive = there.service.alive and all(part.alive for part in there.loads)
+            counts = _counts(there)
+        there.drain(DRAIN_S)
+        code = there.service.stop() if there.service.alive else 1
+        census = take(there.journals, there.archive)
+        said = [line for part in (there.service, *there.loads) for line in part.lines() if "Traceback" in line]
+    failures = counts.get("gripmap_answer_failures_total", 0.0)
+    refused = sum(value for name, value in counts.items() if name.startswith("gripmap_refused_messages"))
+    site.say(f"{census}; {failures:.0f} answers failed, {len(said)} tracebacks, exit {code}")
+    return [
+        figure("faults.fuzz_wire.crashes", (not alive) + (code != 0) + len(said) + failures),
+        figure("faults.fuzz_wire.honest_lost", census.lost),
+        figure("faults.fuzz_wire.doubled", census.doubled),
+        figure("faults.fuzz_wire.honest", census.settled),
+        figure("faults.fuzz_wire.refused", refused),
+        figure("faults.fuzz_wire.answered", answers),
+        Figure("faults.fuzz_wire.sent", sent, "malformed messages that Zenoh let through"),
+    ]
+
+
+def _message(r: random.Random, mutants: Mutants) -> tuple[str, bytes, str]:
+    """Key, payload and encoding of the next."""
+    message, what = mutants.message(), r.random()
+    if what < 0.02:
+        return keys.weather_key(REGION), changed_bytes(r, message.payload), r.choice(list(wire.ENCODING.values()))
+    if what < 0.04:
+        return keys.ack_key(r.choice(HONEST)), _unreadable_ack(r), wire.ACK_ENCODING
+    if what < 0.06:
+        return r.choice((keys.map_key(TILE), keys.alert_key(TILE))), message.payload, message.encoding
+    return message.key, message.payload, message.encoding
+
+
+def _unreadable_ack(r: random.Random) -> bytes:
+    while True:
+        payload = r.randbytes(r.randrange(1, 200))
+        try:
+            wire.decode_ack(payload)
+        except WireError:
+            return payload
+
+
+def _put(session: zenoh.Session, key: str, payload: bytes, encoding: str) -> int:
+    """Put it; 0 where it is Zenoh that refuses the key. A longer encoding is the end of the sender's own session."""
+    if len(encoding) > LONGEST_ENCODING:
+        return 0
+    try:
+        session.put(key, payload, encoding=encoding, congestion_control=zenoh.CongestionControl.BLOCK)
+    except (zenoh.ZError, ValueError):
+        return 0
+    return 1
+
+
+def _ask(session: zenoh.Session, r: random.Random, mutants: Mutants) -> int:
+    """Ask something malformed, with something malformed in hand; how many answers came, errors not counted."""
+    parameters = ";".join(f"{name}={value}" for name, value in mutants.query().items())
+    payload = r.choice((None, b"", r.randbytes(300), mutants.message().payload))
+    try:
+        replies = session.get(f"{r.choice(ASKED)}?{parameters}", payload=payload, timeout=ANSWER_S)
+        return sum(reply.ok is not None for reply in replies)
+    except (zenoh.ZError, ValueError):
+        return 0
+
+
+def _counts(there: Stage) -> dict[str, float]:
+    """The service's metrics."""
+    address = there.service.line_with("ready: ").split()[-1]
+    with urllib.request.urlopen(f"{address}/metrics", timeout=30.0) as page:
+        lines = [line for line in page.read().decode().splitlines() if not line.startswith("#")]
+    return {line.rpartition(" ")[0]: float(line.rpartition(" ")[2]) for line in lines}
