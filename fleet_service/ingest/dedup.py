@@ -159,7 +159,8 @@ class SequenceTrackers:
 
     def forget(self, before: int) -> None:
         """Drop streams without a batch from `before` [ns] on: one that came again would be refused as too old."""
-        self._streams = {key: stream for key, stream in self._streams.items() if stream.newest >= before}
+        for key in [key for key, stream in self._streams.items() if stream.newest < before]:
+            del self._streams[key]
 
     def restore(
         self, kind: Kind, vehicle: IntArray, boot: IntArray, region: IntArray,

@@ -150,10 +150,7 @@ class BatchIntake:
         self.times.clear()
         self._now = clock.now / NS
         if abs(clock.now - self._forgot) > FORGET_NS:
-            self._forgot = clock.now
-            self._streams.forget(min(clock.horizon, self._streams.newest - KNOWN_NS))
-            for known in self._known.values():
-                known.clear()
+            self._forget(clock)
         out = {}
         for kind in Kind:
             ours = [m for m in messages if m.kind is kind]
@@ -198,6 +195,20 @@ class BatchIntake:
             self._refuse(str(owners[place].name), found.heads.at(place), validation.ERASED)
         new = self._new(kind, found.heads, time, good)
         return self._rows(kind, new, found, clock) if new else AcceptedBatches([], {})
+
+    def _forget(self, clock: Clock) -> None:
+        """Streams too old to matter, and names of days of which next to nothing comes any more.
+
+        What goes on being sent stays where it lies: made anew, it would lie between other things, and each time the
+        process would be some megabytes larger.
+        """
+        self._forgot = clock.now
+        self._streams.forget(min(clock.horizon, self._streams.newest - KNOWN_NS))
+        yesterday = clock.now // DAY_NS - 1
+        for known in self._known.values():
+            old = [name for name, stream in known.items() if name[3] < yesterday or stream.key not in self._streams]
+            for name in old:
+                del known[name]
 
     def _forgotten(self, owners: Sequence[Parsed], time: IntArray) -> BoolArray:
         """Which batches (n,) are of a time that was forgotten, of everybody or of their vehicle."""

@@ -38,7 +38,7 @@ def main() -> int:
         found += city(Sumo(FOLDER), FOLDER, SEED)
     print("2/3 coefficients: what a vehicle and a cell cost", flush=True)
     each = coefficients()
-    print("3/3 country: a hundred thousand vehicles, fifteen minutes", flush=True)
+    print("3/3 country: a hundred thousand vehicles, twenty-one minutes", flush=True)
     with tempfile.TemporaryDirectory() as name:
         course = Path(name)
         found += nation(given or FOLDER / PREFIX, course, SEED, each)

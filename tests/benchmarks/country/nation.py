@@ -29,7 +29,7 @@ from tests.benchmarks.country.sender import EVERY_S as SAYS_S
 from tests.faults.processes import Part
 from tests.faults.soak import memory_mb, slope
 
-WARM_S: Final = 300.0  # all have been everywhere, the window is full, and a checkpoint has given its memory back
+WARM_S: Final = 660.0  # all have been everywhere, the window is full, and two checkpoints have given their memory back
 MEASURED_S: Final = 600.0
 EVERY_S: Final = 5.0
 MEMORY_S: Final = 0.25

@@ -16,7 +16,7 @@ from fleet_service.ingest.rate_limit import RateLimiter
 from schemas import keys, wire
 from schemas.config import ServiceConfig
 from schemas.wire import Kind
-from tests.fleet_service.examples import SECOND, batch
+from tests.fleet_service.examples import SECOND, batch, key
 
 NOW = 1_750_000_000 * SECOND
 
@@ -76,3 +76,21 @@ def test_a_start_opens_each_segment_that_waits_for_compaction_twice_however_many
         assert again.fusion.size == 1
     assert len(opened) >= segments
     assert max(opened.values()) <= 2, "once for its rows, once for who sent them"
+
+
+def test_who_goes_on_sending_is_not_looked_up_again_and_days_that_are_over_are_forgotten(tmp_path: Path) -> None:
+    with closing(Engine(ServiceConfig(), tmp_path)) as engine:
+        intake = engine._intake
+
+        def known(seq: int, now: int) -> list[tuple[str, int, int, int]]:
+            sent = batch("car-1", seq, now, [0.8])
+            engine.ingest([Message(Kind.OBSERVATION, key("car-1"), wire.encode(sent), "")], now)
+            engine.flush()
+            return list(intake._known[Kind.OBSERVATION])
+
+        (first,) = known(1, NOW)
+        (again,) = known(2, NOW + 1000 * SECOND)
+        assert again is first
+        (later,) = known(3, NOW + 3 * 86_400 * SECOND)
+        assert later == (*first[:3], first[3] + 3)
+        assert engine.counts[Kind.OBSERVATION] == 3
