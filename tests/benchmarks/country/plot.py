@@ -33,8 +33,9 @@ def draw(course: Path, out: Path) -> None:
         worst = [np.quantile(one, share) if len(one) else np.nan for one in inside]
         below.plot(edges[:-1] + SPAN_S / 2, worst, color=colour, label=label)
     below.set(xlabel="time [s]", ylabel="wait for the ack [s]", ylim=(0, None))
+    below.margins(y=0.25)  # room for the legend
     for axes in (above, middle, below):
         axes.axvline(WARM_S, color="0.7", linewidth=1, linestyle=":")
-        axes.legend(frameon=False, ncols=3, loc="lower right" if axes is middle else "upper right")
+        axes.legend(frameon=False, ncols=3, loc="upper right" if axes is below else "lower right")
         axes.set_xlim(0, None)
     canvas.savefig(out, dpi=130)
