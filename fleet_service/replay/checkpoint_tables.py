@@ -38,7 +38,8 @@ def _listed(column: NDArray[Any]) -> pa.Array[Any]:
 
 def _unlisted(column: pa.ChunkedArray[Any]) -> NDArray[Any]:
     """The column that a list holds; a view, where Arrow's own way to an array looks for another library first."""
-    values = cast("pa.LargeListArray[Any]", column.combine_chunks()).flatten()
+    whole = column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()  # which copies what is one piece
+    values = cast("pa.LargeListArray[Any]", whole).flatten()
     if pa.types.is_boolean(values.type):
         return np.asarray(values)
     data = np.frombuffer(memoryview(values.buffers()[1] or b""), values.type.to_pandas_dtype())
