@@ -64,7 +64,7 @@ def start(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, time: 
         put(memory.mean[j], memory.overall_mean)
         put_square(memory.covariance[j], covariance)
     for friction in (memory.friction, memory.friction_left, memory.friction_right):
-        find_interval(design, design.prior, memory.patch, scratch.blended, friction)
+        find_interval(design, design.prior, memory.patch, scratch.blended, 0.0, friction)
     for kind in range(3):
         memory.drive_odds[kind] = FIRST_ODDS[kind]
     rolling = memory.rolling

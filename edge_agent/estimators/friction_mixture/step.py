@@ -27,7 +27,7 @@ from edge_agent.estimators.friction_mixture.residuals import gained_velocity
 from edge_agent.estimators.friction_mixture.restart import recover, start
 from edge_agent.estimators.friction_mixture.rolling_motion import watch_wheels
 from edge_agent.estimators.friction_mixture.split_sides import BOTH, LEFT, RIGHT, project
-from edge_agent.estimators.friction_mixture.trust import judge
+from edge_agent.estimators.friction_mixture.trust import judge, likeness
 from edge_agent.estimators.friction_mixture.weighing import measure
 from edge_agent.estimators.friction_mixture.workspace import Scratch
 from schemas.numeric import FloatArray
@@ -119,7 +119,8 @@ def _find_friction(memory: MixtureMemory, design: MixtureDesign, scratch: Scratc
         _find_side(memory, design, scratch, RIGHT, memory.friction_right)
         _find_side(memory, design, scratch, BOTH, memory.friction)
     else:
-        find_interval(design, memory.weight[:NODES], memory.patch, scratch.blended, memory.friction)
+        alike = likeness(memory.trust, design.constants)
+        find_interval(design, memory.weight[:NODES], memory.patch, scratch.blended, alike, memory.friction)
         for side in (memory.friction_left, memory.friction_right):
             both = memory.friction
             side.median, side.lower, side.upper = both.median, both.lower, both.upper
@@ -130,7 +131,8 @@ def _find_side(
     memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, side: int, friction: Quantiles
 ) -> None:  # fmt: skip
     project(memory.weight, design.sides.share[side], scratch.projected)
-    find_interval(design, scratch.projected, memory.patch, scratch.blended, friction)
+    alike = likeness(memory.trust, design.constants)
+    find_interval(design, scratch.projected, memory.patch, scratch.blended, alike, friction)
 
 
 @compiled

@@ -96,6 +96,12 @@ def strained_evidence(trust: Trust) -> float:
 
 
 @compiled
+def likeness(trust: Trust, constants: Constants) -> float:
+    """How much the car is as its file says, 0 to 1: 0 from the usual strain on."""
+    return max(1.0 - trust.strain / constants.strain_usual, 0.0)
+
+
+@compiled
 def credence(trust: Trust, constants: Constants) -> float:
     """Share of the evidence that is believed: less while a contradiction grows, none once it is believed."""
     return max(1.0 - (trust.odd / constants.odd_least) ** 2, 0.0)

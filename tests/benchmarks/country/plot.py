@@ -32,8 +32,7 @@ def draw(course: Path, out: Path) -> None:
     for label, share, colour in (("longest", 1.0, "0.75"), ("99 %", 0.99, "0.45"), ("median", 0.5, "0.0")):
         worst = [np.quantile(one, share) if len(one) else np.nan for one in inside]
         below.plot(edges[:-1] + SPAN_S / 2, worst, color=colour, label=label)
-    below.set(xlabel="time [s]", ylabel="wait for the ack [s]", ylim=(0, None))
-    below.margins(y=0.25)  # room for the legend
+    below.set(xlabel="time [s]", ylabel="wait for the ack [s]", ylim=(0, 1.25 * below.dataLim.y1))
     for axes in (above, middle, below):
         axes.axvline(WARM_S, color="0.7", linewidth=1, linestyle=":")
         axes.legend(frameon=False, ncols=3, loc="upper right" if axes is below else "lower right")

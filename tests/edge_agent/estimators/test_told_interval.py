@@ -28,18 +28,22 @@ DESIGN = design_of(Memberships(), adaptive=True)
 
 @nogil
 def _tell(
-    contexts: Records[MixtureContext], filters: Records[MixtureMemory], weight: FloatArray, patch: FloatArray
+    contexts: Records[MixtureContext],
+    filters: Records[MixtureMemory],
+    weight: FloatArray,
+    patch: FloatArray,
+    likeness: float,
 ) -> tuple[float, float, float]:
     context, friction = contexts[0], filters[0].friction
-    find_interval(context.design, weight, patch, context.scratch.blended, friction)
+    find_interval(context.design, weight, patch, context.scratch.blended, likeness, friction)
     return friction.lower, friction.median, friction.upper
 
 
-def told(weight: FloatArray, patch: float = 0.0) -> tuple[float, float, float]:
-    """Lower end, median, upper end of a belief, with this share of patches of ice."""
+def told(weight: FloatArray, patch: float = 0.0, likeness: float = 0.0) -> tuple[float, float, float]:
+    """Lower end, median, upper end of a belief, with this share of patches of ice, of a car so like its file."""
     contexts = records(MixtureContext, 1)
     put_record(contexts["design"][0], DESIGN)
-    return _tell(contexts, records(MixtureMemory, 1), weight, np.full(PATCH_NODES, patch / PATCH_NODES))
+    return _tell(contexts, records(MixtureMemory, 1), weight, np.full(PATCH_NODES, patch / PATCH_NODES), likeness)
 
 
 def about(mu: float, width: float) -> FloatArray:
@@ -53,6 +57,16 @@ def test_who_knows_nothing_tells_the_prior() -> None:
     assert upper == pytest.approx(0.05 + UPPER_END * 1.15, abs=1e-3)
     assert median == pytest.approx(0.625, abs=1e-3)
     assert lower == pytest.approx(0.05 + LOWER_END * 1.15, abs=1e-3)
+
+
+@pytest.mark.parametrize("mu", [0.15, 0.3, 0.5, 0.8])
+def test_in_a_car_as_its_file_says_the_upper_end_alone_is_nearer_and_ice_needs_as_much(mu: float) -> None:
+    weight = about(mu, 0.1)
+    rough, alike = told(weight), told(weight, likeness=0.7)
+    assert alike[:2] == rough[:2]
+    assert alike[2] <= rough[2] - (0.02 if mu > 0.4 else 0.0)
+    assert (alike[2] < SLIPPERY_MU) == (rough[2] < SLIPPERY_MU)
+    assert told(DESIGN.prior, likeness=1.0) == told(DESIGN.prior)
 
 
 def test_a_learned_upper_end_is_nearer_than_a_quantile_of_tempered_evidence() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.estimators import Estimates
-from edge_agent.estimators.friction_mixture.reported_interval import LEARNED_END, LOWER_END, UPPER_END
+from edge_agent.estimators.friction_mixture.reported_interval import LEARNED_END, LOWER_END, NEARER, UPPER_END
 from edge_agent.lab.evaluation.batch import DriveSet, estimates, realistic
 from edge_agent.lab.evaluation.measures import bounds, consistency
 from edge_agent.lab.evaluation.reliability import LEVELS, between_quantiles, on_the_grid, shares, watched
@@ -70,7 +70,7 @@ def test_the_whole_posterior_of_the_default_has_the_quantiles_that_it_tells_with
     for least, most, output in (
         (0.0, LOWER_END, reported.mu_lower),
         (0.5, 0.5, reported.mu),
-        (LEARNED_END, UPPER_END, reported.mu_upper),
+        (LEARNED_END - NEARER, UPPER_END, reported.mu_upper),
     ):
         for side, level in ((-1.0, most), (1.0, least)):
             beside = output + side * 1.15 / BINS
