@@ -4,8 +4,8 @@ BIN := .venv/bin
 STAMP := .venv/.installed
 PAPERS := .venv/.papers
 
-# one process more than cores, for many tests wait for processes of their own
-TESTS := $(BIN)/python -m pytest -q --numprocesses $$(( $$(getconf _NPROCESSORS_ONLN) + 1 )) --dist loadfile
+# two processes more than cores, for many tests wait for processes of their own
+TESTS := $(BIN)/python -m pytest -q --numprocesses $$(( $$(getconf _NPROCESSORS_ONLN) + 2 )) --dist loadfile
 export PYTHONDONTWRITEBYTECODE :=  # what was parsed once is kept: tests start hundreds of processes
 
 .PHONY: setup demo test test-all test-shuffled check package docs lint types faults faults-quick cluster-faults soak bench tune proto lock clean analytics-bench spark-test usability figures roads-bench page-bench ahead-bench browser-test batch-bench image kube country-bench

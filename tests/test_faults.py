@@ -127,6 +127,7 @@ def served(number: int, folder: Path) -> list[str]:
     return ServiceHistory(number, folder / str(number)).violations()
 
 
+@pytest.mark.campaign
 def test_no_history_of_a_service_on_a_disk_that_forgets_loses_doubles_or_brings_back_anything(tmp_path: Path) -> None:
     found_bugs = (45, 84)  # a forgotten vehicle's last rows came in again; rows of a month ago were fused twice
     assert [problem for number in (*range(3), *found_bugs) for problem in served(number, tmp_path)] == []

@@ -199,6 +199,7 @@ def tuned(folder: Path, *words: str) -> tuple[object, list[str]]:
     return found | {"budget": document["provenance"]["budget"]}, [path.name]
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("option", [option for command, option in CHANGED if command == "tune"])
 def test_every_option_of_tune_changes_what_is_found(option: str, tmp_path_factory: pytest.TempPathFactory) -> None:
     base = tmp_path_factory.getbasetemp() / "tuned"

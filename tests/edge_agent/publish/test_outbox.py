@@ -324,6 +324,7 @@ def test_a_batch_that_nobody_answers_is_given_up_once_it_would_stop_its_stream(
     outbox.close()
 
 
+@pytest.mark.campaign
 def test_a_batch_that_waits_takes_little_memory_and_a_long_life_leaves_none_behind(path: Path) -> None:
     """A day of a vehicle is 170 000 batches."""
     count = 20_000

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pytest
 import zenoh
 
 from fleet_service.archive import reading
@@ -41,6 +42,7 @@ def service(router: ZenohSettings, folder: Path) -> Iterator[subprocess.Popen[st
         process.communicate()
 
 
+@pytest.mark.campaign
 def test_a_killed_service_keeps_what_it_acknowledged_and_counts_nothing_twice(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path
 ) -> None:

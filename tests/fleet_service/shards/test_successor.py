@@ -51,9 +51,8 @@ GONE: dict[str, Callable[[Host], None]] = {
 }
 
 
-@pytest.mark.parametrize(
-    "how", [how if how == "killed" else pytest.param(how, marks=pytest.mark.campaign) for how in GONE]
-)
+@pytest.mark.campaign
+@pytest.mark.parametrize("how", GONE)
 def test_a_standby_goes_on_with_all_that_was_acknowledged(
     router: ZenohSettings, session: zenoh.Session, bucket: BucketServer, tmp_path: Path, how: str
 ) -> None:
@@ -283,6 +282,7 @@ def test_who_starts_while_the_bucket_is_away_says_so_and_ends_or_waits_as_a_stan
     made[0].close()
 
 
+@pytest.mark.campaign
 def test_a_standby_is_ready_for_systemd_gives_signs_of_life_and_shows_that_it_does_not_serve(
     router: ZenohSettings, bucket: BucketServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

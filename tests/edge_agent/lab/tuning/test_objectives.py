@@ -137,6 +137,7 @@ def arguments(*words: str) -> argparse.Namespace:
     return parser.parse_args(words)
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("objective", ["interval", "innovation", "predictive"])
 def test_quick_tuning_writes_a_valid_file_and_says_what_it_does(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], objective: str
