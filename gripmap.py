@@ -13,7 +13,7 @@ from __future__ import annotations
 import importlib
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 PACKAGES = ("schemas", "edge_agent", "fleet_service", "deploy")
 FACES = ("edge_agent", "fleet_service")
@@ -50,17 +50,17 @@ def __dir__() -> list[str]:
     return sorted({name for face in FACES for name in importlib.import_module(face).__all__})
 
 
-def edge_agent_main() -> int:
+def edge_agent_main() -> NoReturn:
     """Run `edge-agent`."""
     from edge_agent.cli import main
     from schemas.runtime.process import leave
 
-    return leave(main())
+    leave(main())
 
 
-def fleet_service_main() -> int:
+def fleet_service_main() -> NoReturn:
     """Run `fleet-service`."""
     from fleet_service.cli import main
     from schemas.runtime.process import leave
 
-    return leave(main())
+    leave(main())

@@ -3,4 +3,4 @@
 from edge_agent.cli import main
 from schemas.runtime.process import leave
 
-raise SystemExit(leave(main()))
+leave(main())

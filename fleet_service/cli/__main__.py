@@ -3,4 +3,4 @@
 from fleet_service.cli import main
 from schemas.runtime.process import leave
 
-raise SystemExit(leave(main()))
+leave(main())

@@ -70,15 +70,15 @@ def end_now(code: int) -> NoReturn:
     os._exit(code)
 
 
-def leave(code: int) -> int:
+def leave(code: int) -> NoReturn:
     """End the process as a command does whose work is done, without taking the interpreter apart.
 
     Each compiled kernel is a module of LLVM: after a first use, taking some hundred of them apart was five seconds
-    without a word, beside other work. What is registered for the exit runs. Where a thread still works that the
-    process waits for, its end is left to Python: the code is returned.
+    without a word, beside other work; and a thread of a library that calls back meanwhile, a Zenoh session's, would
+    abort the process. As at Python's own end, threads that are no daemons are waited for, and what is registered for
+    the exit runs.
     """
-    if any(one is not threading.main_thread() and not one.daemon for one in threading.enumerate()):
-        return code
+    threading._shutdown()  # type: ignore[attr-defined] # no public way
     atexit._run_exitfuncs()
     end_now(code)
 
