@@ -14,6 +14,7 @@ from edge_agent.estimators.friction_mixture.reported_interval import (
     DRAWN_IN,
     LEARNED_END,
     LOWER_END,
+    SURE_END,
     UPPER_END,
     find_interval,
 )
@@ -82,11 +83,11 @@ def test_a_long_upper_tail_is_not_cut_off() -> None:
     assert told(weight)[2] == pytest.approx(widest - DRAWN_IN, abs=1e-9)
 
 
-@pytest.mark.parametrize("mu", [0.2, 0.25, 0.3, 0.35, 0.4])
-def test_slippery_for_sure_is_said_at_95_percent_only(mu: float) -> None:
+@pytest.mark.parametrize("mu", [0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4])
+def test_slippery_for_sure_is_said_at_99_percent_only(mu: float) -> None:
     weight = about(mu, 0.08)
     _, _, upper = told(weight)
-    assert (upper < SLIPPERY_MU) == (quantile(DESIGN.mu, DESIGN.prior, weight, UPPER_END) < SLIPPERY_MU)
+    assert (upper < SLIPPERY_MU) == (quantile(DESIGN.mu, DESIGN.prior, weight, SURE_END) < SLIPPERY_MU)
 
 
 def test_a_patch_lowers_the_lower_end_alone() -> None:
