@@ -26,6 +26,9 @@ SMOOTH_M: Final = 15  # in which a corner of a given route is driven: 9.5 m of r
 OFF_ROUTE_M: Final = 20.0  # from the line of a route: a receiver's error, a wide road, a coarse route
 BACK_M: Final = 20.0  # a fix may jump back by so much
 ASTRAY: Final = np.radians(60.0)  # who heads so much otherwise is on another road
+# Unless the route heads like that so near, for corners are cut and turned into late; or begins so near: a navigation
+# system leaves out what has been driven, and how a route came to its beginning nobody knows.
+CORNER_M: Final = 20.0
 CORRIDOR_M: Final = 150.0  # a road without bends in sight; beyond, where it leads is anybody's guess
 CORRIDOR_WIDENS: Final = 0.05  # per metre: a bend of a kilometre's radius
 
@@ -136,10 +139,13 @@ class GivenRoute:
         share = np.clip(-(start * step).sum(axis=1) / size**2, 0.0, 1.0)
         off = np.hypot(*(start + share[:, None] * step).T)
         turned = np.abs((np.arctan2(step[:, 1], step[:, 0]) - pose.yaw + np.pi) % (2 * np.pi) - np.pi)
-        fits = (off <= OFF_ROUTE_M) & (turned <= ASTRAY)
+        run = _run(line)
+        at, fits = run[:-1] + share * size, off <= OFF_ROUTE_M
+        for k in np.flatnonzero(fits & (turned > ASTRAY)).tolist():
+            first, last = np.searchsorted(run, [at[k] - CORNER_M, at[k] + CORNER_M])
+            fits[k] = first == 0 or turned[first - 1 : last].min() <= ASTRAY
         if not fits.any():
             return None
-        at = _run(line)[:-1] + share * size
         onward = fits & (at >= self._metre - BACK_M)
         among = np.flatnonzero(onward if onward.any() else fits)
         # the nearest of those a little further on; a loop that is driven twice is not jumped ahead in

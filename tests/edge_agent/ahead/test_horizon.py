@@ -19,7 +19,7 @@ from edge_agent.ahead.horizon import (
     safe_speed,
 )
 from edge_agent.ahead.known import ALERT_HELD_S, BORROWED, CHANGE_S, HELD_S, OTHER_WAY, HeardMap, belief_of
-from edge_agent.ahead.path import NONE, GivenRoute, Pose, corridor
+from edge_agent.ahead.path import NONE, GivenRoute, Pose, corridor, degrees
 from edge_agent.ahead.roads import ways_on
 from schemas import grid, mugrid
 from schemas.thresholds import GRAVITY, NS
@@ -46,6 +46,38 @@ def test_a_route_goes_on_where_the_car_is_and_is_none_for_who_left_it() -> None:
     assert len(path.distance) in (98, 99)
     assert route.ahead(further._replace(latitude=57.701), 500.0) is None
     assert route.ahead(further._replace(yaw=HOME.yaw + math.pi), 500.0) is None, "the other way is another road"
+
+
+@pytest.mark.parametrize("spacing", [1.0, 60.0])
+@pytest.mark.parametrize("turned", [0.0, 35.0, 70.0, 89.0])
+@pytest.mark.parametrize("ahead", [-12.0, 0.0, 12.0])
+def test_a_route_is_not_left_in_its_own_corner_by_who_turns_early_or_late(
+    ahead: float, turned: float, spacing: float
+) -> None:
+    """A right angle to the left, 120 m on."""
+    way = np.arange(0.0, 120.0 + spacing / 2, spacing)
+    x, y = np.concatenate([way, np.full(len(way) - 1, 120.0)]), np.concatenate([np.zeros(len(way)), way[1:]])
+    route = GivenRoute(*degrees(x, y, HOME))
+    at = (120.0 + min(ahead, 0.0), max(ahead, 0.0))
+    latitude, longitude = (float(value) for value in degrees(*map(np.asarray, at), HOME))
+    pose = HOME._replace(latitude=latitude, longitude=longitude, yaw=HOME.yaw + math.radians(turned))
+    path = route.ahead(pose, 500.0)
+    assert path is not None
+    assert len(path.distance) == pytest.approx(120.0 - ahead, abs=2.0)
+
+
+@pytest.mark.parametrize("turned", [0.0, 90.0, 180.0])
+def test_a_route_that_begins_here_is_not_left_by_how_the_car_stands(turned: float) -> None:
+    """A navigation system leaves out what has been driven: the next corner may be the beginning."""
+    path = GivenRoute(*line()).ahead(HOME._replace(yaw=HOME.yaw + math.radians(turned)), 300.0)
+    assert path is not None
+    assert len(path.distance) in (299, 300)
+
+
+def test_who_crosses_a_route_or_turns_off_where_it_goes_on_has_left_it() -> None:
+    latitude, longitude = line()
+    further = HOME._replace(latitude=float(latitude[300]), longitude=float(longitude[300]))
+    assert GivenRoute(*line()).ahead(further._replace(yaw=HOME.yaw + math.pi / 2), 500.0) is None
 
 
 def test_a_loop_that_is_driven_twice_is_not_jumped_ahead_in() -> None:
