@@ -58,9 +58,9 @@ def test_a_route_is_not_left_in_its_own_corner_by_who_turns_early_or_late(
     way = np.arange(0.0, 120.0 + spacing / 2, spacing)
     x, y = np.concatenate([way, np.full(len(way) - 1, 120.0)]), np.concatenate([np.zeros(len(way)), way[1:]])
     route = GivenRoute(*degrees(x, y, HOME))
-    at = (120.0 + min(ahead, 0.0), max(ahead, 0.0))
-    latitude, longitude = (float(value) for value in degrees(*map(np.asarray, at), HOME))
-    pose = HOME._replace(latitude=latitude, longitude=longitude, yaw=HOME.yaw + math.radians(turned))
+    latitude, longitude = degrees(np.array([120.0 + min(ahead, 0.0)]), np.array([max(ahead, 0.0)]), HOME)
+    yaw = HOME.yaw + math.radians(turned)
+    pose = HOME._replace(latitude=float(latitude[0]), longitude=float(longitude[0]), yaw=yaw)
     path = route.ahead(pose, 500.0)
     assert path is not None
     assert len(path.distance) == pytest.approx(120.0 - ahead, abs=2.0)
