@@ -328,6 +328,7 @@ def test_hostile_tiles_are_refused_and_counted_and_the_car_hears_of_ice_all_the_
             until(lambda said=said: liar.said > said)  # type: ignore[misc]
         until(lambda: car.lookout.counts.values()["heard_refused"] >= every - 1)
         assert not car.lookout.counts.heard("cells")
+        car.until(lambda seen: seen.time < time.time_ns() + NS)  # at an hour from now an alert of now is forgotten
         liar.put(alert(int(ICE[0]), time=time.time_ns()))
         assert car.next().state == "raised"
         assert not car.lookout.counts.failures
