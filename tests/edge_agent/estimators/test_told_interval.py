@@ -84,7 +84,7 @@ def test_a_long_upper_tail_is_not_cut_off() -> None:
 
 
 @pytest.mark.parametrize("mu", [0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4])
-def test_slippery_for_sure_is_said_at_99_percent_only(mu: float) -> None:
+def test_slippery_for_sure_is_said_at_its_own_level_only(mu: float) -> None:
     weight = about(mu, 0.08)
     _, _, upper = told(weight)
     assert (upper < SLIPPERY_MU) == (quantile(DESIGN.mu, DESIGN.prior, weight, SURE_END) < SLIPPERY_MU)
