@@ -27,7 +27,7 @@ DRAWN_IN = 0.085  # [1] most by which the upper end comes nearer: a belief that 
 # How much nearer it comes in a car that is as its file says, by level and at the most: what else is wrong of it is
 # small as well. On level drives one truth in eighty had lain above. The lower end stays: safe deceleration rests on it.
 NEARER, DRAWN_NEARER = 0.15, 0.15
-# Ice ends without a sign: of what .95 called slippery for sure in three towns .08 lay just beyond it, now .05 (.04 in others)
+# Ice ends without a sign: of what .95 called slippery for sure in three towns .08 lay beyond it, now .05; .04 in others
 SURE_END = 0.995
 
 
