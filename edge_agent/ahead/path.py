@@ -122,24 +122,23 @@ class GivenRoute:
         """The way on along the route; None when the car has left it."""
         x, y = plane(self._latitude, self._longitude, pose)
         line = np.column_stack([x, y])
-        place = self._match(line, pose)
+        run = _run(line)
+        place = self._match(line, run, pose)
         if place is None:
             return None
-        run = _run(line)
         self._metre = place
         rest = run > place
         here = [np.interp(place, run, x), np.interp(place, run, y)]
         ahead = np.concatenate([[here], line[rest]])
         return along("route", ahead, pose, length) if len(ahead) > 1 else None
 
-    def _match(self, line: FloatArray, pose: Pose) -> float | None:
+    def _match(self, line: FloatArray, run: FloatArray, pose: Pose) -> float | None:
         """Metre of the route at which the car is: the next one on from the last, heading the same way."""
         step, start = np.diff(line, axis=0), line[:-1]
         size = np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)
         share = np.clip(-(start * step).sum(axis=1) / size**2, 0.0, 1.0)
         off = np.hypot(*(start + share[:, None] * step).T)
         turned = np.abs((np.arctan2(step[:, 1], step[:, 0]) - pose.yaw + np.pi) % (2 * np.pi) - np.pi)
-        run = _run(line)
         at, fits = run[:-1] + share * size, off <= OFF_ROUTE_M
         for k in np.flatnonzero(fits & (turned > ASTRAY)).tolist():
             first, last = np.searchsorted(run, [at[k] - CORNER_M, at[k] + CORNER_M])

@@ -112,9 +112,8 @@ def stop_on_signal() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
-# Set when a session or a source hangs, on a frozen router, say: it would keep the interpreter from ending, or abort the
-# process when it comes back to an interpreter that has ended. So the command line ends the process itself, once the
-# command has closed its files and its exit code is known.
+# Set when a session or a source hangs, on a frozen router, say: what its library does at the exit may wait for it. So
+# the command line ends the process itself, once the command has closed its files and its exit code is known.
 left_behind = threading.Event()
 
 

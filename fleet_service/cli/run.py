@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import faulthandler
 import gc
 import os
 import sys
@@ -122,6 +123,7 @@ def _leave_at_last(
     stop.wait()
     if not stopped.wait(LEAVE_AT_LAST_S):
         log_line("left at last: a session or a job did not end in time")
+        faulthandler.dump_traceback()  # which one, and where
         if service.failure is not None:
             traceback.print_exception(service.failure)
         code = service.exit_code

@@ -110,7 +110,7 @@ class Feed(ABC):
 
     @property
     def listening(self) -> bool:
-        """Whether its thread runs: after `close`, one that hangs, beside which the interpreter must not end."""
+        """Whether its thread runs: after `close`, one that hangs, which its library may wait for at the exit."""
         return self._thread.is_alive()
 
     def hear(self, stamp_ns: int, what: object) -> None:
