@@ -114,7 +114,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if args.stay:
             print(f"\n{address} stays until Ctrl-C; the truth can be laid over it.", flush=True)
             stop_on_signals().wait()
-    return 0 if all(figure.holds for figure in found if figure.name != compare.DELAY) else 1
+    return 0 if compare.works(found) else 1
 
 
 if __name__ == "__main__":

@@ -150,3 +150,14 @@ def test_who_was_warned_and_lost_grip_on_the_new_ice_is_counted_by_passes_told_a
     assert [row["name"] for row in json.loads((tmp_path / "figures.json").read_text())[1:]] == list(shares)
     picture.draw(found, tmp_path / "without.png")
     assert (tmp_path / "map.png").read_bytes() != (tmp_path / "without.png").read_bytes()
+
+
+@pytest.mark.parametrize(("name", "value", "works"), [
+    (compare.COVERAGE, 0.95, True), (compare.COVERAGE, 0.995, True), (compare.COVERAGE, 0.79, False),
+    (compare.COVERAGE, float("nan"), False), (compare.DELAY, 6, True), ("demo.observations.duplicates", 1, False),
+])  # fmt: skip
+def test_a_demo_fails_by_what_breaks_a_promise(name: str, value: float, works: bool) -> None:
+    among = Figure(name, value, "", 0)
+    if name == compare.COVERAGE:
+        among = Figure(name, value, "", (0.8, compare.WIDEST), "within")
+    assert compare.works([Figure("demo.vehicles", 36, "", 30, "more"), among]) == works
