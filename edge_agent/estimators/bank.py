@@ -25,8 +25,8 @@ Kernel: TypeAlias = Callable[..., None]
 """kernel(filters, contexts, t, signals, outputs, part), or with visits = (closes, evidence) before part.
 
 Takes t (T, N) and signals (T, N, 18) of the vehicles of `part`, changes their filters (N,), writes outputs (T, N, …)
-indexed by Column and, where closes (T, N) says so, evidence (T, N, 32); closes (0, N) is nowhere. A context holds the
-tables that all filters read, and arrays that a step writes before it reads them.
+indexed by Column and, where closes (T, N) says so and where friction jumps within a visit, evidence (T, N, 32); closes
+(0, N) is nowhere. A context holds the tables that all filters read, and arrays that a step writes before it reads them.
 """
 
 
@@ -60,7 +60,7 @@ class EstimatorBank:
             threads: how many share the vehicles among them; changes no bit of the result.
 
         Returns:
-            Estimates at the same samples; none of them is NaN, except evidence away from closes.
+            Estimates at the same samples; none of them is NaN, except evidence away from closes and jumps.
 
         Raises:
             InputError: shapes do not agree with the bank, or threads is below 1.
@@ -76,12 +76,12 @@ class EstimatorBank:
             self._entered(self._filters, self._contexts, t, signals, values, *visits, (0, 0, count))
             if self._entered is self._kernel:
                 self._entered = entry_point(self._kernel)  # `checked` sees to it that all arguments are of one kind
-            return Estimates(values, evidence)
+            return _estimates(values, evidence, closes)
         if threads > len(self._contexts):
             self._contexts = np.repeat(self._contexts[:1], threads)
         whole = (self._filters, self._contexts, t, signals, values, *visits)
         in_shares(lambda share, first, last: self._kernel(*whole, (share, first, last)), count, threads)
-        return Estimates(values, evidence)
+        return _estimates(values, evidence, closes)
 
     def beliefs(self) -> tuple[FloatArray, FloatArray] | None:
         """What is believed now: log(posterior/uniform), and the evidence in the visit so far; (N, 32) each, maximum 0.
@@ -93,3 +93,9 @@ class EstimatorBank:
         own, visit = np.zeros((2, len(self._filters), BINS))
         self._beliefs(self._filters, self._contexts, own, visit)
         return own, visit
+
+
+def _estimates(values: FloatArray, evidence: FloatArray | None, closes: BoolArray | None) -> Estimates:
+    if evidence is None or closes is None:
+        return Estimates(values)
+    return Estimates(values, evidence, np.isfinite(evidence[..., 0]) & ~np.asarray(closes, np.bool_))

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.numeric import FloatArray
+from schemas.numeric import BoolArray, FloatArray
 
 FlagArray: TypeAlias = NDArray[np.int64]
 
@@ -56,7 +56,7 @@ def _column(place: Column) -> Any:  # noqa: ANN401 the annotation beside it says
 class Estimates:
     """What a bank reports of T samples of N vehicles; columns are arrays of shape (T, N), documented in `Column`."""
 
-    __slots__ = ("evidence", "values")
+    __slots__ = ("evidence", "jumps", "values")
 
     vx: FloatArray = _column(Column.VX)
     vy: FloatArray = _column(Column.VY)
@@ -74,9 +74,12 @@ class Estimates:
     adaptation: FloatArray = _column(Column.ADAPTATION)
     innovation_log_likelihood: FloatArray = _column(Column.INNOVATION_LOG_LIKELIHOOD)
 
-    def __init__(self, values: FloatArray, evidence: FloatArray | None = None) -> None:
+    def __init__(self, values: FloatArray, evidence: FloatArray | None = None, jumps: BoolArray | None = None) -> None:
         self.values = values  # (T, N, ONE_FRICTION or FOUR_FRICTIONS) indexed by Column
-        self.evidence = evidence  # (T, N, 32) at closes, else NaN: log-likelihood of the visit on the friction grid
+        # (T, N, 32) log-likelihood on the friction grid: at closes of the visit's last part, at jumps of the part that
+        # ends there, else NaN
+        self.evidence = evidence
+        self.jumps = jumps  # (T, N) where the friction has become another within a visit
 
     @property
     def health(self) -> FlagArray:

@@ -62,13 +62,14 @@ class Located(NamedTuple):
     """Per sample, shape (T, N).
 
     closes: True at the first sample of a new visit, or of being nowhere.
-    inside: True where a fix of this very sample lies in the visited cell.
+    inside, outside: True where a fix of this very sample lies in the visited cell, or beside it.
     cell, sector: quadint z21 and heading sector, -1 when nowhere.
     latitude, longitude [deg], yaw [rad]: as last received, NaN when too old.
     """
 
     closes: BoolArray
     inside: BoolArray
+    outside: BoolArray
     cell: IntArray
     sector: IntArray
     latitude: FloatArray
@@ -103,7 +104,8 @@ def locate(
         after["fix_time"] = np.nan
     shape = t.shape
     located = Located(
-        np.zeros(shape, np.bool_), np.zeros(shape, np.bool_), np.full(shape, NOWHERE), np.full(shape, NOWHERE),
+        np.zeros(shape, np.bool_), np.zeros(shape, np.bool_), np.zeros(shape, np.bool_),
+        np.full(shape, NOWHERE), np.full(shape, NOWHERE),
         np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan),
     )  # fmt: skip
     _follow(t, _fixes(signals), after, located)
@@ -189,4 +191,5 @@ def _follow(t: FloatArray, fixes: Records[ReceiverSample], tracks: Records[CellT
                 _begin(track, fix, heading)
                 located.closes[k, n] = True
             located.inside[k, n] = fix.cell != NOWHERE and fix.cell == track.cell
+            located.outside[k, n] = fix.cell != NOWHERE and fix.cell != track.cell
             located.cell[k, n], located.sector[k, n] = track.cell, track.sector

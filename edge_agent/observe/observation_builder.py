@@ -8,7 +8,7 @@ same records in the same order. Pure.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,11 @@ WINDOW_NS: Final = int(UTILISED_WINDOW_S * NS)
 WHEEL_SHARE: Final = 1.3
 DRIVEN_SHARE: Final = 1.5
 FELT_STD: Final = 0.03
+FELT_S: Final = 0.06  # smoothing of the accelerometers: their largest reading would be noise
+# What was felt belongs to the cell so near a fix in it, and once as much of it is behind as a fix may be wrong: of ice
+# that was left or entered by dry road a sixth of the visits told a grip that the dry road had given.
+NEAR_FIX_M: Final = 3.0
+EXCLUDED_NATS: Final = -3.0  # what is less likely by so much was not the friction of a part that has ended
 
 
 class RecordBlock(NamedTuple):
@@ -58,6 +63,14 @@ class Visit:
     speed_sum: float  # [m/s] over the samples
     mu_utilised: float  # largest, once the window holds nothing of the cell before
     felt: float  # most that a wheel may have used, by the accelerometers in the cell alone
+    ax: float  # smoothed, of this visit and those before [m/s²]
+    ay: float
+    travelled: float  # in the visit [m]
+    from_fix: float  # since the last fix in the cell [m]; infinite after one outside
+    part_time: int  # at which its last part began: the friction was another before [ns]
+    parts: int  # that ended before
+    earlier: Annotated[FloatArray, mugrid.BINS]  # log-likelihood of these, the larger of each: it was one or the other
+    earlier_used: float  # least that was used in one of them
     driving: float  # squared accelerations of all samples, by direction [m²/s⁴]
     braking: float
     left: float
@@ -76,8 +89,7 @@ class Sample:
     health: int
     speed: float  # [m/s]
     mu_utilised: float
-    felt: float
-    ax: float  # as measured; 0 where it is not [m/s²]
+    ax: float  # as measured; NaN where it is not [m/s²]
     ay: float
     mu: float
     mu_lower: float
@@ -109,8 +121,26 @@ def observe(
     """
     after = OpenVisits(before.visits.copy(), before.slot.copy())
     ended = records(Visit, int(np.count_nonzero(located.closes)))
-    ended = ended[: _visit(time, located, _samples(estimates, signals), after.visits, ended)]
+    jumps = _jumps(estimates)
+    count = _visit(time, located, _samples(estimates, signals), jumps, after.visits, ended, config.position_std)
+    ended = ended[:count]
     return after, _observations(ended, estimates.evidence, config), _states(after, time, located, estimates, config)
+
+
+class Jumps(NamedTuple):
+    """Where the friction became another within a visit (T, N), and what its part before told: row of (k, 32) each."""
+
+    row: IntArray  # -1: nowhere
+    told: FloatArray
+
+
+def _jumps(estimates: Estimates) -> Jumps:
+    row = np.full(estimates.mu.shape, -1)
+    if estimates.jumps is None or estimates.evidence is None:
+        return Jumps(row, np.zeros((0, mugrid.BINS)))
+    told = estimates.evidence[estimates.jumps]
+    row[estimates.jumps] = np.arange(len(told))
+    return Jumps(row, told)
 
 
 def _samples(estimates: Estimates, signals: FloatArray | None) -> RecordArray:
@@ -119,19 +149,16 @@ def _samples(estimates: Estimates, signals: FloatArray | None) -> RecordArray:
     samples["speed"] = np.hypot(estimates.vx, estimates.vy)
     for name in ("health", "mu_utilised", "mu", "mu_lower", "mu_upper"):
         samples[name] = getattr(estimates, name)
-    samples["felt"] = np.inf
-    if signals is not None:
-        ax, ay = signals[..., S.AX], signals[..., S.AY]
-        felt = WHEEL_SHARE * np.hypot(np.where(ax > 0.0, DRIVEN_SHARE, 1.0) * ax, ay) / GRAVITY + FELT_STD
-        samples["felt"] = np.where(np.isnan(felt), np.inf, felt)
-        samples["ax"], samples["ay"] = np.nan_to_num(ax), np.nan_to_num(ay)
+    for name, channel in (("ax", S.AX), ("ay", S.AY)):
+        samples[name] = np.nan if signals is None else signals[..., channel]
     return samples
 
 
 @compiled
 def _visit(
-    time: IntArray, located: Located, samples: Records[Sample], visits: Records[Visit], ended: Records[Visit]
-) -> int:
+    time: IntArray, located: Located, samples: Records[Sample], jumps: Jumps, visits: Records[Visit],
+    ended: Records[Visit], position_std: float,
+) -> int:  # fmt: skip
     """Sequential core: add each sample to its visit, write out a visit when the next begins; returns how many."""
     count = 0
     for k in range(time.shape[0]):
@@ -144,10 +171,16 @@ def _visit(
                     count += 1
                 _begin(visit, time[k, n], located.cell[k, n], located.sector[k, n])
             if visit.cell != NOWHERE:
-                _add(visit, time[k, n], samples[k, n])
+                if located.inside[k, n]:
+                    visit.from_fix = 0.0
+                elif located.outside[k, n]:
+                    visit.from_fix = np.inf
+                _add(visit, time[k, n], samples[k, n], position_std)
                 if located.inside[k, n]:
                     visit.latitude, visit.longitude = located.latitude[k, n], located.longitude[k, n]
                     visit.yaw = located.yaw[k, n]
+                if jumps.row[k, n] >= 0:
+                    _begin_part(visit, time[k, n], jumps.told[jumps.row[k, n]])
     return count
 
 
@@ -155,25 +188,59 @@ def _visit(
 def _begin(visit: Visit, time: int, cell: int, sector: int) -> None:
     """A record becomes a visit without a sample."""
     visit.enter_time, visit.cell, visit.sector, visit.samples, visit.health = time, cell, sector, 0, 0
-    visit.driving, visit.braking, visit.left, visit.right, visit.felt = 0.0, 0.0, 0.0, 0.0, 0.0
+    visit.driving, visit.braking, visit.left, visit.right, visit.felt = 0.0, 0.0, 0.0, 0.0, np.inf
     visit.speed_sum, visit.latitude, visit.longitude, visit.yaw = 0.0, 0.0, 0.0, 0.0
+    visit.travelled, visit.from_fix = 0.0, 0.0
+    visit.part_time, visit.parts, visit.earlier_used = time, 0, np.inf
 
 
 @compiled
-def _add(visit: Visit, time: int, sample: Sample) -> None:
+def _begin_part(visit: Visit, time: int, told: FloatArray) -> None:
+    """The friction has become another: what was used before counts as far as the part that ends did not exclude it."""
+    most = mugrid.UPPER
+    for i in range(mugrid.BINS - 1, -1, -1):
+        if told[i] >= EXCLUDED_NATS:
+            most = mugrid.CENTRES[i]
+            break
+    visit.earlier_used = min(visit.earlier_used, visit.mu_utilised, visit.felt, most)
+    for i in range(mugrid.BINS):
+        visit.earlier[i] = told[i] if visit.parts == 0 else max(visit.earlier[i], told[i])
+    visit.parts += 1
+    visit.part_time, visit.mu_utilised, visit.felt = time, 0.0, np.inf
+
+
+@compiled
+def _add(visit: Visit, time: int, sample: Sample, position_std: float) -> None:
     """One more sample of a visit."""
+    _feel(visit, (time - visit.leave_time) / NS, sample, position_std)
     visit.leave_time = time
     visit.samples += 1
     visit.health |= sample.health
     visit.speed_sum += sample.speed
-    visit.driving += max(sample.ax, 0.0) ** 2
-    visit.braking += max(-sample.ax, 0.0) ** 2
-    visit.left += max(sample.ay, 0.0) ** 2
-    visit.right += max(-sample.ay, 0.0) ** 2
-    visit.felt = max(visit.felt, sample.felt)
-    grown = visit.leave_time - visit.enter_time > WINDOW_NS
+    if np.isfinite(sample.ax + sample.ay):
+        visit.driving += max(sample.ax, 0.0) ** 2
+        visit.braking += max(-sample.ax, 0.0) ** 2
+        visit.left += max(sample.ay, 0.0) ** 2
+        visit.right += max(-sample.ay, 0.0) ** 2
+    grown = visit.leave_time - visit.part_time > WINDOW_NS
     visit.mu_utilised = max(visit.mu_utilised, sample.mu_utilised) if grown else sample.mu_utilised
     visit.mu, visit.mu_lower, visit.mu_upper = sample.mu, sample.mu_lower, sample.mu_upper
+
+
+@compiled
+def _feel(visit: Visit, dt: float, sample: Sample, position_std: float) -> None:
+    """What the accelerometers feel `dt` [s] after the sample before; a visit without them rules nothing out."""
+    if np.isfinite(sample.ax + sample.ay):
+        share = 1.0 - np.exp(-dt / FELT_S)
+        visit.ax += share * (sample.ax - visit.ax)
+        visit.ay += share * (sample.ay - visit.ay)
+        felt = 0.0 if np.isinf(visit.felt) else visit.felt
+        if visit.travelled >= position_std and visit.from_fix <= NEAR_FIX_M:
+            along = (DRIVEN_SHARE if visit.ax > 0.0 else 1.0) * visit.ax
+            felt = max(felt, WHEEL_SHARE * np.hypot(along, visit.ay) / GRAVITY + FELT_STD)
+        visit.felt = felt
+    visit.travelled += sample.speed * dt
+    visit.from_fix += sample.speed * dt
 
 
 def _typed(kind: Kind, columns: dict[str, NDArray[np.generic]]) -> Columns:
@@ -187,17 +254,23 @@ def _directions(ended: RecordArray) -> dict[str, FloatArray]:
     """
     along, across = ended["driving"] + ended["braking"], ended["left"] + ended["right"]
     whole = np.where(along + across > 0.0, along + across, np.nan)
-    used = np.minimum(ended["mu_utilised"], ended["felt"])
+    used = _used(ended)
     return {
         "used_longitudinal": used * np.sqrt(along / whole) * np.where(ended["driving"] >= ended["braking"], 1.0, -1.0),
         "used_lateral": used * np.sqrt(across / whole) * np.where(ended["left"] >= ended["right"], 1.0, -1.0),
     }
 
 
+def _used(ended: RecordArray) -> FloatArray:
+    """Grip used in visits (n,): the window may hold the cell before; where friction jumped, that of the least part."""
+    last = np.minimum(ended["mu_utilised"], ended["felt"])
+    return np.asarray(np.minimum(last, ended["earlier_used"]))
+
+
 def _observations(ended: RecordArray, evidence: FloatArray | None, config: AgentConfig) -> RecordBlock:
     n = len(ended)
     mu, upper = ended["mu"], ended["mu_upper"]
-    used = np.minimum(ended["mu_utilised"], ended["felt"])  # the window may hold the cell before
+    used = _used(ended)
     carried = ("enter_time", "leave_time", "cell", "sector", "latitude", "longitude", "yaw", "health")
     columns: dict[str, NDArray[np.generic]] = {
         **{name: ended[name] for name in (*carried, "mu", "mu_lower", "mu_upper")},
@@ -205,7 +278,7 @@ def _observations(ended: RecordArray, evidence: FloatArray | None, config: Agent
         "position_std": np.full(n, config.position_std),
         "yaw_std": np.full(n, config.yaw_std),
         "speed": ended["speed_sum"] / np.maximum(ended["samples"], 1),
-        "log_likelihood": _likelihood(ended["sample"], ended["vehicle"], evidence),
+        "log_likelihood": _likelihood(ended, evidence),
         "tyre_season": np.full(n, config.tyre_season),
         "air_temperature": np.full(n, np.nan),
         "abs_active": np.full(n, ABS_UNKNOWN),
@@ -216,14 +289,17 @@ def _observations(ended: RecordArray, evidence: FloatArray | None, config: Agent
     return RecordBlock(Kind.OBSERVATION, _typed(Kind.OBSERVATION, columns), ended["vehicle"].copy(), urgent)
 
 
-def _likelihood(sample: IntArray, vehicle: IntArray, evidence: FloatArray | None) -> NDArray[np.uint8]:
-    """Bytes (n, 32) of visits that ended there; (n, 0) of a bank without evidence.
+def _likelihood(ended: RecordArray, evidence: FloatArray | None) -> NDArray[np.uint8]:
+    """Bytes (n, 32) of visits; (n, 0) of a bank without evidence.
 
-    A visit that the bank did not follow from its start is flat.
+    A visit that the bank did not follow from its start is flat. Where the friction jumped in the cell it was one or the
+    other, and the larger likelihood counts.
     """
     if evidence is None:
-        return np.zeros((len(sample), 0), dtype=np.uint8)
-    reported = evidence[sample, vehicle]
+        return np.zeros((len(ended), 0), dtype=np.uint8)
+    reported = evidence[ended["sample"], ended["vehicle"]]
+    several = ended["parts"] > 0
+    reported[several] = np.maximum(reported[several], ended["earlier"][several])
     known = np.isfinite(reported).all(axis=-1, keepdims=True)
     return mugrid.encode_log_likelihood(np.where(known, reported, 0.0))
 

@@ -25,6 +25,9 @@ CONTAMINATION_LEAST: Final = 0.04
 BIAS_MOST: Final = 0.15
 BIAS_KNOWN_LEAST: Final = 0.03  # ... nor to be known better: tyres warm up and wear, loads change
 FLEET_BIAS: Final = 0.06  # standard deviation of the fleet's biases, before anybody was met
+# ... of those of one kind of tyres against others: on wet and cold road summer and winter tyres differ by a tenth.
+TYRE_BIAS: Final = 0.05
+TYRE_SLOPE_STD: Final = 0.15  # ... and of its slope about the fleet's: blocks and sipes make a tread softer
 
 # An error that all vehicles of a place share (the same manoeuvre, the same tyre model, the same ruts) does not average
 # out however many they are; see `shared`. Without a value:
@@ -32,6 +35,10 @@ COMMON_RELATIVE: Final = 0.04
 # ... and what does not grow with the grip: crossfall (a road has 2.5 %), slope that no filter knows, drag that is
 # taken for a tyre's force. Of cells on ice (μ ≤ .2) of five tuning ways the intervals held .80 with .01, .86 with .02.
 COMMON_ABSOLUTE: Final = 0.02
+# ... of what reads high, which is more: of ice a seventh of the visits tell a grip that lay beside it, in the same cell
+# or the one before. Of towns with the errors of four tuning ways the intervals held .78 of the ice with .02 for both,
+# .81 with this, and no less of anything else.
+COMMON_HIGH: Final = 0.025
 # ... with values: what every manoeuvre shares, and what one kind of it does.
 COMMON_ALWAYS: Final = 0.02
 COMMON_MANOEUVRE: Final = 0.05
@@ -40,6 +47,9 @@ SHARED_SHARE: Final = 0.8
 # More for it costs: with a slope of .5 the interval score of three rough ways after twenty minutes was .63 and not .55.
 SHARED_SLOPE: Final = 0.25
 SHARED_MOST: Final = 0.2
+# ... and where the slope of the fleet's values has been found (SLOPE_KNOWN), what is left of the doubt: one slope
+# is not right for every tyre and surface.
+SHARED_KNOWN_SLOPE: Final = 0.1
 # ... but who raises an alarm bears more doubt: with the map's own slope 3 fleets of 12 that took a wet curve gently, on
 # winter tyres, made a false alert, with this none. The most of it decides how much ice stays without an alert in a
 # clean fleet (of cell-minutes, three towns): none with .23, where 1 fleet of 12 was false; .02 with .26; .06 with .35.
@@ -151,6 +161,7 @@ TRUST_FULL: Final = 0.9
 # relative variance (a standard deviation of 17 %) tell: others have the tyre's shape in what they state.
 SHAPED_VARIANCE: Final = 0.03
 USED_NOISE: Final = 0.04  # of the grip used, relative: as much less of its differences' squares is real
+USED_NOISE_ABSOLUTE: Final = 0.02  # ... and what an accelerometer adds on any road: .2 m/s²
 SLOPE_MEMORY: Final = 300.0  # squares by weight beyond which old ones count half: some two hundred comparisons
 SLOPE_PRIOR: Final = 0.0
 SLOPE_STD: Final = 0.15  # so sure is that: as some twenty comparisons

@@ -16,10 +16,10 @@ from fleet_service.fusion.belief import SLIPPERY_SHARE, unpack
 from fleet_service.fusion.late import LATE_MOST_NS, delayed, fused_at
 from fleet_service.fusion.neighbours import beliefs
 from fleet_service.fusion.observations import Observations, SmallArray
-from fleet_service.fusion.shared import ALARM_KERNELS, KERNELS, kernel_of, shared_parts
+from fleet_service.fusion.shared import ALARM_KERNELS, KERNELS, KNOWN_KERNELS, kernel_of, shared_parts
 from fleet_service.fusion.standing import ERRORS, UNKNOWN, Standing, classes, first_standing, unknown
 from fleet_service.fusion.store.cells import Cells
-from fleet_service.fusion.store.records import ICE, NOBODY, NONE, USED, Rows
+from fleet_service.fusion.store.records import ICE, LATE, NOBODY, NONE, USED, Rows
 from fleet_service.fusion.store.store import Store, distinct
 from fleet_service.fusion.trust import initial_trust, judged, slope_std
 from fleet_service.fusion.weather import Reports, Weather, no_reports, weather_of
@@ -155,7 +155,7 @@ class Fusion:
             rows = np.flatnonzero((epoch == e) & ~left)
             if before is None:
                 standing = self._standing(e)
-                used[rows], error[rows] = standing.weights(vehicle[rows]), standing.errors(vehicle[rows])
+                used[rows], error[rows] = standing.weights(vehicle[rows]), standing.errors(vehicle[rows], o.tyre[rows])
             else:
                 used[rows], error[rows] = before.weight[rows], before.error[rows]
             arrivals = _arrivals(o, vehicle, used, error, old)
@@ -186,11 +186,11 @@ class Fusion:
     def beliefs(self, slots: IntArray, now: int) -> FloatArray:
         """Belief of each slot about its road, (k, 32), with what time did to it until `now` [ns], and with what
         slippery neighbours tell of it."""
-        return self._read(KERNELS, slots, np.full(len(slots), now))
+        return self._read(self._kernels(), slots, np.full(len(slots), now))
 
     def believed(self, slots: IntArray) -> FloatArray:
         """Belief of each slot about its road, (k, 32), at its last observation."""
-        return self._read(KERNELS, slots, self.live.time[slots])
+        return self._read(self._kernels(), slots, self.live.time[slots])
 
     def slippery(self, slots: IntArray) -> FloatArray:
         """P(slippery) of each slot's road at its last observation by its own reports alone, (k,)."""
@@ -202,12 +202,20 @@ class Fusion:
         Where the slope of the fleet's values is known, and KNOWN_SOURCES vehicles with a record told of ice within the
         hour, there is no more doubt than the map has.
         """
-        if not len(slots) or slope_std(self.store.peers, self.standings[-1]) > c.SLOPE_KNOWN:
+        if not len(slots) or not self._shape_known:
             return self._read(ALARM_KERNELS, slots, self.live.time[slots])
         hour = self.live.time[slots] - int(c.VOTE_RENEWAL_S * NS)
         known = self.sources(slots, ICE, hour, least=c.TELLING_TRUST)[0] >= c.KNOWN_SOURCES
         doubtful = self._read(ALARM_KERNELS, slots, self.live.time[slots])
         return np.where(known[:, None], self.believed(slots), doubtful)
+
+    @property
+    def _shape_known(self) -> bool:
+        """Whether the slope of the fleet's values has been found."""
+        return slope_std(self.store.peers, self.standings[-1]) <= c.SLOPE_KNOWN
+
+    def _kernels(self) -> Float32Array:
+        return KNOWN_KERNELS if self._shape_known else KERNELS
 
     def _read(self, kernels: Float32Array, slots: IntArray, now: IntArray) -> FloatArray:
         return beliefs(self.store.state.live, self.store.table, self._weather, kernels, slots, now)
@@ -222,7 +230,9 @@ class Fusion:
 
     def error(self, vehicle: int) -> dict[str, float]:
         """What is known of a vehicle's own error, see `standing`."""
-        return dict(zip(ERRORS, self.standings[-1].errors(self._index(vehicle))[0].tolist(), strict=True))
+        index = self._index(vehicle)
+        tyre = np.append(self.store.peers["tyre"][: self.store.vehicles], 0)[index]
+        return dict(zip(ERRORS, self.standings[-1].errors(index, tyre)[0].tolist(), strict=True))
 
     def _index(self, vehicle: int) -> IntArray:
         index = self.store.known(np.array([vehicle]))
@@ -260,9 +270,8 @@ class Fusion:
             last = self.standings[-1]
             joined = store.vehicles - len(last.weight)
             weight = np.append(last.weight, np.full(joined, initial_trust(False), np.float32))
-            standing = judged(
-                store.peers, last._replace(weight=weight, error=last.errors(np.arange(store.vehicles))), self._epoch
-            )
+            error = last.errors(np.arange(store.vehicles), store.peers["tyre"][: store.vehicles])
+            standing = judged(store.peers, last._replace(weight=weight, error=error), self._epoch)
             self.standings = [self.standings[0], *self.standings[1:][-self._kept_epochs :], standing]
 
     def _absorb(
@@ -285,7 +294,8 @@ def _arrivals(
     return Arrivals(
         time=o.time, number=o.vehicle, boot=o.boot, sequence=o.sequence, vehicle=vehicle, weight=weight,
         evidence=o.evidence, reported=o.reported, used=(np.clip(o.used, 0.0, 2.5) * USED).astype(np.uint8),
-        shared=shared_parts(o.reported, error), manoeuvre=o.manoeuvre, error=classes(error), old=old,
+        shared=shared_parts(o.reported, error), manoeuvre=o.manoeuvre,
+        tyre=np.where(old, LATE, o.tyre).astype(np.int8), error=classes(error),
     )  # fmt: skip
 
 

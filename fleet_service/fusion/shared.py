@@ -5,10 +5,12 @@ the grip they used; by what else belongs to the manoeuvre. No number of them ave
 who uses more. So a belief is about what the *fleet* takes a road for, and whoever reads it gets the road:
 
     road_i = Σ_j K_ij·p_j,    K_ij ∝ exp(-½·((μ_j - μ_i)/(μ_i·σ±))²),    rows sum to 1
-    σ₋² = σ_c² + clip(SHARED_SLOPE·(SHARED_SHARE - ū/μ_i), 0, SHARED_MOST)²  where μ_j < μ_i,    σ₊ = σ_c  above
+    σ₋² = σ_c² + (COMMON_ABSOLUTE/μ_i)² + clip(slope·(SHARED_SHARE - ū/μ_i), 0, SHARED_MOST)²  where μ_j < μ_i
+    σ₊² = σ_c² + (COMMON_HIGH/μ_i)²  above
     σ_c² = COMMON_ALWAYS² + COMMON_MANOEUVRE²/n_eff + σ_s²·(a + (1 - a)/n_eff),    n_eff = (Σ w_k)²/Σ w_k²
 
-The error is one-sided, since only what reads low falls enough towards the upper end to be a value.
+The error of the shape is one-sided, since only what reads low falls enough towards the upper end to be a value. Its
+slope is SHARED_SLOPE; where the slope of the fleet's own values has been found (`standing`), SHARED_KNOWN_SLOPE.
 
 A sender states all of its error, and what of that does not show between senders that do the same is what they share:
 σ_s² = SHARED_PART·(1 - κ²)·stated², relative, of the cell's values by weight; a = SHARED_ALWAYS. Where values are
@@ -22,7 +24,7 @@ Legend
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,32 +66,46 @@ def shared_parts(reported: Float32Array, error: Float32Array) -> ByteArray:
     return np.asarray((np.clip(np.sqrt(hidden + stretched), 0.0, STATED[-1]) * SHARED).astype(np.uint8))
 
 
-def shared_kernel(used: float, kinds: float, stated: float, *, alarm: bool = False) -> FloatArray:
-    """K of the mean grip used, the number of kinds of manoeuvre and what is shared of what is stated, (32, 32); of an
-    `alarm` with more doubt about the shape of tyres."""
+class Doubt(NamedTuple):
+    """About the shape of tyres: σ₋ for each share of the grip that was left, and its most."""
+
+    slope: float
+    most: float
+
+
+UNKNOWN_SHAPE: Final = Doubt(c.SHARED_SLOPE, c.SHARED_MOST)
+KNOWN_SHAPE: Final = Doubt(c.SHARED_KNOWN_SLOPE, c.SHARED_MOST)  # where the fleet's own slope has been found
+ALARM_SHAPE: Final = Doubt(c.ALERT_SLOPE, c.ALERT_MOST)  # whoever raises an alarm bears more
+
+
+def shared_kernel(used: float, kinds: float, stated: float, doubt: Doubt = UNKNOWN_SHAPE) -> FloatArray:
+    """K of the mean grip used, the number of kinds of manoeuvre and what is shared of what is stated, (32, 32)."""
     centres = mugrid.CENTRES
     always = c.COMMON_ALWAYS**2 + c.COMMON_MANOEUVRE**2 / kinds
     always += stated**2 * (c.SHARED_ALWAYS + (1.0 - c.SHARED_ALWAYS) / kinds)
-    slope, most = (c.ALERT_SLOPE, c.ALERT_MOST) if alarm else (c.SHARED_SLOPE, c.SHARED_MOST)
-    shape = np.clip(slope * (c.SHARED_SHARE - used / centres), 0.0, most)
-    above = np.hypot(np.sqrt(always) * centres, c.COMMON_ABSOLUTE)
-    below = np.hypot(above, shape * centres)
-    away = centres[None, :] - centres[:, None]
-    kernel = np.exp(-0.5 * np.square(away / np.where(away < 0.0, below[:, None], above[:, None])))
-    return np.asarray(kernel / kernel.sum(axis=1, keepdims=True))
+    shape = np.clip(doubt.slope * (c.SHARED_SHARE - used / centres), 0.0, doubt.most)
+    relative = np.sqrt(always) * centres
+    low = np.hypot(np.hypot(relative, c.COMMON_ABSOLUTE), shape * centres)
+    return _two_sided(low, np.hypot(relative, c.COMMON_HIGH))
 
 
 def base_kernel() -> FloatArray:
     """K where nobody gave a value: what bounds have in common, (32, 32)."""
-    std = np.hypot(c.COMMON_RELATIVE * mugrid.CENTRES, c.COMMON_ABSOLUTE)[:, None]
-    kernel = np.exp(-0.5 * np.square((mugrid.CENTRES[None, :] - mugrid.CENTRES[:, None]) / std))
+    relative = c.COMMON_RELATIVE * mugrid.CENTRES
+    return _two_sided(np.hypot(relative, c.COMMON_ABSOLUTE), np.hypot(relative, c.COMMON_HIGH))
+
+
+def _two_sided(below: FloatArray, above: FloatArray) -> FloatArray:
+    """K of standard deviations (32,) of what reads low, and of what reads high."""
+    away = mugrid.CENTRES[None, :] - mugrid.CENTRES[:, None]
+    kernel = np.exp(-0.5 * np.square(away / np.where(away < 0.0, below[:, None], above[:, None])))
     return np.asarray(kernel / kernel.sum(axis=1, keepdims=True))
 
 
-def _table(*, alarm: bool = False) -> Float32Array:
+def _table(doubt: Doubt) -> Float32Array:
     """Kernels transposed, so that the bins of a road stand beside each other; `kernel_of` finds them, (…, 32, 32)."""
     rows = [
-        shared_kernel((row + 0.5) * USED_STEP, kinds, stated, alarm=alarm).T
+        shared_kernel((row + 0.5) * USED_STEP, kinds, stated, doubt).T
         for row in range(USED_ROWS)
         for kinds in KINDS
         for stated in STATED
@@ -97,8 +113,9 @@ def _table(*, alarm: bool = False) -> Float32Array:
     return np.stack([base_kernel().T, *rows]).astype(np.float32)
 
 
-KERNELS: Final = _table()  # handed to kernels: a global of this size is not kept in their cache
-ALARM_KERNELS: Final = _table(alarm=True)
+KERNELS: Final = _table(UNKNOWN_SHAPE)  # handed to kernels: a global of this size is not kept in their cache
+KNOWN_KERNELS: Final = _table(KNOWN_SHAPE)
+ALARM_KERNELS: Final = _table(ALARM_SHAPE)
 
 
 @refcount_free_inlined

@@ -21,6 +21,7 @@ BIAS_STEP: Final = 1.0 / 400.0  # of a bias in eight bits; a bin is 3 % of a dry
 BIAS_STDS: Final = (0.03, 0.04, c.BIAS_RELATIVE, 0.07, 0.1)  # relative; the next larger one is taken
 SPREADS: Final = (1.0, 1.25, 1.6, 2.0, 2.5, 3.2)  # the nearest one is taken
 SLOPE_STEP: Final = 0.01
+TYRES: Final = 4  # kinds: not told, summer, winter, all-season
 ERRORS: Final = ("bias", "bias_std", "spread", "slope")  # columns of an error, by name
 UNKNOWN: Final = (0.0, c.BIAS_RELATIVE, c.SPREAD_FIRST, c.SLOPE_PRIOR)  # b, σ_b, κ, λ of a vehicle that nobody met
 
@@ -32,8 +33,8 @@ class Standing(NamedTuple):
         epoch: from which it acts; -1: from the beginning.
         weight: r of each vehicle, (V,).
         error: b, σ_b, κ, λ of each, (V, 4).
-        newcomer: weight of a vehicle that is not among them.
-        newcomer_error: its error, (4,): that of the fleet, but for the bias.
+        initial: weight of a vehicle that is not among them.
+        initial_error: its error by the kind of its tyres, (TYRES, 4).
     """
 
     epoch: int
@@ -48,16 +49,15 @@ class Standing(NamedTuple):
         known = np.append(self.weight, np.float32(self.initial))
         return np.asarray(known[np.where(inside, vehicle, len(self.weight))])
 
-    def errors(self, vehicle: IntArray) -> Float32Array:
-        """Errors of vehicles (n,) by index, (n, 4)."""
-        inside = vehicle < len(self.error)
-        known = np.vstack([self.error, self.initial_error[None]])
-        return np.asarray(known[np.where(inside, vehicle, len(self.error))])
+    def errors(self, vehicle: IntArray, tyre: IntArray | NDArray[np.int8]) -> Float32Array:
+        """Errors of vehicles (n,) by index, with tyres of a kind (n,), (n, 4)."""
+        known = np.vstack([self.error, self.initial_error])
+        return np.asarray(known[np.where(vehicle < len(self.error), vehicle, len(self.error) + tyre.astype(np.int64))])
 
 
 def first_standing(initial: float) -> Standing:
     """That of a service that knows nobody."""
-    return Standing(-1, np.zeros(0, np.float32), unknown(0), initial, unknown(1)[0])
+    return Standing(-1, np.zeros(0, np.float32), unknown(0), initial, unknown(TYRES))
 
 
 def unknown(vehicles: int) -> Float32Array:

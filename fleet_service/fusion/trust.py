@@ -12,6 +12,10 @@ their spread: more than one, and they are surer than they should be; less, and t
 that they share (`shared`). And where who used more of the grip reads more, all read too low who used little: that slope
 is the fleet's, for one estimator and one kind of tyre have one shape.
 
+So errors have three levels: the fleet, the kind of tyres where it is told, the vehicle. A level that little is known of
+is drawn towards the one above: biases of a kind are a normal of TYRE_BIAS about the fleet's, its slope one of
+TYRE_SLOPE_STD about the fleet's. A vehicle that nobody met has the errors of its kind.
+
 Legend
     q    agreement of two values: 1 within PEERS_AGREE standard deviations, 0 from PEERS_DISAGREE on
     ā    mean q of a pair of vehicles over their last meetings
@@ -19,7 +23,7 @@ Legend
     g    share that agreed, (a₀ + Σ m·ā) / (n₀ + Σ m)
     T    trust, clip((g - TRUST_NONE) / (TRUST_FULL - TRUST_NONE), 0, 1)
     r    weight: T·min(g, 1 - CONTAMINATION_LEAST) / (1 - CONTAMINATION), T at the least known
-    b    bias, mean of d + b_other by weight 1/(σ_d²/n + σ_b_other²), and 1/FLEET_BIAS² of nought
+    b    bias, mean of d + b_other by weight 1/(σ_d²/n + σ_b_other²), and 1/FLEET_BIAS² of its kind's
 """
 
 from __future__ import annotations
@@ -30,10 +34,10 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.standing import Standing
-from fleet_service.fusion.store.records import NOBODY, USED
+from fleet_service.fusion.standing import TYRES, Standing
+from fleet_service.fusion.store.records import LATE, NOBODY, USED
 from schemas import mugrid
-from schemas.numeric import Float32Array
+from schemas.numeric import Float32Array, FloatArray
 from schemas.runtime.jit import compiled, refcount_free
 from schemas.runtime.records import RecordArray
 from schemas.thresholds import NS
@@ -43,8 +47,9 @@ _LEAST_VARIANCE: Final = 1e-4  # nobody reads to a hundredth
 
 class Comparison(NamedTuple):
     """A comparison: agreement, relative differences of the values and of the grip used, variance that both state of the
-    first; 0 where the values are not of one road; whether both did the same, and whether both are so sure of themselves
-    that the shape of their tyres is not in what they state."""
+    first; 0 where the values are not of one road; whether both did the same, and whether both have tyres of one kind
+    and are so sure of themselves that the shape of these is not in what they state; variance of the noise of the grip
+    used, relative."""
 
     agreement: float
     difference: float
@@ -52,6 +57,7 @@ class Comparison(NamedTuple):
     variance: float
     alike: bool
     shaped: bool
+    noise: float
 
 
 @refcount_free
@@ -64,9 +70,10 @@ def compare(
     nobody.
     """
     here = reporters[row]
-    if entries[entry].share < c.HERE_SHARE or entries[entry].old:
+    if entries[entry].share < c.HERE_SHARE or entries[entry].tyre == LATE:
         return
     vehicle, now = int(entries[entry].vehicle), entries[entry].time // NS
+    peers[vehicle].tyre = entries[entry].tyre
     mean, std = float(entries[entry].mean), float(entries[entry].std)
     used, manoeuvre = entries[entry].used / USED, int(entries[entry].manoeuvre)
     own = _own_variance(mean, std) if entries[entry].weight >= c.TELLING_TRUST else 0.0
@@ -91,11 +98,12 @@ def compare(
         both = 0.5 * (mean + here.mean[k])
         variance = own + here.own[k] if own > 0.0 and here.own[k] > 0.0 and agreement > 0.0 else 0.0
         alike = manoeuvre == here.manoeuvre[k] and abs(used - here.used[k]) < c.ALIKE_USED * both
-        shaped = max(own, here.own[k]) < c.SHAPED_VARIANCE
+        shaped = max(own, here.own[k]) < c.SHAPED_VARIANCE and peers[vehicle].tyre == peers[other].tyre
+        noise = c.USED_NOISE**2 + (c.USED_NOISE_ABSOLUTE / both) ** 2
         found = Comparison(
-            agreement, (mean - here.mean[k]) / both, (used - here.used[k]) / both, variance, alike, shaped
+            agreement, (mean - here.mean[k]) / both, (used - here.used[k]) / both, variance, alike, shaped, noise
         )
-        opposite = Comparison(agreement, -found.difference, -found.used, variance, alike, shaped)
+        opposite = Comparison(agreement, -found.difference, -found.used, variance, alike, shaped, noise)
         _note(peers, vehicle, other, _rank(names[vehicle].key, names[other].key), found)
         _note(peers, other, vehicle, _rank(names[other].key, names[vehicle].key), opposite)
     reporter[place] = vehicle
@@ -136,7 +144,7 @@ def _note(peers: RecordArray, vehicle: int, other: int, rank: int, found: Compar
             this.stated *= np.float32(0.5)
             this.found *= np.float32(0.5)
     if variance > 0.0 and found.shaped:
-        this.used_squares += np.float32((found.used * found.used - 2.0 * c.USED_NOISE**2) / variance)
+        this.used_squares += np.float32((found.used * found.used - 2.0 * found.noise) / variance)
         this.used_products += np.float32(found.used * difference / variance)
         if this.used_squares > c.SLOPE_MEMORY:
             this.used_squares *= np.float32(0.5)
@@ -173,10 +181,10 @@ def judged(peers: RecordArray, before: Standing, epoch: int) -> Standing:
     vehicles = len(before.weight)
     weight, error = np.empty(vehicles, np.float32), np.empty((vehicles, 4), np.float32)
     established = _weigh(peers, before.weight, weight)
-    square, slope = _fleet(peers, before.weight)
-    _find_errors(peers, before.weight, before.error, (square, slope), error)
-    fleet = np.array([0.0, c.BIAS_RELATIVE, _spread(square, 0.0, 0.0), slope], np.float32)
-    return Standing(epoch, weight, error, initial_trust(established), fleet)
+    kinds = np.empty((TYRES, 4), np.float32)
+    found = _find_kinds(peers, before.weight, before.error, kinds)
+    _find_errors(peers, found, kinds, error)
+    return Standing(epoch, weight, error, initial_trust(established), kinds)
 
 
 @compiled
@@ -206,30 +214,50 @@ def _weigh(peers: RecordArray, before: Float32Array, out: Float32Array) -> bool:
 
 
 @compiled
-def _fleet(peers: RecordArray, before: Float32Array) -> tuple[float, float]:
-    """κ² and λ of the fleet; each vehicle counts in the measure of its weight `before` (V,).
+def _find_kinds(peers: RecordArray, before: Float32Array, error: Float32Array, out: Float32Array) -> FloatArray:
+    """Fill the errors (TYRES, 4) of vehicles that nobody met by the kind of their tyres, from weights (V,) and errors
+    (V, 4) before; each vehicle counts in the measure of its weight. Returns what `_biases` does.
 
-    λ says how much too low the fleet's values are for each μ that was left: regression of the differences of values
-    upon those of the grip used, in the same places.
+    λ says how much too low values are for each μ that was left: regression of the differences of values upon those of
+    the grip used, in the same places. A kind that nobody told is the fleet.
     """
-    found, stated = c.SPREAD_FIRST**2 * c.SPREAD_PRIOR, float(c.SPREAD_PRIOR)
-    squares, products = 0.0, c.SLOPE_PRIOR / c.SLOPE_STD**2
+    found, stated, squares, products = np.zeros(TYRES), np.zeros(TYRES), np.zeros(TYRES), np.zeros(TYRES)
     for v in range(len(before)):
         own = min(float(before[v]), 1.0)
-        found += own * float(peers[v].found)
-        stated += own * float(peers[v].stated)
-        squares += own * float(peers[v].used_squares)
-        products += own * float(peers[v].used_products)
-    slope = products / (max(squares, 0.0) + 1.0 / c.SLOPE_STD**2)
-    return found / stated, min(max(slope, 0.0), c.SLOPE_MOST)
+        kind = peers[v].tyre
+        found[kind] += own * float(peers[v].found)
+        stated[kind] += own * float(peers[v].stated)
+        squares[kind] += own * float(peers[v].used_squares)
+        products[kind] += own * float(peers[v].used_products)
+    fleet = (found.sum() + c.SPREAD_FIRST**2 * c.SPREAD_PRIOR) / (stated.sum() + c.SPREAD_PRIOR)
+    slope = products.sum() + c.SLOPE_PRIOR / c.SLOPE_STD**2
+    slope /= max(squares.sum(), 0.0) + 1.0 / c.SLOPE_STD**2
+    biases, bias = _biases(peers, before, error), np.zeros(TYRES)
+    whole, products_of = np.full(TYRES, 1.0 / c.TYRE_BIAS**2), np.zeros(TYRES)
+    for v in range(len(before)):
+        precision = biases[v, 1]
+        if precision > 0.0:
+            own = min(float(before[v]), 1.0) / (1.0 / precision + c.FLEET_BIAS**2)
+            whole[peers[v].tyre] += own
+            products_of[peers[v].tyre] += own * biases[v, 0]
+    for k in range(TYRES):
+        told = k > 0
+        bias[k] = products_of[k] / whole[k] if told else 0.0
+        of_kind = (found[k] + fleet * c.SPREAD_PRIOR) / (stated[k] + c.SPREAD_PRIOR) if told else fleet
+        prior = 1.0 / c.TYRE_SLOPE_STD**2
+        of_shape = (products[k] + slope * prior) / (max(squares[k], 0.0) + prior) if told else slope
+        out[k, 0] = min(max(bias[k], -c.BIAS_MOST), c.BIAS_MOST)
+        out[k, 1] = c.BIAS_RELATIVE
+        out[k, 2] = _spread(of_kind, 0.0, 0.0)
+        out[k, 3] = min(max(of_shape, 0.0), c.SLOPE_MOST)
+    return biases
 
 
 @compiled
-def _find_errors(
-    peers: RecordArray, before: Float32Array, error: Float32Array, fleet: tuple[float, float], out: Float32Array
-) -> None:
-    """Fill bias, how well it is known, spread, slope, (V, 4), from weights (V,) and errors (V, 4) before."""
-    for v in range(len(out)):
+def _biases(peers: RecordArray, before: Float32Array, error: Float32Array) -> FloatArray:
+    """What others tell of the vehicles' biases, and how precise it is, (V, 2); precision 0 where nobody does."""
+    out = np.zeros((len(before), 2))
+    for v in range(len(before)):
         this, precisions, differences = peers[v], 0.0, 0.0
         for k in range(c.PEERS):
             other, weight = this.other[k], float(this.weight[k])
@@ -238,13 +266,25 @@ def _find_errors(
                 precision = min(float(before[other]), 1.0) / precision
                 precisions += precision
                 differences += precision * (float(this.difference[k]) / max(weight, 1e-9) + float(error[other, 0]))
-        whole = precisions + 1.0 / c.FLEET_BIAS**2
+        if precisions > 0.0:
+            out[v, 0], out[v, 1] = differences / precisions, precisions
+    return out
+
+
+@compiled
+def _find_errors(peers: RecordArray, biases: FloatArray, kinds: Float32Array, out: Float32Array) -> None:
+    """Fill bias, how well it is known, spread, slope, (V, 4): what others tell (V, 2), drawn towards that of the kind
+    of its tyres (TYRES, 4)."""
+    for v in range(len(out)):
+        kind, precision = kinds[peers[v].tyre], biases[v, 1]
+        whole = precision + 1.0 / c.FLEET_BIAS**2
         std = max(math.sqrt(1.0 / whole), c.BIAS_KNOWN_LEAST)
-        known = precisions > 0.0 and std < c.BIAS_RELATIVE
-        out[v, 0] = min(max(differences / whole, -c.BIAS_MOST), c.BIAS_MOST) if known else 0.0
+        known = precision > 0.0 and std < c.BIAS_RELATIVE
+        bias = (precision * biases[v, 0] + float(kind[0]) / c.FLEET_BIAS**2) / whole
+        out[v, 0] = min(max(bias, -c.BIAS_MOST), c.BIAS_MOST) if known else kind[0]
         out[v, 1] = std if known else c.BIAS_RELATIVE
-        out[v, 2] = _spread(fleet[0], float(this.found), float(this.stated))
-        out[v, 3] = fleet[1]
+        out[v, 2] = _spread(float(kind[2]) ** 2, float(peers[v].found), float(peers[v].stated))
+        out[v, 3] = kind[3]
 
 
 @compiled

@@ -34,7 +34,7 @@ IDENTITY: Final = ["vehicle", "boot", "region", "seq"]
 COLUMNS: Final = [
     *("leave_time", "cell", "sector", "latitude", "position_std", "yaw", "mu", "mu_lower", "mu_upper"),
     *("mu_utilised", "log_likelihood", *IDENTITY, "row", "late", "weight"),
-    *("used_longitudinal", "used_lateral", "late_by", *ERRORS),
+    *("used_longitudinal", "used_lateral", "tyre_season", "late_by", *ERRORS),
 ]  # of what the fusion takes
 FILTERED: Final = ("longitude", "received_at")  # beside them, where not all rows are wanted
 Box = tuple[float, float, float, float]  # west, south, east, north [deg]

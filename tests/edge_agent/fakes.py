@@ -44,6 +44,7 @@ class MadeUp:
     mu_utilised: FloatArray
     health: NDArray[np.int32]
     evidence: FloatArray | None
+    jumps: NDArray[np.bool_] | None = None
 
     def part(self, rows: slice) -> MadeUp:
         """The same for some samples."""

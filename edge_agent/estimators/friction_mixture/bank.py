@@ -15,6 +15,7 @@ from edge_agent.estimators.friction_mixture.memory import MixtureMemory, Quantil
 from edge_agent.estimators.friction_mixture.reported_interval import LOWER_END, UPPER_END
 from edge_agent.estimators.friction_mixture.split_sides import BOTH, project
 from edge_agent.estimators.friction_mixture.step import step, velocity
+from edge_agent.estimators.friction_mixture.visit_parts import begin_part, end_part
 from edge_agent.estimators.friction_mixture.workspace import MixtureContext, Scratch
 from schemas.mugrid import CENTRES
 from schemas.numeric import BoolArray, FloatArray
@@ -57,6 +58,8 @@ def _advance(
             memory.log_likelihood = 0.0
             output = outputs[k, n]
             health = step(memory, design, scratch, t[k, n], signals[k, n])
+            if closes.shape[0] > 0 and memory.started and memory.block.samples == 0:  # a block has ended
+                end_part(memory, design, evidence[k, n])
             report(memory, design, output)
             output[Column.HEALTH] = health | memory.health
 
@@ -74,6 +77,7 @@ def close_visit(memory: MixtureMemory, design: MixtureDesign, scratch: Scratch, 
     else:
         visit_evidence(design.mu, design.prior, memory.visit_weight[:NODES], CENTRES, evidence)
         put(memory.visit_weight[:NODES], design.prior)
+    begin_part(memory, design)
 
 
 @compiled

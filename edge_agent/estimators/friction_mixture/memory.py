@@ -9,7 +9,7 @@ import numpy as np
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.estimators.common.excitation import Excitation
 from edge_agent.estimators.common.readings import INPUTS
-from edge_agent.estimators.friction_mixture.constants import ALL_NODES, PATCH_NODES, STATES
+from edge_agent.estimators.friction_mixture.constants import ALL_NODES, NODES, PATCH_NODES, STATES
 from edge_agent.estimators.friction_mixture.design import Nominal
 from schemas.numeric import FloatArray, IntArray
 from schemas.runtime.records import RecordArray, records
@@ -123,6 +123,8 @@ class MixtureMemory:
     covariance: Annotated[FloatArray, ALL_NODES, STATES, STATES]
     weight: Annotated[FloatArray, ALL_NODES]
     visit_weight: Annotated[FloatArray, ALL_NODES]  # probabilities from the reference prior at the visit's start
+    surest: Annotated[FloatArray, NODES]  # they where they knew most, since the road last became another
+    information: float  # of them over the prior [nat]
     patch: Annotated[FloatArray, PATCH_NODES]  # probability of a patch of ice here, by node
     penalty: Annotated[FloatArray, ALL_NODES]  # ledger: charged so far for what a node believes of the vehicle [nat]
     overall_mean: Annotated[FloatArray, STATES]  # moments of the mixture

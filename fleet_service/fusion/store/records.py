@@ -19,6 +19,7 @@ from schemas.runtime.records import RecordArray, record_type
 
 NONE: Final = -1  # no row
 NOBODY: Final = -1  # no vehicle
+LATE: Final = -1  # in place of a kind of tyres
 GRIP, ICE = 0, 1  # sides: what a corroborating source reported
 SOURCES: Final = 5  # remembered per slot of each side: as many as an alert ever needs
 # What a vehicle reported last, its mean, standard deviation and votes spent, is remembered in 16 bits: parts of 1/FINE,
@@ -94,7 +95,7 @@ class EntryRecord:
         used, shared: grip used, and what its value shares with others, in parts of 1/USED and 1/SHARED.
         bias, bias_class, spread_class, slope: what is known of the vehicle's own error, see `standing.classes`.
         manoeuvre: see `shared`.
-        old: whether it came late, and is compared with nobody.
+        tyre: kind of the vehicle's tyres; LATE of what came late, and is compared with nobody.
     """
 
     previous: np.int32
@@ -125,7 +126,7 @@ class EntryRecord:
     bias_class: np.int8
     spread_class: np.int8
     manoeuvre: np.int8
-    old: np.int8
+    tyre: np.int8
     slope: np.int8
 
 
@@ -189,7 +190,7 @@ class PeersRecord:
     """Whom a vehicle was compared with: the other, the rank of their pair, agreement and comparisons, summed; weight of
     the relative differences of their values, and the differences by weight; squared differences beyond what both say of
     themselves, and what they say; squares of the differences of their use, and their products with those of the values,
-    by weight."""
+    by weight; kind of its tyres, as told last."""
 
     other: Annotated[Int32Array, c.PEERS]
     rank: Annotated[Int32Array, c.PEERS]
@@ -201,6 +202,7 @@ class PeersRecord:
     found: np.float32
     used_squares: np.float32
     used_products: np.float32
+    tyre: np.int32
 
 
 class VehicleRecord:

@@ -142,6 +142,66 @@ def test_grip_that_the_accelerometers_did_not_feel_in_the_cell_is_of_the_cell_be
     assert told == pytest.approx([WHEEL_SHARE * 0.1 + FELT_STD, 0.8, 0.8])
 
 
+def felt(observed: np.ndarray, east: np.ndarray) -> list[float]:
+    """Grip told of the visits of a car that goes east along `east` (T, 1) [m] at 100 Hz and feels `observed` (T,) g."""
+    flat = np.zeros_like(east)
+    block, reported = ground(east, flat, flat, rate_hz=100.0, fix_every=10), estimates(len(east), 1, used=0.9)
+    signals = block.signals.copy()
+    signals[:, 0, S.AX], signals[..., S.AY] = -GRAVITY * observed, 0.0
+    _, located = locate(Watch.of(1).tracks, block.t, signals)
+    reading = cast("Estimates", type(reported)(**{**vars(reported), "vx": flat + 10.0, "vy": flat}))
+    _, records, _ = observe(OpenVisits.start(1), block.time, located, reading, AgentConfig(), signals)
+    return [float(used) for used in records.columns["mu_utilised"]]
+
+
+def test_grip_that_was_felt_at_the_border_of_a_cell_may_be_of_the_cell_beside() -> None:
+    """Braking at the border, as far as a fix may be wrong, is told of neither cell; further inside of its own."""
+    east = np.arange(450)[:, None] * 0.1
+    flat = np.zeros_like(east)
+    block = ground(east, flat, flat, rate_hz=100.0, fix_every=10)
+    _, located = locate(Watch.of(1).tracks, block.t, block.signals)
+    border = int(np.flatnonzero(located.closes[:, 0])[1])
+    gentle, at_border, inside = np.full(450, 0.1), np.full(450, 0.1), np.full(450, 0.1)
+    at_border[border : border + 8] = 0.6
+    inside[border + 30 : border + 60] = 0.6
+    plain, near, far = (felt(observed, east)[1] for observed in (gentle, at_border, inside))
+    assert plain == pytest.approx(WHEEL_SHARE * 0.1 + FELT_STD, abs=1e-3)
+    assert near == pytest.approx(plain, abs=0.15)
+    assert far > WHEEL_SHARE * 0.55
+
+
+def test_the_noise_of_accelerometers_is_no_grip() -> None:
+    east, rng = np.arange(450)[:, None] * 0.1, np.random.default_rng(3)
+    noisy = 0.1 + 0.05 * rng.normal(size=450)
+    assert max(felt(noisy, east)) < WHEEL_SHARE * 0.16 + FELT_STD < WHEEL_SHARE * noisy.max()
+
+
+@pytest.mark.parametrize("cut", [None, 31, 33])
+def test_a_visit_in_which_friction_jumps_tells_both_frictions_and_what_was_used_of_the_lesser(cut: int | None) -> None:
+    """From ice to dry road within the second visit: it was one or the other, and no more than the ice is told as used,
+    though the brakes took .7 before the change was seen."""
+    samples = 40
+    east = np.arange(samples)[:, None] * 0.5
+    block, reported = ground(east, np.zeros_like(east), np.zeros_like(east)), estimates(samples, 1, mu=0.8)
+    located, *_ = Watch.of(1).step(block, reported)
+    first, second = np.flatnonzero(located.closes[:, 0])[1:3]
+    ice, dry = (-0.5 * np.square((mugrid.CENTRES - mu) / 0.05) for mu in (0.15, 0.8))
+    evidence, jumps = np.full((samples, 1, mugrid.BINS), np.nan), np.zeros((samples, 1), np.bool_)
+    evidence[located.closes[:, 0], 0] = dry
+    jump = (first + second) // 2
+    evidence[jump, 0], jumps[jump] = ice, True
+    made = {"evidence": evidence, "jumps": jumps, "mu_utilised": np.full((samples, 1), 0.7)}
+    reported = type(reported)(**{**vars(reported), **made})
+    watch, told, used = Watch.of(1), [], []
+    for rows in [slice(None)] if cut is None else [slice(0, cut), slice(cut, None)]:
+        _, observations, _ = watch.step(part(block, rows), reported.part(rows))
+        told += list(observations.columns["log_likelihood"])
+        used += observations.columns["mu_utilised"].tolist()
+    assert np.array_equal(told[1], mugrid.encode_log_likelihood(np.maximum(ice, dry)))
+    assert used[1] == pytest.approx(mugrid.CENTRES[ice >= -3.0].max())
+    assert used[0] == pytest.approx(0.7)
+
+
 @pytest.mark.parametrize("rate", [0.5, 2.0, 10.0])
 def test_states_come_at_the_set_rate(rate: float) -> None:
     east = np.zeros((3_001, 2))

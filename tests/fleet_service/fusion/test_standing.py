@@ -9,6 +9,7 @@ import pytest
 
 from fleet_service.fusion import Fusion, shared
 from fleet_service.fusion import constants as c
+from fleet_service.fusion.reported import as_reported
 from fleet_service.fusion.standing import BIAS_STDS, SPREADS, classes, unknown
 from fleet_service.fusion.store.records import ICE
 from fleet_service.fusion.trust import slope_std
@@ -43,6 +44,28 @@ def test_biases_are_found_and_nobody_knows_those_of_a_newcomer() -> None:
     assert known(fusion, "bias_std").max() < c.BIAS_RELATIVE
     assert fusion.error(999)["bias"] == 0.0
     assert fusion.error(999)["bias_std"] == pytest.approx(c.BIAS_RELATIVE)
+
+
+def test_who_tells_its_tyres_is_known_by_them_before_anybody_met_it() -> None:
+    """Half of the fleet on winter tyres, which read a tenth less, told and not: a newcomer's error in a cell alone."""
+    biases = {}
+    for told in (False, True):
+        rng, fusion = np.random.default_rng(6), Fusion(120.0)
+        winter = np.arange(VEHICLES) % 2
+        bias = 0.03 * rng.normal(size=VEHICLES) - 0.1 * winter
+        tyre = (1 + winter if told else 0 * winter).astype(np.int8)
+        for minute in range(40):
+            n = 60
+            who, cell = rng.integers(0, VEHICLES, n), rng.integers(0, 20, n)
+            reading = (0.5 + 0.02 * cell) * (1.0 + bias[who]) + 0.04 * rng.normal(size=n)
+            o = observations(60.0 * minute + np.sort(rng.uniform(0, 60, n)), who, value(reading, 0.04), cell=cell)
+            fusion.update(dataclasses.replace(o, tyre=tyre[who], reported=as_reported(o.evidence).reported))
+        biases[told] = fusion.standings[-1].errors(np.full(3, 999), np.arange(3))[:, 0]
+    assert biases[False].tolist() == [0.0, 0.0, 0.0]
+    unknown_kind, summer, of_winter = biases[True]
+    assert unknown_kind == 0.0
+    assert 0.07 < summer - of_winter < 0.11
+    assert of_winter < 0.0 < summer  # which of them is right nobody can see
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.5])

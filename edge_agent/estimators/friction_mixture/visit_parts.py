@@ -1,0 +1,59 @@
+"""A friction that jumps inside a visit: what the visit's first part told, before the road became another.
+
+The visit's own belief starts from the prior and follows the road, so that at the end it tells the last surface alone.
+Beside it the surest belief of the visit so far is kept, by information over the prior. Where the belief lies almost
+whole at frictions that the surest one had excluded, the friction has jumped: the surest is the evidence of the part
+that ends, and the next part begins. A belief on its way from one to the other takes nobody's place.
+
+Legend
+    w, s       probabilities of the nodes in the visit, and where it was surest   (K,)
+    p          prior of the nodes                                                 (K,)
+    D          information, Σ w·ln(w/p) [nat]
+"""
+
+from __future__ import annotations
+
+import math
+
+from edge_agent.estimators.common.arrays import put
+from edge_agent.estimators.friction_mixture.constants import NODES
+from edge_agent.estimators.friction_mixture.design import MixtureDesign
+from edge_agent.estimators.friction_mixture.friction_grid import visit_evidence
+from edge_agent.estimators.friction_mixture.memory import MixtureMemory
+from schemas.mugrid import CENTRES
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+
+EXCLUDED = math.exp(-3.0)  # of the largest likelihood: what lies below it, the surest belief excludes
+ALMOST_WHOLE = 0.9
+COMPATIBLE = 0.5  # as much as may lie there of a belief that takes the surest one's place
+KNOWING = 0.7  # [nat] half of the range is excluded; a belief that knows less says nothing against another
+
+
+@compiled
+def begin_part(memory: MixtureMemory, design: MixtureDesign) -> None:
+    """Nothing was told in this part so far."""
+    put(memory.surest, design.prior)
+    memory.information = 0.0
+
+
+@compiled
+def end_part(memory: MixtureMemory, design: MixtureDesign, evidence: FloatArray) -> None:
+    """Keep the surest belief; where friction has jumped, write what the part that ends told (32,) and begin another."""
+    if memory.split:
+        return
+    w, s, p = memory.visit_weight[:NODES], memory.surest, design.prior
+    known, most = 0.0, 0.0
+    for j in range(NODES):
+        known += w[j] * math.log(w[j] / p[j])
+        most = max(most, s[j] / p[j])
+    excluded = 0.0
+    for j in range(NODES):
+        if s[j] < EXCLUDED * most * p[j]:
+            excluded += w[j]
+    jumped = known >= KNOWING and excluded > ALMOST_WHOLE
+    if jumped:
+        visit_evidence(design.mu, p, s, CENTRES, evidence)
+    if jumped or (known > memory.information and excluded < COMPATIBLE):
+        put(s, w)
+        memory.information = known
