@@ -81,11 +81,13 @@ class Fusion:
         self.standings: list[Standing] = [first_standing(initial_trust(False))]
         self.reports: Reports = no_reports()
         self._weather: Weather = weather_of(self.reports)
+        self._shape_known = False
 
     def resume(self, epoch: int | None, standings: list[Standing], reports: Reports) -> None:
         """Go on from an epoch, the standings since, and the weather; the store is set before."""
         self._epoch, self.standings, self.reports = epoch, standings, reports
         self._weather = weather_of(reports)
+        self._shape_known = self._knows_shape()
 
     @property
     def epoch(self) -> int:
@@ -209,9 +211,8 @@ class Fusion:
         doubtful = self._read(ALARM_KERNELS, slots, self.live.time[slots])
         return np.where(known[:, None], self.believed(slots), doubtful)
 
-    @property
-    def _shape_known(self) -> bool:
-        """Whether the slope of the fleet's values has been found."""
+    def _knows_shape(self) -> bool:
+        """Whether the slope of the fleet's values has been found; it moves with the standing."""
         return slope_std(self.store.peers, self.standings[-1]) <= c.SLOPE_KNOWN
 
     def _kernels(self) -> Float32Array:
@@ -273,6 +274,7 @@ class Fusion:
             error = last.errors(np.arange(store.vehicles), store.peers["tyre"][: store.vehicles])
             standing = judged(store.peers, last._replace(weight=weight, error=error), self._epoch)
             self.standings = [self.standings[0], *self.standings[1:][-self._kept_epochs :], standing]
+            self._shape_known = self._knows_shape()
 
     def _absorb(
         self, o: Observations, rows: IntArray, arrivals: Arrivals, most: int
