@@ -32,6 +32,27 @@ UNITS: Final = {
 CHANNELS: Final = tuple(UNITS)
 
 
+# Context: what a car's controllers and its surroundings say, beside the channels that estimators read. A block of it is
+# a float array (T, N, len(CONTEXT)); NaN is unknown. All of it is optional: most cars have some, some have none.
+FLAGS: Final = ("abs_active", "esc_active", "tcs_active")  # slip controllers: anti-lock, stability, traction control
+CONTEXT_UNITS: Final = {
+    **dict.fromkeys(FLAGS, "0 no, 1 yes"),
+    "air_temperature": "degC outside",
+    "wiper": "0 still, 1 wiping without a pause",
+}
+CONTEXT: Final = tuple(CONTEXT_UNITS)
+
+
+class C(IntEnum):
+    """Index of a context signal on the last axis of a context block; the flags come first, in the order of FLAGS."""
+
+    ABS = CONTEXT.index("abs_active")
+    ESC = CONTEXT.index("esc_active")
+    TCS = CONTEXT.index("tcs_active")
+    AIR_TEMPERATURE = CONTEXT.index("air_temperature")
+    WIPER = CONTEXT.index("wiper")
+
+
 class S(IntEnum):
     """Index of a channel on the last axis of a block; of a wheel channel, the index of its first wheel (fl)."""
 

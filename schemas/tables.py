@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 import pyarrow as pa
 
 from schemas import grid, mugrid
-from schemas.signals import UNITS, per_wheel
+from schemas.signals import CONTEXT_UNITS, UNITS, per_wheel
 from schemas.thresholds import EXCITED_SHARE, SLIPPERY_MU
 
 
@@ -70,11 +70,15 @@ OBSERVATION: Final = (
     Field("tyre_season", I8, "0 unknown, 1 summer, 2 winter, 3 all-season", "tyres of the vehicle",
           range=(0, 3)),
     Field("air_temperature", F32, "degC", "outside; NaN where not measured", 2.0**-4, (-90.0, 80.0)),
-    Field("abs_active", I8, "-1 unknown, 0 no, 1 yes", "a slip controller intervened", range=(-1, 1)),
+    Field("abs_active", I8, "-1 unknown, 0 no, 1 yes", "anti-lock braking intervened", range=(-1, 1)),
     Field("used_longitudinal", F32, "-", "part of mu_utilised along the vehicle, driving positive; NaN where not said",
           _MU_STEP, (-2.0, 2.0)),
     Field("used_lateral", F32, "-", "part of mu_utilised across the vehicle, to the left; NaN where not said",
           _MU_STEP, (-2.0, 2.0)),
+    Field("esc_active", I8, "-1 unknown, 0 no, 1 yes", "stability control intervened", range=(-1, 1)),
+    Field("tcs_active", I8, "-1 unknown, 0 no, 1 yes", "traction control intervened", range=(-1, 1)),
+    Field("wiper", F32, "0 still … 1 wiping without a pause", "front wipers, mean over the visit; NaN where not known",
+          2.0**-6, (0.0, 1.0)),
 )  # fmt: skip
 
 # Where a vehicle was and how it moved.
@@ -199,6 +203,10 @@ ESTIMATES: Final = (
 SIGNAL_LOG: Final = (
     Field("t", F64, "s", "of the sample, increasing"),
     *(Field(name, F64, unit, "null or NaN is a missing reading") for name, unit in UNITS.items()),
+)
+# Columns that a signal log may have beside these.
+SIGNAL_LOG_CONTEXT: Final = tuple(
+    Field(name, F64, unit, "null or NaN is unknown; the column may be missing") for name, unit in CONTEXT_UNITS.items()
 )
 
 

@@ -5,6 +5,7 @@
 | 1.0 | no version and no digest; the columns are exactly those of FIRST |
 | 1.1 | `gripmap.version` and `gripmap.digest` in the footer |
 | 1.2 | observations: `value`; roll-up: `value_count`, `value_sum`; map: `mu` is null where only bounds are known |
+| 1.3 | observations: `esc_active`, `tcs_active`, `wiper` |
 
 A minor version adds columns: who knows fewer passes over the others, who knows more reads null. A major version changes
 what a column means: who is older refuses it. The digest is made the same way in all versions, so that damage is told
@@ -35,7 +36,7 @@ class Version(NamedTuple):
         return f"{self.major}.{self.minor}"
 
 
-VERSION: Final = Version(1, 2)
+VERSION: Final = Version(1, 3)
 OLDEST: Final = Version(1, 0)  # of a file that says none
 PREFIX: Final = "gripmap."
 KEY: Final = PREFIX + "version"

@@ -28,7 +28,7 @@ BASIS_MEASURED: Basis
 BASIS_BORROWED: Basis
 
 class ObservationBatch(_message.Message):
-    __slots__ = ("vehicle", "boot", "region", "seq", "first_held", "estimator", "enter_time", "leave_time", "cell", "sector", "latitude", "longitude", "position_std", "yaw", "yaw_std", "speed", "mu", "mu_lower", "mu_upper", "mu_utilised", "log_likelihood", "health", "tyre_season", "air_temperature", "abs_active", "used_longitudinal", "used_lateral")
+    __slots__ = ("vehicle", "boot", "region", "seq", "first_held", "estimator", "enter_time", "leave_time", "cell", "sector", "latitude", "longitude", "position_std", "yaw", "yaw_std", "speed", "mu", "mu_lower", "mu_upper", "mu_utilised", "log_likelihood", "health", "tyre_season", "air_temperature", "abs_active", "used_longitudinal", "used_lateral", "esc_active", "tcs_active", "wiper")
     VEHICLE_FIELD_NUMBER: _ClassVar[int]
     BOOT_FIELD_NUMBER: _ClassVar[int]
     REGION_FIELD_NUMBER: _ClassVar[int]
@@ -56,6 +56,9 @@ class ObservationBatch(_message.Message):
     ABS_ACTIVE_FIELD_NUMBER: _ClassVar[int]
     USED_LONGITUDINAL_FIELD_NUMBER: _ClassVar[int]
     USED_LATERAL_FIELD_NUMBER: _ClassVar[int]
+    ESC_ACTIVE_FIELD_NUMBER: _ClassVar[int]
+    TCS_ACTIVE_FIELD_NUMBER: _ClassVar[int]
+    WIPER_FIELD_NUMBER: _ClassVar[int]
     vehicle: str
     boot: int
     region: int
@@ -83,7 +86,10 @@ class ObservationBatch(_message.Message):
     abs_active: _containers.RepeatedScalarFieldContainer[int]
     used_longitudinal: _containers.RepeatedScalarFieldContainer[float]
     used_lateral: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, vehicle: _Optional[str] = ..., boot: _Optional[int] = ..., region: _Optional[int] = ..., seq: _Optional[int] = ..., first_held: _Optional[int] = ..., estimator: _Optional[str] = ..., enter_time: _Optional[_Iterable[int]] = ..., leave_time: _Optional[_Iterable[int]] = ..., cell: _Optional[_Iterable[int]] = ..., sector: _Optional[_Iterable[int]] = ..., latitude: _Optional[_Iterable[float]] = ..., longitude: _Optional[_Iterable[float]] = ..., position_std: _Optional[_Iterable[float]] = ..., yaw: _Optional[_Iterable[float]] = ..., yaw_std: _Optional[_Iterable[float]] = ..., speed: _Optional[_Iterable[float]] = ..., mu: _Optional[_Iterable[float]] = ..., mu_lower: _Optional[_Iterable[float]] = ..., mu_upper: _Optional[_Iterable[float]] = ..., mu_utilised: _Optional[_Iterable[float]] = ..., log_likelihood: _Optional[bytes] = ..., health: _Optional[_Iterable[int]] = ..., tyre_season: _Optional[_Iterable[int]] = ..., air_temperature: _Optional[_Iterable[float]] = ..., abs_active: _Optional[_Iterable[int]] = ..., used_longitudinal: _Optional[_Iterable[float]] = ..., used_lateral: _Optional[_Iterable[float]] = ...) -> None: ...
+    esc_active: _containers.RepeatedScalarFieldContainer[int]
+    tcs_active: _containers.RepeatedScalarFieldContainer[int]
+    wiper: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, vehicle: _Optional[str] = ..., boot: _Optional[int] = ..., region: _Optional[int] = ..., seq: _Optional[int] = ..., first_held: _Optional[int] = ..., estimator: _Optional[str] = ..., enter_time: _Optional[_Iterable[int]] = ..., leave_time: _Optional[_Iterable[int]] = ..., cell: _Optional[_Iterable[int]] = ..., sector: _Optional[_Iterable[int]] = ..., latitude: _Optional[_Iterable[float]] = ..., longitude: _Optional[_Iterable[float]] = ..., position_std: _Optional[_Iterable[float]] = ..., yaw: _Optional[_Iterable[float]] = ..., yaw_std: _Optional[_Iterable[float]] = ..., speed: _Optional[_Iterable[float]] = ..., mu: _Optional[_Iterable[float]] = ..., mu_lower: _Optional[_Iterable[float]] = ..., mu_upper: _Optional[_Iterable[float]] = ..., mu_utilised: _Optional[_Iterable[float]] = ..., log_likelihood: _Optional[bytes] = ..., health: _Optional[_Iterable[int]] = ..., tyre_season: _Optional[_Iterable[int]] = ..., air_temperature: _Optional[_Iterable[float]] = ..., abs_active: _Optional[_Iterable[int]] = ..., used_longitudinal: _Optional[_Iterable[float]] = ..., used_lateral: _Optional[_Iterable[float]] = ..., esc_active: _Optional[_Iterable[int]] = ..., tcs_active: _Optional[_Iterable[int]] = ..., wiper: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class StateBatch(_message.Message):
     __slots__ = ("vehicle", "boot", "region", "seq", "first_held", "estimator", "time", "latitude", "longitude", "position_std", "yaw", "vx", "vy", "yaw_rate", "sideslip", "mu", "mu_lower", "mu_upper", "health")

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from schemas import grid, mugrid
 from schemas.errors import WireError
 from schemas.numeric import BoolArray, IntArray
+from schemas.signals import FLAGS
 from schemas.wire.codec import ENCODING, MAX_ROWS, MESSAGES, NEEDED, Batch, Columns, Kind, column_types, parse
 
-ABSENT: Final = {"abs_active": -1}  # what an absent integer reads as, where it is not 0
+ABSENT: Final = dict.fromkeys(FLAGS, -1)  # what an absent integer reads as, where it is not 0
 LIKELIHOOD: Final = "log_likelihood"
 
 

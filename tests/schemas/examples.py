@@ -14,7 +14,13 @@ from schemas import grid, wire
 from schemas.wire import Alert, Batch, Kind, StreamAck
 
 DATA = Path(__file__).parent / "data"
-LATER = ("used_longitudinal", "used_lateral")  # columns that came after the kept bytes
+LATER = (
+    "used_longitudinal",
+    "used_lateral",
+    "esc_active",
+    "tcs_active",
+    "wiper",
+)  # columns that came after the kept bytes
 
 
 def batch(kind: Kind, rows: int = 3) -> Batch:

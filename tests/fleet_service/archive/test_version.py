@@ -149,6 +149,21 @@ def test_a_missing_column_is_null_and_an_unknown_one_is_passed_over(tmp_path: Pa
         assert engine.counts["files_set_aside"] == 0
 
 
+def test_segments_before_1_3_tell_of_no_controller_and_no_wiper(tmp_path: Path) -> None:
+    added = ["esc_active", "tcs_active", "wiper"]
+    fill(tmp_path, 1, 20)
+    (path,) = segments.paths(tmp_path, Kind.OBSERVATION)
+    rewritten(path, lambda table: table.drop_columns(added), "1.2")
+    (table,) = reading.read(tmp_path, Kind.OBSERVATION)
+    assert [table[name].null_count for name in added] == [20, 20, 20]
+    rows = segments.rows_of(table)
+    assert (rows["esc_active"] == -1).all()
+    assert (rows["tcs_active"] == -1).all()
+    assert np.isnan(rows["wiper"]).all()
+    compact(tmp_path)
+    assert len(_identities(tmp_path, Kind.OBSERVATION)) == 20
+
+
 def test_compaction_of_segments_of_several_versions_loses_no_row_and_no_column(tmp_path: Path) -> None:
     fill(tmp_path, 3, 20)
     first, second, _ = segments.paths(tmp_path, Kind.OBSERVATION)

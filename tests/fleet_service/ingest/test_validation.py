@@ -89,6 +89,11 @@ def one(column: str, values: list[float]) -> dict[str, Any]:
         ("sector", [4, 0], "sector"),
         ("sector", [2, 0], "sector"),
         ("tyre_season", [9, 0], "tyre_season"),
+        ("abs_active", [2, 0], "abs_active"),
+        ("esc_active", [-2, 0], "esc_active"),
+        ("tcs_active", [2, 0], "tcs_active"),
+        ("wiper", [1.5, 0.0], "wiper"),
+        ("air_temperature", [99.0, 0.0], "air_temperature"),
         ("cell", [FAR, CELL], "cell"),
         ("cell", [-5, CELL], "cell"),
         ("enter_time", [NOW - 10**18, NOW], "time"),
@@ -120,6 +125,15 @@ def test_a_bad_value_is_refused_with_its_row_and_a_reason(
 )
 def test_what_is_absent_or_just_beside_is_let_in(desk: Desk, column: str, values: list[float]) -> None:
     assert desk.take(message(batch("sim-001", 1, NOW - SECOND, [0.8, 0.7], **one(column, values)))) == 2
+
+
+def test_controllers_and_surroundings_are_taken_as_they_were_sent(desk: Desk) -> None:
+    told = {"abs_active": [1, -1], "esc_active": [0, 1], "wiper": [0.5, np.nan], "air_temperature": [-3.5, np.nan]}
+    accepted = desk.intake.accept([message(batch("sim-001", 1, NOW - SECOND, [0.8, 0.7], **told))], CLOCK)
+    rows = accepted[Kind.OBSERVATION].rows
+    for name, values in told.items():
+        np.testing.assert_array_equal(rows[name], np.array(values, rows[name].dtype))
+    assert rows["tcs_active"].tolist() == [-1, -1], "left out: unknown"
 
 
 def test_a_bad_batch_among_good_ones_is_refused_alone(desk: Desk) -> None:

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from schemas import grid, tables, wire
 from schemas.errors import WireError
 from schemas.proto import gripmap_pb2 as pb
+from schemas.signals import FLAGS
 from schemas.wire import Batch, Kind, decode
 from tests.schemas.examples import DATA, LATER, MESSAGES, acknowledgement, alert, batch, batch_of_version_1
 
@@ -77,7 +78,7 @@ def test_bytes_of_version_1_are_still_written_and_read(name: str) -> None:
         kind = Kind.OBSERVATION if name.startswith("obs") else Kind.STATE
         found, sent = decode(kept, wire.ENCODING[kind], kind), batch_of_version_1(kind)
         absent = {name: found.columns.pop(name) for name in LATER if name in found.columns}
-        assert all(np.isnan(column).all() for column in absent.values())
+        assert all((column == -1 if name in FLAGS else np.isnan(column)).all() for name, column in absent.items())
         same(found, sent)
     elif name == "ack":
         assert wire.decode_ack(kept) == acknowledgement()
@@ -97,7 +98,8 @@ def test_a_person_can_publish_with_one_line() -> None:
     assert got.columns["leave_time"][0] == 1790000000000000000
     assert got.region == grid.region_of(got.columns["cell"][0])
     assert np.isnan(got.columns["air_temperature"][0])
-    assert got.columns["abs_active"][0] == -1
+    assert [got.columns[name].tolist() for name in FLAGS] == [[-1]] * 3
+    assert np.isnan(got.columns["wiper"][0])
     assert got.columns["log_likelihood"].shape == (1, 0)
 
 
