@@ -6,6 +6,7 @@ skipped: a loop that fell behind catches up as fast as it can, and counts it.
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -21,6 +22,8 @@ from schemas.wire import Kind
 STATUS_EVERY_S = 5.0
 STOPPED_DRAIN_S = 1.7  # a signalled agent is gone within 3 s, with a second for sessions that hang
 ENDED_DRAIN_S = 10.0  # at its own end it may wait for a busy service
+
+log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -57,11 +60,13 @@ def drive(
     `admitted` are held back, and counted. `after` is called after each block.
     """
     progress, status_at = progress or Progress(), STATUS_EVERY_S
+    doubted: set[tuple[int, str]] = set()
     started = first = float("nan")
     for block in blocks:
         _, observations, states = pipeline.step(block)
         _offer(publisher, progress, admitted(), observations, states)
         after()
+        _warn_of_flags(pipeline, doubted)
         if not progress.blocks:
             started, first = clock(), float(block.t.min())  # the first block may have had to load kernels
         length = float(block.t.max()) - first - progress.signals_s
@@ -80,6 +85,14 @@ def drive(
     if (last := pipeline.finish()) is not None:
         _offer(publisher, progress, admitted(), last)
     return progress
+
+
+def _warn_of_flags(pipeline: Pipeline, warned: set[tuple[int, str]]) -> None:
+    """Log each controller flag that carries no weight, once a vehicle; `warned` remembers which."""
+    for vehicle, flag, reason in pipeline.doubted_flags():
+        if (vehicle, flag) not in warned:
+            warned.add((vehicle, flag))
+            log.warning("vehicle %d: %s %s: it counts as unknown; correct the profile", vehicle, flag, reason)
 
 
 def _offer(publisher: Publisher, progress: Progress, admitted: bool, *records: RecordBlock) -> None:

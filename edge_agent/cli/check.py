@@ -6,10 +6,15 @@ import argparse
 import json
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from edge_agent.cli.options import add_json
 
+if TYPE_CHECKING:
+    from edge_agent.inputs.signal_log import SignalLog
+
 NOT_PASSED = 1
+FLAG_ROWS = 1000  # after which a controller's flag is looked at again
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,10 +45,12 @@ def run(args: argparse.Namespace) -> int:
     file = args.vehicle or beside(args.log)
     vehicle, log = load_vehicle(file), read_log(args.log)
     diagnosis = diagnose(log.t, log.signals, vehicle, log.ground)
+    doubts = _doubted(log)
     if args.json:
-        print(json.dumps({"log": str(args.log), **document(diagnosis)}, allow_nan=False))
+        print(json.dumps({"log": str(args.log), **document(diagnosis), "doubted_flags": doubts}, allow_nan=False))
     else:
-        print("\n".join([*lines(diagnosis), f"{args.log}: {advice(diagnosis)}"]))
+        flags = [f"{'no weight':<10}{name} {reason}: it counts as unknown" for name, reason in doubts.items()]
+        print("\n".join([*lines(diagnosis), *flags, f"{args.log}: {advice(diagnosis)}"]))
     if args.out is not None:
         writable("out", args.out).write_text(page(diagnosis, f"{args.log.name}, {vehicle.name}"), encoding="utf-8")
     if args.fix is not None and diagnosis.findings:
@@ -55,6 +62,18 @@ def run(args: argparse.Namespace) -> int:
             _tell(f"not mended: {finding.channel} {finding.kind}: its recording must be decoded otherwise")
         _tell(f"{args.fix}: the corrected profile; import the recording again with it")
     return 0 if diagnosis.passed else NOT_PASSED
+
+
+def _doubted(log: SignalLog) -> dict[str, str]:
+    """Controller flags of a log that carry no weight at some time, and why."""
+    from edge_agent.observe.controller_flags import doubted_flags, new_flag_records, trusted_context
+
+    flags, found = new_flag_records(1), dict[str, str]()
+    for block in log.blocks(0, rows=FLAG_ROWS):
+        if block.context is not None:
+            flags, _ = trusted_context(flags, block.t, block.signals, block.context)
+            found |= {name: reason for _, name, reason in doubted_flags(flags) if name not in found}
+    return found
 
 
 def _tell(line: str) -> None:

@@ -12,11 +12,15 @@ from schemas.thresholds import NS
 
 @dataclass(frozen=True)
 class Block:
-    """Samples of N vehicles: t (T, N) [s], the same instants as time (T, N) [ns UTC], signals (T, N, channels)."""
+    """Samples of N vehicles: t (T, N) [s], the same instants as time (T, N) [ns UTC], signals (T, N, channels).
+
+    `context` (T, N, len(CONTEXT)) is what controllers and surroundings say; None where the source knows nothing of it.
+    """
 
     t: FloatArray
     time: IntArray
     signals: FloatArray
+    context: FloatArray | None = None
 
 
 def absolute(t: FloatArray, start_ns: int) -> IntArray:

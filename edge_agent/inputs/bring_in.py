@@ -17,7 +17,7 @@ from edge_agent.inputs.readers import can_log, gnss, mdf, rosbag, tabular
 from edge_agent.inputs.readers.dbc import Database, read_dbc
 from edge_agent.inputs.recording import Recording, foreign
 from schemas.errors import InputError
-from schemas.signals import CHANNELS
+from schemas.signals import CHANNELS, CONTEXT
 from schemas.thresholds import NS
 
 PROVENANCE = b"gripmap.import"
@@ -85,7 +85,9 @@ def profile_of(log: Path) -> Profile:
         schema = pq.ParquetFile(log).schema_arrow
         if (provenance := (schema.metadata or {}).get(PROVENANCE)) is not None:
             return Profile.model_validate(json.loads(provenance)["profile"])
-        return Profile(name=log.stem[:64], channels={n: Channel(signal=n) for n in CHANNELS if n in schema.names})
+        return Profile(
+            name=log.stem[:64], channels={n: Channel(signal=n) for n in (*CHANNELS, *CONTEXT) if n in schema.names}
+        )
 
 
 def write_log(path: Path, merged: Merged, profile: Profile, sources: Sequence[str]) -> None:

@@ -15,13 +15,14 @@ from typing import Final
 
 import numpy as np
 
+from edge_agent.inputs.context import context_values, held_readings
 from edge_agent.inputs.profile import Channel, Profile
 from edge_agent.inputs.recording import Recording, Series
 from edge_agent.inputs.signal_log import GROUND
-from edge_agent.inputs.units import QUANTITY, to_si, understood
+from edge_agent.inputs.units import QUANTITY, ZEROS, to_si, understood
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
-from schemas.signals import CHANNELS
+from schemas.signals import CHANNELS, CONTEXT
 from schemas.thresholds import NS
 
 GNSS: Final = {  # channels that a receiver's recording fills by itself
@@ -88,7 +89,15 @@ def merge(
         source = recordings[place].name
         origins[name] = {"source": source, "signals": channel.signals, **_rates(one), "jitter_s": jitter}
     _still_courses(series)
+    context = {name: series.pop(name) for name in CONTEXT if name in series}
+    if not series:
+        raise InputError("profile", "no recording has any of the channels", "context alone is no drive")
     merged = _rows(series, profile, recordings, found)
+    for name, one in context.items():
+        if len(one.t) == len(merged.t) and np.array_equal(one.t, merged.t):
+            merged.columns[name] = one.values  # a table's own rows stay as they are
+        else:
+            merged.columns[name] = held_readings(name, one, merged.t, lasting=profile.channels[name].lasting)
     shift = merged.t[0]
     merged.t = merged.t - shift
     merged.start_ns = None if start_ns is None else start_ns + round(shift * NS)
@@ -99,7 +108,7 @@ def merge(
 def found_in(recordings: Sequence[Recording], profile: Profile) -> dict[str, tuple[int, Channel]]:
     """Channel -> the recording that has its signals, and how; a receiver fills what the profile's signals do not."""
     found: dict[str, tuple[int, Channel]] = {}
-    for name in (*CHANNELS, GROUND):
+    for name in (*CHANNELS, GROUND, *CONTEXT):
         asked = profile.channels.get(name)
         for place, recording in enumerate(recordings):
             if asked and asked.source in (None, recording.name) and set(asked.signals) <= recording.signals.keys():
@@ -183,6 +192,7 @@ def made(
                 where, f"is a speed in {unit}", "give the wheel's radius: --vehicle, or wheel_radius in the profile"
             )
         factor = known
+        values = values - ZEROS.get(unit, 0.0)
     if channel.at == "steering wheel":
         if ratio is None:
             raise InputError(
@@ -201,6 +211,8 @@ def made(
             values = np.where(np.isin(_held(recording.signals[gate], first.t), good), values, np.nan)
     if channel.course:
         values = np.mod(np.pi / 2.0 - values + np.pi, 2.0 * np.pi) - np.pi
+    if name in CONTEXT:
+        return Series(first.t, context_values(name, values, channel.active)), 0.0
     t, jitter = (first.t, 0.0) if recording.rows else steady(first.t)
     return Series(t, values), jitter
 
@@ -249,8 +261,8 @@ def _rows(
     recordings: Sequence[Recording],
     found: Mapping[str, tuple[int, Channel]],
 ) -> Merged:
-    sources = {place for place, _ in found.values()}
-    late = {profile.channels[name].delay_s for name in found if name in profile.channels}
+    sources = {place for name, (place, _) in found.items() if name in series}
+    late = {profile.channels[name].delay_s for name in series if name in profile.channels}
     if len(sources) == 1 and recordings[min(sources)].rows and len(late) == 1 and profile.rate_hz is None:
         t = next(iter(series.values())).t
         return Merged(t, {name: one.values for name, one in series.items()}, None)

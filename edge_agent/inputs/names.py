@@ -39,6 +39,21 @@ RULES: Final[dict[str, Rule]] = {
     "latitude": (r"^lat$|latitude|gps.*lat|breite", rf"{STATES}|acc|err|rate"),
     "longitude": (r"^lon$|^lng$|^long$|longitude|gps.*(lon|lng)|laenge$", rf"{STATES}|acc|err"),
     "yaw": (r"^yaw$|heading|course|track$", rf"{STATES}|rate|acc|err"),
+    **{
+        f"{name}_active": (
+            rf"\b({words})\b.*\b(act|active|aktiv|engaged|ctl|bremsung|eingriff|anf)\b",
+            rf"{STATES}|def\b|err|lamp|enabled|passi|switch|tast|off\b|mode",
+        )
+        for name, words in (("abs", "abs"), ("esc", "esc|esp|vsc|vdc"), ("tcs", "tcs|asr|trc|eds"))
+    },
+    "air_temperature": (
+        r"(outside|outdoor|ambient|aussen|out|air) (air )?temp",
+        rf"{STATES}|set|incar|cabin|intake|qbit|ind|int air",
+    ),
+    "wiper": (
+        r"(wiper|wischer|wiping).*(active|aktiv|is wiping|front|vorne)",
+        rf"{STATES}|rear|rr|hinten|wear|worn|err",
+    ),
 }
 STEERING: Final[Rule] = (
     r"^delta|steer|lenk.*winkel|sas.*angle|lwi",

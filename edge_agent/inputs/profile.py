@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from edge_agent.inputs.units import QUANTITY
 from schemas.config import explain
 from schemas.errors import InputError
+from schemas.signals import CONTEXT, FLAGS
 
 FOLDER: Final = Path(__file__).parent / "profiles"
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -52,6 +53,8 @@ class Channel(Part):
     valid: Annotated[dict[Text, list[Finite]], Field(description="signal -> values at which to believe it")] = {}
     wrap: Annotated[float | None, Field(gt=0.0, description="recorded values count modulo this (status bits)")] = None
     course: Annotated[bool, Field(description="a heading, clockwise from north")] = False
+    active: Annotated[list[Finite] | None, Field(description="values at which a flag is on; else all but 0")] = None
+    lasting: Annotated[bool, Field(description="sent when it changes: its last value holds")] = False
 
     @property
     def signals(self) -> list[str]:
@@ -94,6 +97,10 @@ class Profile(Part):
                 raise ValueError(f"there is no channel {name}; choose of {', '.join(QUANTITY)}")
             if channel.unit is not None and channel.unit not in QUANTITY[name]:
                 raise ValueError(f"{name} in {channel.unit}; choose of {', '.join(QUANTITY[name])}")
+            if channel.active is not None and name not in FLAGS:
+                raise ValueError(f"{name} has active values; only {', '.join(FLAGS)} have")
+            if channel.lasting and name not in CONTEXT:
+                raise ValueError(f"{name} is lasting; only {', '.join(CONTEXT)} may be")
         return self
 
     def needs(self) -> set[str]:

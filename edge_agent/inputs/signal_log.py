@@ -3,6 +3,7 @@
 Needed columns: `t` [s] or `timestamp`; ax, ay, yaw_rate; the four omega; delta_fl or delta_fr. Each of them must hold
 at least one reading. The other channels may be missing, and NaN or null is a missing reading anywhere.
 A front wheel whose steering angle has no column takes that of the other; rear wheels without a column do not steer.
+What controllers and surroundings say (`schemas.signals.CONTEXT`) may be there too.
 `timestamp` is an Arrow timestamp, or a number: integer ns since 1970 UTC, float s since 1970 UTC.
 Time may stand still (the estimator says so in `health`) but not go back.
 """
@@ -20,9 +21,10 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from edge_agent.inputs.block import Block, absolute
+from edge_agent.inputs.context import context_values
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
-from schemas.signals import CHANNELS, S, per_wheel
+from schemas.signals import CHANNELS, CONTEXT, S, per_wheel
 from schemas.thresholds import NS
 
 GROUND: Final = "gnss_speed"  # beside the channels; only the signal doctor reads it
@@ -40,12 +42,14 @@ class SignalLog:
     signals: FloatArray
     start_ns: int | None
     ground: FloatArray | None = None  # speed over ground (T,) [m/s], where a receiver's was imported
+    context: FloatArray | None = None  # (T, len(CONTEXT)), where a column of it is there
 
     def blocks(self, start_ns: int, rows: int = BLOCK_ROWS) -> Iterator[Block]:
         """The log in order, in blocks of at most `rows` samples; t = 0 is at `start_ns`."""
         for first in range(0, len(self.t), rows):
             t = self.t[first : first + rows, None]
-            yield Block(t, absolute(t, start_ns), self.signals[first : first + rows, None])
+            context = None if self.context is None else self.context[first : first + rows, None]
+            yield Block(t, absolute(t, start_ns), self.signals[first : first + rows, None], context)
 
 
 def read_log(path: Path) -> SignalLog:
@@ -67,19 +71,32 @@ def read_log(path: Path) -> SignalLog:
     _check(table, signals)
     fill_steering(signals, [name not in table.column_names for name in (*FRONT_STEERING, *REAR_STEERING)])
     ground = _numbers(table, GROUND) if GROUND in table.column_names else None
-    return SignalLog(t, signals, start_ns, ground)
+    return SignalLog(t, signals, start_ns, ground, _context(table))
 
 
 def _table(path: Path) -> pa.Table:
     try:
         with pq.ParquetFile(path) as file:
             present = set(file.schema_arrow.names)
-            return file.read(columns=[name for name in ("t", "timestamp", GROUND, *CHANNELS) if name in present])
+            return file.read(
+                columns=[name for name in ("t", "timestamp", GROUND, *CHANNELS, *CONTEXT) if name in present]
+            )
     except FileNotFoundError as error:
         raise InputError("log", f"{path} does not exist", "give the path of a signal log") from error
     except (OSError, pa.ArrowException) as error:
         reason = str(error).splitlines()[0]
         raise InputError("log", f"{path} is not a Parquet file ({reason})", "write the log as Parquet") from error
+
+
+def _context(table: pa.Table) -> FloatArray | None:
+    """Context (T, len(CONTEXT)), None where the log has no column of it."""
+    if not set(CONTEXT) & set(table.column_names):
+        return None
+    context = np.full((table.num_rows, len(CONTEXT)), np.nan)
+    for index, name in enumerate(CONTEXT):
+        if name in table.column_names:
+            context[:, index] = context_values(name, _numbers(table, name), None)
+    return context
 
 
 def _numbers(table: pa.Table, name: str) -> FloatArray:

@@ -6,7 +6,7 @@ import math
 import re
 from typing import Final
 
-from schemas.signals import CHANNELS, per_wheel
+from schemas.signals import CHANNELS, CONTEXT, FLAGS, per_wheel
 from schemas.thresholds import GRAVITY
 
 DEG: Final = math.pi / 180.0
@@ -17,6 +17,10 @@ ANGLE: Final = {"rad": 1.0, "deg": DEG}
 SPEED: Final = {"m/s": 1.0, "km/h": 1.0 / 3.6, "mph": 0.44704, "kn": 1852.0 / 3600.0}
 TORQUE: Final = {"N*m": 1.0, "kN*m": 1000.0}
 DEGREES: Final = {"deg": 1.0}
+FLAG: Final = {"1": 1.0}
+TEMPERATURE: Final = {"degC": 1.0, "degF": 5.0 / 9.0, "K": 1.0}
+SHARE: Final = {"1": 1.0, "%": 0.01}
+ZEROS: Final = {"degF": 32.0, "K": 273.15}  # what is taken off before the factor: 0 degC in these units
 # as written by others, in lower case without blanks -> ours
 SPELLINGS: Final = {
     "m/s2": "m/s^2", "m/s²": "m/s^2", "m/s/s": "m/s^2", "ms-2": "m/s^2", "mps2": "m/s^2", "m/s**2": "m/s^2",
@@ -24,6 +28,8 @@ SPELLINGS: Final = {
     "degps": "deg/s", "degree/s": "deg/s", "unit_degreofarcpersecon": "deg/s", "radps": "rad/s", "1/min": "rpm",
     "°": "deg", "degree": "deg", "degrees": "deg", "unit_degreofarc": "deg", "radian": "rad", "radians": "rad",
     "kph": "km/h", "kmh": "km/h", "km^h": "km/h", "kmph": "km/h", "unit_kilometerperhour": "km/h", "mps": "m/s",
+    "°c": "degC", "c": "degC", "degc": "degC", "celsius": "degC", "degreescelsius": "degC", "unit_degrecelsi": "degC",
+    "°f": "degF", "degf": "degF", "fahrenheit": "degF", "k": "K", "kelvin": "K", "percent": "%", "unit_percent": "%",
     "kt": "kn", "knot": "kn", "nm": "N*m", "n.m": "N*m", "n*m": "N*m", "unit_newtometer": "N*m",
 }  # fmt: skip
 
@@ -33,8 +39,9 @@ QUANTITY: Final[dict[str, dict[str, float]]] = {
     **dict.fromkeys(per_wheel("omega"), TURN_RATE | SPEED),
     **dict.fromkeys(per_wheel("torque"), TORQUE),
     "latitude": DEGREES, "longitude": DEGREES, "yaw": ANGLE,
+    **dict.fromkeys(FLAGS, FLAG), "air_temperature": TEMPERATURE, "wiper": SHARE,
 }  # fmt: skip
-assert set(QUANTITY) == set(CHANNELS)
+assert set(QUANTITY) == {*CHANNELS, *CONTEXT}
 
 
 def spelled(text: str) -> str:

@@ -19,14 +19,15 @@ from schemas.config import AgentConfig
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.jit import compiled
 from schemas.runtime.records import RecordArray, Records, records
-from schemas.signals import S
+from schemas.signals import CONTEXT, FLAGS, C, S
 from schemas.thresholds import EXCITED_SHARE, GRAVITY, NS, UTILISED_WINDOW_S
 from schemas.wire import Columns, Kind, column_types
 
 if TYPE_CHECKING:
     from edge_agent.estimators import Estimates
 
-ABS_UNKNOWN: Final = -1  # no slip controller is read yet
+FLAG_UNKNOWN: Final = -1
+KNOWN_SHARE: Final = 0.5  # of a visit's samples, from which on "not active" can be said of a flag
 WINDOW_NS: Final = int(UTILISED_WINDOW_S * NS)
 # No wheel uses more than this over what the vehicle feels: load moves to wheels that then bear more, and the wheels of
 # one driven axle, with half of the load or more, drive all of it. A reading of g is right to FELT_STD.
@@ -71,6 +72,8 @@ class Visit:
     parts: int  # that ended before
     earlier: Annotated[FloatArray, mugrid.BINS]  # log-likelihood of these, the larger of each: it was one or the other
     earlier_used: float  # least that was used in one of them
+    known: Annotated[FloatArray, len(CONTEXT)]  # samples at which each context signal was known
+    told: Annotated[FloatArray, len(CONTEXT)]  # its sum over these; of a flag the samples at which it was on
     driving: float  # squared accelerations of all samples, by direction [m²/s⁴]
     braking: float
     left: float
@@ -91,6 +94,7 @@ class Sample:
     mu_utilised: float
     ax: float  # as measured; NaN where it is not [m/s²]
     ay: float
+    context: Annotated[FloatArray, len(CONTEXT)]
     mu: float
     mu_lower: float
     mu_upper: float
@@ -113,16 +117,19 @@ class OpenVisits:
 
 def observe(
     before: OpenVisits, time: IntArray, located: Located, estimates: Estimates, config: AgentConfig,
-    signals: FloatArray | None = None,
+    signals: FloatArray | None = None, context: FloatArray | None = None,
 ) -> tuple[OpenVisits, RecordBlock, RecordBlock]:  # fmt: skip
     """Records of a block: time (T, N) [ns UTC] -> the carried visits, observations, states.
 
-    Without `signals` (T, N, channels) observations do not tell how the grip was used.
+    Without `signals` (T, N, channels) observations do not tell how the grip was used, and without `context`
+    (T, N, len(CONTEXT)) they tell nothing of controllers and surroundings.
     """
     after = OpenVisits(before.visits.copy(), before.slot.copy())
     ended = records(Visit, int(np.count_nonzero(located.closes)))
     jumps = _jumps(estimates)
-    count = _visit(time, located, _samples(estimates, signals), jumps, after.visits, ended, config.position_std)
+    count = _visit(
+        time, located, _samples(estimates, signals, context), jumps, after.visits, ended, config.position_std
+    )
     ended = ended[:count]
     return after, _observations(ended, estimates.evidence, config), _states(after, time, located, estimates, config)
 
@@ -143,14 +150,15 @@ def _jumps(estimates: Estimates) -> Jumps:
     return Jumps(row, told)
 
 
-def _samples(estimates: Estimates, signals: FloatArray | None) -> RecordArray:
-    """What visits take from the estimates and the accelerometers, as records (T, N)."""
+def _samples(estimates: Estimates, signals: FloatArray | None, context: FloatArray | None) -> RecordArray:
+    """What visits take from the estimates, the accelerometers and the context, as records (T, N)."""
     samples = records(Sample, *estimates.mu.shape)
     samples["speed"] = np.hypot(estimates.vx, estimates.vy)
     for name in ("health", "mu_utilised", "mu", "mu_lower", "mu_upper"):
         samples[name] = getattr(estimates, name)
     for name, channel in (("ax", S.AX), ("ay", S.AY)):
         samples[name] = np.nan if signals is None else signals[..., channel]
+    samples["context"] = np.nan if context is None else context
     return samples
 
 
@@ -192,6 +200,9 @@ def _begin(visit: Visit, time: int, cell: int, sector: int) -> None:
     visit.speed_sum, visit.latitude, visit.longitude, visit.yaw = 0.0, 0.0, 0.0, 0.0
     visit.travelled, visit.from_fix = 0.0, 0.0
     visit.part_time, visit.parts, visit.earlier_used = time, 0, np.inf
+    for i in range(len(visit.known)):
+        visit.known[i] = 0.0
+        visit.told[i] = 0.0
 
 
 @compiled
@@ -217,6 +228,10 @@ def _add(visit: Visit, time: int, sample: Sample, position_std: float) -> None:
     visit.samples += 1
     visit.health |= sample.health
     visit.speed_sum += sample.speed
+    for i in range(len(visit.known)):
+        if np.isfinite(sample.context[i]):
+            visit.known[i] += 1.0
+            visit.told[i] += sample.context[i]
     if np.isfinite(sample.ax + sample.ay):
         visit.driving += max(sample.ax, 0.0) ** 2
         visit.braking += max(-sample.ax, 0.0) ** 2
@@ -280,13 +295,28 @@ def _observations(ended: RecordArray, evidence: FloatArray | None, config: Agent
         "speed": ended["speed_sum"] / np.maximum(ended["samples"], 1),
         "log_likelihood": _likelihood(ended, evidence),
         "tyre_season": np.full(n, config.tyre_season),
-        "air_temperature": np.full(n, np.nan),
-        "abs_active": np.full(n, ABS_UNKNOWN),
+        **_context(ended),
         **_directions(ended),
     }
     limit = config.slippery_mu
     urgent = (upper < limit) | ((mu < limit) & (used >= EXCITED_SHARE * mu))
     return RecordBlock(Kind.OBSERVATION, _typed(Kind.OBSERVATION, columns), ended["vehicle"].copy(), urgent)
+
+
+def _context(ended: RecordArray) -> dict[str, NDArray[np.generic]]:
+    """What controllers and surroundings said during visits, (n,) each.
+
+    A flag is 1 where it was on at any sample, 0 where it was not and was known at KNOWN_SHARE of them, else unknown.
+    """
+    known, told = ended["known"], ended["told"]
+    enough = known[:, : len(FLAGS)] >= KNOWN_SHARE * np.maximum(ended["samples"], 1)[:, None]
+    flags = np.where(told[:, : len(FLAGS)] > 0.0, 1, np.where(enough, 0, FLAG_UNKNOWN))
+    mean = np.where(known > 0.0, told / np.maximum(known, 1.0), np.nan)
+    return {
+        **{name: flags[:, index] for index, name in enumerate(FLAGS)},
+        "air_temperature": mean[:, C.AIR_TEMPERATURE],
+        "wiper": mean[:, C.WIPER],
+    }
 
 
 def _likelihood(ended: RecordArray, evidence: FloatArray | None) -> NDArray[np.uint8]:

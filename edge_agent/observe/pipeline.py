@@ -11,6 +11,7 @@ import numpy as np
 
 from edge_agent.inputs.block import Block
 from edge_agent.observe.cell_tracker import NOWHERE, locate, new_tracks
+from edge_agent.observe.controller_flags import doubted_flags, new_flag_records, trusted_context
 from edge_agent.observe.observation_builder import OpenVisits, RecordBlock, observe
 from edge_agent.observe.trip_privacy import TripEnds
 from schemas.grid import SECTORS
@@ -52,6 +53,7 @@ class Pipeline:
         self._tracks, self._open = new_tracks(vehicles), OpenVisits.start(vehicles)
         self._ends = TripEnds(vehicles, config.trip_end_m, config.trip_end_s)
         self._last: Block | None = None
+        self._flags = new_flag_records(vehicles)
         self.seen: Seen | None = None
         self.grip: Grip | None = None
         self.places: IntArray = np.full(vehicles, NOWHERE)  # cell * 4 + sector at the block's end
@@ -60,8 +62,11 @@ class Pipeline:
         """Estimates, observations and states of a block of at least one sample, the latter two without trip ends."""
         self._tracks, located = locate(self._tracks, block.t, block.signals)
         estimates = self._bank.advance(block.t, block.signals, located.closes)
+        context = block.context
+        if context is not None:
+            self._flags, context = trusted_context(self._flags, block.t, block.signals, context)
         self._open, observations, states = observe(
-            self._open, block.time, located, estimates, self._config, block.signals
+            self._open, block.time, located, estimates, self._config, block.signals, context
         )
         self._last = block
         self.seen = Seen(located.latitude[-1], located.longitude[-1], located.yaw[-1], estimates.vx[-1], block.time[-1])
@@ -76,6 +81,10 @@ class Pipeline:
     def beliefs(self) -> tuple[FloatArray, FloatArray] | None:
         """What the estimators believe now, and the evidence of the visits so far; see `EstimatorBank.beliefs`."""
         return self._bank.beliefs()
+
+    def doubted_flags(self) -> list[tuple[int, str, str]]:
+        """Controller flags that carry no weight now: index of the vehicle, name of the flag, and why."""
+        return doubted_flags(self._flags)
 
     def finish(self) -> RecordBlock | None:
         """Close the open visits and return their observations; None when there was no sample.

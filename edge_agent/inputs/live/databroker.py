@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,6 +27,7 @@ class DatabrokerFeed(Feed):
         clock: the host's.
         address: host and port.
         paths: that the profile reads; those which the broker does not know are left out.
+        lasting: of these, the ones that are sent when they change.
         files: `ca`, the authority of its certificate, without which no TLS is spoken, and `token`, a JSON web token.
 
     Raises:
@@ -34,10 +35,12 @@ class DatabrokerFeed(Feed):
     """
 
     def __init__(
-        self, name: str, clock: HostClock, address: str, paths: Sequence[str], files: Mapping[str, str]
+        self, name: str, clock: HostClock, address: str, paths: Sequence[str], files: Mapping[str, str],
+        lasting: Iterable[str] = (),
     ) -> None:  # fmt: skip
         super().__init__(name, clock)
         self._grpc, self._address, self._paths = library("grpc"), address, sorted(paths)
+        self._lasting = frozenset(lasting)
         # protobuf's runtime is there with the core; the messages are made when a broker is asked for
         self._messages = library("edge_agent.inputs.live.kuksa.broker_pb2")
         try:
@@ -54,7 +57,8 @@ class DatabrokerFeed(Feed):
     def listen(self) -> None:
         """Hear updates until the broker goes.
 
-        Its first answer holds what it knew before, however old: not readings.
+        Its first answer holds what it knew before, however old: not readings, but of what is sent when it changes the
+        value of now.
         """
         with self._channel() as channel:
             known = self._known(channel)
@@ -67,8 +71,7 @@ class DatabrokerFeed(Feed):
             try:
                 for place, update in enumerate(self._call):
                     self.openings += not place
-                    if place:
-                        self._hear(update)
+                    self._hear(update, standing=not place)
                     if self.stopping.is_set():
                         return
             finally:
@@ -117,9 +120,12 @@ class DatabrokerFeed(Feed):
                 self.say(f"does not know {path}")
         return known
 
-    def _hear(self, update: Any) -> None:  # noqa: ANN401
+    def _hear(self, update: Any, *, standing: bool) -> None:  # noqa: ANN401
         for path, point in update.entries.items():
             kind = point.value.WhichOneof("typed_value")
-            if kind in NUMBERS:
+            if kind in NUMBERS and (not standing or path in self._lasting):
                 stamp = point.timestamp
-                self.hear(stamp.seconds * NS + stamp.nanos, (path, float(getattr(point.value, kind))))
+                at = stamp.seconds * NS + stamp.nanos
+                if standing:
+                    at = self.clock.start_ns + round(self.clock.now() * NS)
+                self.hear(at, (path, float(getattr(point.value, kind))))

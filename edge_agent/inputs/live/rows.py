@@ -17,6 +17,7 @@ from typing import Final
 import numpy as np
 
 from edge_agent.inputs.block import Block
+from edge_agent.inputs.context import context_signals, held_readings
 from edge_agent.inputs.live.feed import TICK_S, Feed, HostClock
 from edge_agent.inputs.merge import COURSE_SPEED, SPARSE, found_in, made, sampled
 from edge_agent.inputs.profile import Profile
@@ -24,7 +25,7 @@ from edge_agent.inputs.recording import Recording, Series
 from edge_agent.inputs.signal_log import GROUND, fill_steering
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
-from schemas.signals import CHANNELS, per_wheel
+from schemas.signals import CHANNELS, CONTEXT, per_wheel
 from schemas.thresholds import EARTH_RADIUS_M, NS
 from schemas.vehicle import Vehicle
 
@@ -64,6 +65,7 @@ class LiveRows:
             raise InputError("steering_ratio", "is not known", "give it in the profile or the vehicle file")
         self.rate_hz = profile.rate_hz or RATE_HZ
         self._readings: list[dict[str, Series]] = [{} for _ in feeds]
+        self._context = context_signals(profile)  # their last readings hold, and are kept
         self._used = dict.fromkeys(SPARSE, -math.inf)  # time of the last fix that has its row
         self._next = 0  # row
         self._date_ns: int | None = None
@@ -109,6 +111,7 @@ class LiveRows:
         self._next += size
         recordings = [self._recording(place, feed, t[0] - KEPT_S) for place, feed in enumerate(self.feeds)]
         signals = np.full((size, len(CHANNELS)), np.nan)
+        context = np.full((size, len(CONTEXT)), np.nan)
         self.ground = np.full(size, np.nan)
         fixes: dict[str, Series] = {}
         for name, (place, channel) in found_in(recordings, self._profile).items():
@@ -118,14 +121,17 @@ class LiveRows:
             except InputError:  # what says its sign has not come yet
                 continue
             series = Series(series.t - channel.delay_s, series.values)
-            if sparse:
+            if name in CONTEXT:
+                lasting = channel.lasting and self.feeds[place].trouble is None
+                context[:, CONTEXT.index(name)] = held_readings(name, series, t, lasting=lasting)
+            elif sparse:
                 fixes[name] = series
             else:
                 signals[:, CHANNELS.index(name)] = sampled(series, t, sparse=False)
         self._place(fixes, t, signals)
         self._steer(signals)
         time = self._start_ns() + np.rint(t * NS).astype(np.int64)
-        return Block(t[:, None], time[:, None], signals[:, None])
+        return Block(t[:, None], time[:, None], signals[:, None], context[:, None] if self._context else None)
 
     def _recording(self, place: int, feed: Feed, oldest: float) -> Recording:
         """What a source told lately."""
@@ -142,6 +148,8 @@ class LiveRows:
             kept[name] = Series(t[order], values[order], fresh.unit)
         for name, series in list(kept.items()):
             first = int(np.searchsorted(series.t, oldest))
+            if name in self._context:
+                first = max(min(first, int(np.searchsorted(series.t, oldest, side="right")) - 1), 0)
             if first == len(series.t):
                 del kept[name]
             elif first:

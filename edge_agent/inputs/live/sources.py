@@ -18,6 +18,7 @@ from typing import Final
 from urllib.parse import parse_qsl
 
 from edge_agent.inputs.bring_in import database_of
+from edge_agent.inputs.context import lasting_signals
 from edge_agent.inputs.live.can_bus import CanFeed, Decoder
 from edge_agent.inputs.live.databroker import DatabrokerFeed
 from edge_agent.inputs.live.feed import Feed, HostClock
@@ -79,7 +80,10 @@ def _open(source: str, profile: Profile, database: Database | None, clock: HostC
     if kind == "gpsd":
         return GpsdFeed(source, clock, _host(source, address, PORTS[kind]))
     if kind == "vss":
-        return DatabrokerFeed(source, clock, address or f"127.0.0.1:{PORTS[kind]}", sorted(profile.needs()), options)
+        return DatabrokerFeed(
+            source, clock, address or f"127.0.0.1:{PORTS[kind]}", sorted(profile.needs()), options,
+            lasting=lasting_signals(profile),
+        )  # fmt: skip
     if kind == "ros2":
         return _ros2(
             source,

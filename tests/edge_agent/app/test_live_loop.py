@@ -6,6 +6,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import pytest
 from edge_agent.app.live_loop import STATUS_EVERY_S, Progress, drive
 from edge_agent.estimators import create
 from edge_agent.inputs.block import Block
+from edge_agent.inputs.context import context_block
 from edge_agent.lab.simulation import SimulatedFleet
 from edge_agent.lab.simulation.blocks import blocks
 from edge_agent.lab.truth_file import TruthRecorder
@@ -104,6 +106,36 @@ def run(
     report = lambda progress: reported.append(progress.signals_s)  # noqa: E731
     progress = drive(parts, pipeline_of(fleet), basket, stop, report, **options)  # type: ignore[arg-type]
     return progress, basket, reported
+
+
+def test_a_simulated_source_hands_its_context_to_the_observations(caplog: pytest.LogCaptureFixture) -> None:
+    """Hand-made: the first car brakes with ABS now and then, the second one's lamp always burns, the third has none."""
+    fleet, parts = fleet_blocks(300)
+    for place, block in enumerate(parts):
+        abs_active = np.full(block.t.shape, np.nan)
+        abs_active[:, 0] = place % 50 > 40
+        abs_active[:, 1] = 1.0
+        parts[place] = replace(
+            block, context=context_block(*block.t.shape, {"abs_active": abs_active, "air_temperature": -3.0})
+        )
+    _, basket, _ = run(iter(parts), fleet, threading.Event(), clock=count(0.0, 0.1).__next__)
+    plain = Basket()
+    pipeline = pipeline_of(fleet)
+    for block in parts:
+        plain.offer(*pipeline.step(replace(block, context=None))[1:])
+    last = pipeline.finish()
+    assert last is not None
+    plain.offer(last)
+    whose, flag = basket.column(Kind.OBSERVATION, "vehicle"), basket.column(Kind.OBSERVATION, "abs_active")
+    assert set(flag[whose == 0].tolist()) == {0, 1}
+    assert set(flag[whose > 0].tolist()) == {-1}
+    filled = np.isfinite(basket.column(Kind.OBSERVATION, "air_temperature"))
+    assert filled.mean() >= 0.9
+    told = [record.getMessage() for record in caplog.records if "counts as unknown" in record.getMessage()]
+    assert told == ["vehicle 1: abs_active has been on since the start: it counts as unknown; correct the profile"]
+    for name in plain.taken[0].columns.keys() - {"abs_active", "air_temperature"}:
+        one, other = (b.column(Kind.OBSERVATION, name) for b in (plain, basket))
+        assert np.array_equal(one, other, equal_nan=one.dtype.kind == "f"), name
 
 
 def test_a_loop_that_keeps_up_is_not_behind_and_takes_its_time() -> None:

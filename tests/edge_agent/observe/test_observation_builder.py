@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import pytest
 
+from edge_agent.inputs.context import context_block
 from edge_agent.observe.cell_tracker import NOWHERE, locate
 from edge_agent.observe.observation_builder import FELT_STD, WHEEL_SHARE, OpenVisits, RecordBlock, observe
 from schemas import grid, mugrid
@@ -221,3 +222,32 @@ def test_without_position_there_is_no_state() -> None:
     assert not len(states.vehicle)
     assert not len(observations.vehicle)
     assert states.kind is Kind.STATE
+
+
+def test_an_observation_tells_what_controllers_and_surroundings_said_in_its_visit() -> None:
+    """East through cells at 10 m/s; the first visit has an intervention, the second hardly any reading."""
+    samples = 40
+    east = np.arange(samples)[:, None] * 1.0
+    block, reported = ground(east, np.zeros_like(east), np.zeros_like(east)), estimates(samples, 1)
+    _, located = locate(Watch.of(1).tracks, block.t, block.signals)
+    first, second = np.flatnonzero(located.closes[:, 0])[1:3]
+    given = {"abs_active": np.zeros((samples, 1)), "air_temperature": np.linspace(-2.0, 0.0, samples)[:, None]}
+    given["abs_active"][first - 1] = 1.0
+    given["abs_active"][first + 1 : second] = np.nan
+    given["wiper"] = np.where(np.arange(samples)[:, None] < first, 0.5, np.nan)
+    context = context_block(samples, 1, given)
+    reading = cast("Estimates", reported)
+    _, told, _ = observe(OpenVisits.start(1), block.time, located, reading, AgentConfig(), block.signals, context)
+    columns = told.columns
+    assert columns["abs_active"][:2].tolist() == [1, -1]
+    assert columns["esc_active"].tolist() == columns["tcs_active"].tolist() == [-1] * len(told.vehicle)
+    expected = [given["air_temperature"][rows, 0].mean() for rows in (slice(0, first), slice(first, second))]
+    assert columns["air_temperature"][:2].tolist() == pytest.approx(expected)
+    assert columns["wiper"][0] == 0.5
+    assert np.isnan(columns["wiper"][1])
+    _, plain, _ = observe(OpenVisits.start(1), block.time, located, reading, AgentConfig(), block.signals)
+    same = columns.keys() - {"abs_active", "air_temperature", "wiper"}
+    for name in same:
+        assert np.array_equal(columns[name], plain.columns[name], equal_nan=columns[name].dtype.kind == "f"), name
+    assert plain.columns["abs_active"].tolist() == [-1] * len(told.vehicle)
+    assert np.isnan(plain.columns["air_temperature"]).all()

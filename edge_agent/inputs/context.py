@@ -1,0 +1,89 @@
+"""Context signals: what controllers and surroundings say, from the readings of a source to the rows of a log.
+
+A flag or a temperature is not interpolated. A row has the last reading at or before its time, as long as that is not
+older than HELD_S; a channel that the profile calls `lasting` is sent when it changes, and holds until its next reading.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+
+from edge_agent.inputs.profile import Profile
+from edge_agent.inputs.recording import Series
+from schemas.numeric import BoolArray, FloatArray
+from schemas.signals import CONTEXT, FLAGS
+
+# Design parameters. A controller's flag comes at 10 to 100 Hz and lives as long as the intervention does; the air
+# and the wipers change slowly and come once or twice a second.
+HELD_S: Final = {name: 1.0 if name in FLAGS else 30.0 for name in CONTEXT}
+AIR_C: Final = (-60.0, 65.0)  # beyond what was ever measured on a road: codes for "no value" and broken sensors
+
+
+def context_values(name: str, values: FloatArray, active: Sequence[float] | None) -> FloatArray:
+    """Readings of a context signal in the log's unit, same shape.
+
+    Args:
+        name: of the signal, one of CONTEXT.
+        values: in its unit; NaN where there is none.
+        active: recorded values at which a flag is on; None: all but 0.
+
+    Returns:
+        Flags as 0 and 1, the wiper within 0 and 1, temperatures that can be true. NaN stays NaN.
+    """
+    if name in FLAGS:
+        on = values != 0.0 if active is None else np.isin(values, active)
+        return np.where(np.isfinite(values), on.astype(np.float64), np.nan)
+    if name == "wiper":
+        return np.clip(values, 0.0, 1.0)
+    return np.where((values >= AIR_C[0]) & (values <= AIR_C[1]), values, np.nan)
+
+
+def held_readings(name: str, series: Series, t: FloatArray, *, lasting: bool) -> FloatArray:
+    """The last reading at or before each time t (T,) [s], NaN where it is too old or there is none."""
+    known = np.isfinite(series.values)
+    times = series.t[known]
+    if not len(times):
+        return np.full(len(t), np.nan)
+    place = np.searchsorted(times, t + 1e-9, side="right") - 1
+    last = np.maximum(place, 0)
+    fresh = (place >= 0) & (lasting | (t - times[last] <= HELD_S[name]))
+    return np.where(fresh, series.values[known][last], np.nan)
+
+
+def lasting_signals(profile: Profile) -> set[str]:
+    """Whole names of the signals that are sent when they change."""
+    return {name for channel in profile.channels.values() if channel.lasting for name in channel.needs()}
+
+
+def context_signals(profile: Profile) -> set[str]:
+    """Whole names of the signals that context is made of."""
+    return {name for channel in CONTEXT if channel in profile.channels for name in profile.channels[channel].needs()}
+
+
+def context_block(
+    samples: int, vehicles: int, values: Mapping[str, FloatArray | BoolArray | float]
+) -> FloatArray:  # fmt: skip
+    """A block's context (T, N, len(CONTEXT)) from what a source knows; the rest is unknown.
+
+    The way in for a source that has no profile, a simulation for one:
+
+        Block(t, time, signals, context_block(*t.shape, {"abs_active": truth.abs, "air_temperature": -3.0}))
+
+    Args:
+        samples: T.
+        vehicles: N.
+        values: by the names of CONTEXT, each (T, N), (N,) or one number; flags may be boolean; NaN is unknown.
+
+    Raises:
+        KeyError: a name is not one of CONTEXT.
+        ValueError: a shape does not fit.
+    """
+    if unknown := values.keys() - set(CONTEXT):
+        raise KeyError(f"{sorted(unknown)[0]} is no context signal; use {', '.join(CONTEXT)}")
+    block = np.full((samples, vehicles, len(CONTEXT)), np.nan)
+    for name, value in values.items():
+        block[..., CONTEXT.index(name)] = context_values(name, np.asarray(value, dtype=np.float64), None)
+    return block

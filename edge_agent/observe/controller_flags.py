@@ -1,0 +1,126 @@
+"""Controller flags that cannot be true carry no weight: a lamp that always burns, a bit that was decoded wrongly.
+
+A flag counts as unknown
+
+- until it was read as off for OFF_S in this trip: what never was off tells nothing;
+- while the vehicle has stood for STANDING_S with the flag on: no controller acts on wheels that do not turn;
+- while it was on for more than MOST_ACTIVE of the last minutes, once it was on for LEAST_ACTIVE_S of them.
+
+Being off for OFF_S ends the second doubt, and the third ends as the share falls. Pure. A `FlagRecord` per vehicle and
+flag is carried between blocks, so that any split of the samples gives the same result.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+from schemas.runtime.records import RecordArray, Records, records
+from schemas.signals import FLAGS, S
+
+# Design parameters.
+OFF_S: Final = 1.0
+STANDING_S: Final = 5.0  # locked wheels stand still too, but a controller releases them within a fraction of a second
+MOST_ACTIVE: Final = 0.3  # of the time; a long way of ice is less, an average winter drive far less
+LEAST_ACTIVE_S: Final = 30.0  # a braking from 30 m/s to rest on ice of .1 lasts as long
+MEMORY_S: Final = 600.0  # over which the share is taken, with exponential forgetting
+MOST_STEP_S: Final = 0.5  # longer gaps count as this much
+STANDING_RATE: Final = 1.0  # [rad/s] of the fastest wheel: .3 m/s
+
+NEVER_OFF, STANDING, TOO_OFTEN = 1, 2, 4  # why a flag is doubted; these add up
+REASONS: Final = {
+    NEVER_OFF: "has been on since the start", STANDING: "is on while the vehicle stands", TOO_OFTEN: "is on too often",
+}  # fmt: skip
+
+
+class FlagRecord:
+    """What is carried of one flag of one vehicle, as a record."""
+
+    time: float  # of its last sample [s]
+    off: float  # for how long it was off without a break [s]
+    active: float  # for how long it was on, with forgetting [s]
+    known: float  # for how long it was known, with forgetting [s]
+    standing: float  # for how long it was on while the vehicle stood [s]
+    was_off: bool  # for OFF_S without a break, once
+    doubt: int  # why it is doubted: NEVER_OFF and others; 0 while it was never on
+
+
+def new_flag_records(vehicles: int) -> RecordArray:
+    """Records (N, len(FLAGS)) of vehicles whose flags nobody has read."""
+    made = records(FlagRecord, vehicles, len(FLAGS))
+    made["time"] = np.nan
+    return made
+
+
+def trusted_context(
+    before: RecordArray, t: FloatArray, signals: FloatArray, context: FloatArray
+) -> tuple[RecordArray, FloatArray]:
+    """Take out the flags that cannot be true.
+
+    Args:
+        before: (N, len(FLAGS)) records of the block before.
+        t: (T, N) [s].
+        signals: (T, N, channels), of which the wheel speeds tell whether the vehicle stands.
+        context: (T, N, len(CONTEXT)).
+
+    Returns:
+        the records to carry on, and the context with NaN in the place of flags that are doubted.
+    """
+    after, checked = before.copy(), context.copy()
+    wheels = np.abs(signals[..., S.OMEGA : S.OMEGA + 4])
+    with np.errstate(invalid="ignore"):
+        standing = np.where(np.isfinite(wheels).any(axis=-1), np.nan_to_num(wheels).max(axis=-1) < STANDING_RATE, False)
+    _check(after, t, standing.astype(np.float64), checked)
+    return after, checked
+
+
+def doubted_flags(record: RecordArray) -> list[tuple[int, str, str]]:
+    """Flags that are doubted now: index of the vehicle, name of the flag, and why."""
+    return [
+        (int(n), FLAGS[flag], " and ".join(REASONS[reason] for reason in REASONS if record["doubt"][n, flag] & reason))
+        for n, flag in np.argwhere(record["doubt"] > 0)
+    ]
+
+
+@compiled
+def _check(flags: Records[FlagRecord], t: FloatArray, standing: FloatArray, context: FloatArray) -> None:
+    """Sequential core of `trusted_context`: moves the records on, and takes doubtful flags out of the context."""
+    for k in range(t.shape[0]):
+        for n in range(t.shape[1]):
+            for i in range(3):
+                value = context[k, n, i]
+                if not np.isfinite(value):
+                    continue
+                record = flags[n, i]
+                dt = min(max(t[k, n] - record.time, 0.0), MOST_STEP_S) if np.isfinite(record.time) else 0.0
+                record.time = t[k, n]
+                _count(record, dt, value > 0.5, standing[k, n] > 0.5)
+                if value > 0.5 and record.doubt > 0:
+                    context[k, n, i] = np.nan
+
+
+@compiled
+def _count(record: FlagRecord, dt: float, on: bool, stands: bool) -> None:
+    """One more known sample of a flag, `dt` [s] after the one before."""
+    keep = np.exp(-dt / MEMORY_S)
+    record.known = record.known * keep + dt
+    record.active = record.active * keep + (dt if on else 0.0)
+    if on:
+        record.off = 0.0
+        if stands:
+            record.standing += dt
+    else:
+        record.off += dt
+        if record.off >= OFF_S:
+            record.was_off = True
+            record.standing = 0.0
+    record.doubt = 0
+    if on and not record.was_off:
+        record.doubt += NEVER_OFF
+    if record.standing >= STANDING_S:
+        record.doubt += STANDING
+    if record.active >= LEAST_ACTIVE_S and record.active > MOST_ACTIVE * record.known:
+        record.doubt += TOO_OFTEN
