@@ -94,7 +94,6 @@ class Sample:
     mu_utilised: float
     ax: float  # as measured; NaN where it is not [m/s²]
     ay: float
-    context: Annotated[FloatArray, len(CONTEXT)]
     mu: float
     mu_lower: float
     mu_upper: float
@@ -126,45 +125,48 @@ def observe(
     """
     after = OpenVisits(before.visits.copy(), before.slot.copy())
     ended = records(Visit, int(np.count_nonzero(located.closes)))
-    jumps = _jumps(estimates)
-    count = _visit(
-        time, located, _samples(estimates, signals, context), jumps, after.visits, ended, config.position_std
-    )
+    notes = _notes(estimates, context)
+    count = _visit(time, located, _samples(estimates, signals), notes, after.visits, ended, config.position_std)
     ended = ended[:count]
     return after, _observations(ended, estimates.evidence, config), _states(after, time, located, estimates, config)
 
 
-class Jumps(NamedTuple):
-    """Where the friction became another within a visit (T, N), and what its part before told: row of (k, 32) each."""
+class SampleNotes(NamedTuple):
+    """What some samples come with.
+
+    row, told: where the friction became another within a visit (T, N), and what its part before told: row of (k, 32).
+    context: (T, N, len(CONTEXT)); no rows where nothing is known.
+    """
 
     row: IntArray  # -1: nowhere
     told: FloatArray
+    context: FloatArray
 
 
-def _jumps(estimates: Estimates) -> Jumps:
+def _notes(estimates: Estimates, context: FloatArray | None) -> SampleNotes:
+    heard = np.zeros((0, 0, len(CONTEXT))) if context is None else np.ascontiguousarray(context)
     row = np.full(estimates.mu.shape, -1)
     if estimates.jumps is None or estimates.evidence is None:
-        return Jumps(row, np.zeros((0, mugrid.BINS)))
+        return SampleNotes(row, np.zeros((0, mugrid.BINS)), heard)
     told = estimates.evidence[estimates.jumps]
     row[estimates.jumps] = np.arange(len(told))
-    return Jumps(row, told)
+    return SampleNotes(row, told, heard)
 
 
-def _samples(estimates: Estimates, signals: FloatArray | None, context: FloatArray | None) -> RecordArray:
-    """What visits take from the estimates, the accelerometers and the context, as records (T, N)."""
+def _samples(estimates: Estimates, signals: FloatArray | None) -> RecordArray:
+    """What visits take from the estimates and the accelerometers, as records (T, N)."""
     samples = records(Sample, *estimates.mu.shape)
     samples["speed"] = np.hypot(estimates.vx, estimates.vy)
     for name in ("health", "mu_utilised", "mu", "mu_lower", "mu_upper"):
         samples[name] = getattr(estimates, name)
     for name, channel in (("ax", S.AX), ("ay", S.AY)):
         samples[name] = np.nan if signals is None else signals[..., channel]
-    samples["context"] = np.nan if context is None else context
     return samples
 
 
 @compiled
 def _visit(
-    time: IntArray, located: Located, samples: Records[Sample], jumps: Jumps, visits: Records[Visit],
+    time: IntArray, located: Located, samples: Records[Sample], notes: SampleNotes, visits: Records[Visit],
     ended: Records[Visit], position_std: float,
 ) -> int:  # fmt: skip
     """Sequential core: add each sample to its visit, write out a visit when the next begins; returns how many."""
@@ -184,11 +186,13 @@ def _visit(
                 elif located.outside[k, n]:
                     visit.from_fix = np.inf
                 _add(visit, time[k, n], samples[k, n], position_std)
+                if k < len(notes.context):
+                    _add_context(visit, notes.context[k, n])
                 if located.inside[k, n]:
                     visit.latitude, visit.longitude = located.latitude[k, n], located.longitude[k, n]
                     visit.yaw = located.yaw[k, n]
-                if jumps.row[k, n] >= 0:
-                    _begin_part(visit, time[k, n], jumps.told[jumps.row[k, n]])
+                if notes.row[k, n] >= 0:
+                    _begin_part(visit, time[k, n], notes.told[notes.row[k, n]])
     return count
 
 
@@ -228,10 +232,6 @@ def _add(visit: Visit, time: int, sample: Sample, position_std: float) -> None:
     visit.samples += 1
     visit.health |= sample.health
     visit.speed_sum += sample.speed
-    for i in range(len(visit.known)):
-        if np.isfinite(sample.context[i]):
-            visit.known[i] += 1.0
-            visit.told[i] += sample.context[i]
     if np.isfinite(sample.ax + sample.ay):
         visit.driving += max(sample.ax, 0.0) ** 2
         visit.braking += max(-sample.ax, 0.0) ** 2
@@ -240,6 +240,15 @@ def _add(visit: Visit, time: int, sample: Sample, position_std: float) -> None:
     grown = visit.leave_time - visit.part_time > WINDOW_NS
     visit.mu_utilised = max(visit.mu_utilised, sample.mu_utilised) if grown else sample.mu_utilised
     visit.mu, visit.mu_lower, visit.mu_upper = sample.mu, sample.mu_lower, sample.mu_upper
+
+
+@compiled
+def _add_context(visit: Visit, context: FloatArray) -> None:
+    """What controllers and surroundings say at one more sample of a visit, (len(CONTEXT),)."""
+    for i in range(len(context)):
+        if np.isfinite(context[i]):
+            visit.known[i] += 1.0
+            visit.told[i] += context[i]
 
 
 @compiled
