@@ -59,6 +59,14 @@ ORACLE_HEAD: Final = """\
 
 Two bars of the papers that are hard, and an oracle on the same sensors (`oracle.py`): a Bayesian who knows the friction
 and the motion, and knows everything but what vehicle file and data sheet leave open."""
+DETECTION_HEAD: Final = """\
+# Detection
+
+Towns drawn by seeds that nobody tuned on, rough cars and plain cars apart; short: 120 s, long: 900 s, because faults
+that silence a car only show there. Definitions: `edge_agent/lab/evaluation/detection.py`. ± is the standard error over
+towns. `flag`: ordinary ABS and ESC logic on the same signals (`slip_flag.py`); `oracle`: an observer who knows motion
+and forces (`slide_oracle.py`); `roc`: the estimator's belief at other thresholds. Cars under which ice appeared while
+they stood are counted as `stood` and nowhere else."""
 FRICTION: Final = ("paper-aco-fckf", "federated-ckf", "sr-ukf")  # papers' estimators that estimate friction
 SHOWN_LEVELS: Final = LEVELS[::2]
 
@@ -216,3 +224,30 @@ def reliability(values: dict[str, float]) -> str:
         for name in estimators(values, "reliability.", ".below_05")
     ]
     return grid(("estimator", *(f"{100 * level:.0f} %" for level in SHOWN_LEVELS)), rows)
+
+
+def detection_report(figures: Sequence[Figure]) -> str:
+    """Return the report of the detection judge."""
+    return f"{DETECTION_HEAD}\n\n{detection_table(figures)}\n"
+
+
+def detection_table(figures: Sequence[Figure]) -> str:
+    """Return one row per figure of the detection judge: rough and plain cars with standard errors, and the bars."""
+    by_name = {figure.name: figure for figure in figures}
+    names = dict.fromkeys(name.rpartition(".")[0] for name in by_name if not name.endswith(".se"))
+    rows = []
+    for name in names:
+        cells, limits, held = [], [], []
+        for kind in ("rough", "plain"):
+            figure, error = by_name.get(f"{name}.{kind}"), by_name.get(f"{name}.{kind}.se")
+            shown = figure is not None and not math.isnan(figure.value)
+            cells.append(
+                f"{figure.value:.3g}" + (f" ± {error.value:.1g}" if error else "") if figure and shown else "–"
+            )
+            if figure is not None and figure.bar is not None:
+                limits.append(f"{figure.bar:g}")
+                held += [figure.holds] if shown else []
+        sign = "" if not limits else "≤ " if by_name[f"{name}.rough"].better == "less" else "≥ "
+        verdict_ = "" if not held else "holds" if all(held) else "✗"
+        rows.append([f"`{name}`", *cells, sign + "; ".join(dict.fromkeys(limits)), verdict_])
+    return grid(("figure", "rough", "plain", "bar", ""), rows)

@@ -55,7 +55,8 @@ GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0  # multiples of it, modulo 1, are spread e
 class Truth:
     """What was true in a block, (T, N) or (T, N, 4): pose [m, m, rad], speed [m/s], friction, |F|/(μ F_z).
 
-    ax, ay: what an accelerometer feels [m/s^2]; slope: rise of the road per metre ahead.
+    ax, ay: acceleration that an accelerometer measures [m/s^2]; slope: rise of the road per metre ahead.
+    theta: normalised slip of each wheel; a wheel slides beyond about 2.6.
     """
 
     x: FloatArray
@@ -69,6 +70,7 @@ class Truth:
     ax: FloatArray
     ay: FloatArray
     slope: FloatArray
+    theta: FloatArray
 
 
 @compiled
@@ -77,7 +79,7 @@ def run(
     ground: tuple[Lanes, FloatArray, FloatArray], keys: tuple[KeyArray, KeyArray], first: int, steps: int,
     timing: tuple[float, int],
 ) -> FloatArray:  # fmt: skip
-    """Records (T, N, 32) of the next `steps` samples; the states are carried on in place.
+    """Records (T, N, RECORD) of the next `steps` samples; the states are carried on in place.
 
     states: vehicles (N, 12), drivers (N, 10), routes (N, 4), wheels (N, 8, 4); ground: lanes, tables
     of friction and of relief; keys: of routes and of alerts (N,);
@@ -216,14 +218,20 @@ def _truth(records: FloatArray) -> Truth:
         records[..., column]
         for column in (RecordColumn.X, RecordColumn.Y, RecordColumn.YAW, RecordColumn.VX, RecordColumn.VY)
     )
-    wheels = (
-        records[..., RecordColumn.MU : RecordColumn.MU + 4],
-        records[..., RecordColumn.UTILISATION : RecordColumn.UTILISATION + 4],
+    return Truth(
+        x,
+        y,
+        yaw,
+        vx,
+        vy,
+        mu_wheel=records[..., RecordColumn.MU : RecordColumn.MU + 4],
+        utilisation=records[..., RecordColumn.UTILISATION : RecordColumn.UTILISATION + 4],
+        yaw_rate=records[..., RecordColumn.YAW_RATE],
+        ax=records[..., RecordColumn.AX],
+        ay=records[..., RecordColumn.AY],
+        slope=records[..., RecordColumn.SLOPE],
+        theta=records[..., RecordColumn.THETA : RecordColumn.THETA + 4],
     )
-    felt = (
-        records[..., column] for column in (RecordColumn.YAW_RATE, RecordColumn.AX, RecordColumn.AY, RecordColumn.SLOPE)
-    )
-    return Truth(x, y, yaw, vx, vy, *wheels, *felt)
 
 
 def _start(

@@ -305,14 +305,15 @@ class RecordColumn(IntEnum):
     UTILISATION = 26  # |F| / (μ F_z)
     SLOPE = 30  # rise of the road per metre ahead
     BANK = 31  # and to the left
+    THETA = 32  # four wheels: normalised slip; beyond about 2.6 a wheel slides
 
 
-RECORD: Final = 32
+RECORD: Final = 36
 
 
 @compiled
 def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: FloatArray) -> None:
-    """Fill `record` (32,) with what is true at this instant under the inputs `u`; fills `w` too."""
+    """Fill `record` (RECORD,) with what is true at this instant under the inputs `u`; fills `w` too."""
     wheel_forces(x, p, u, w)
     ax, ay, _ = body_accelerations(x, p, u, w)
     record[RecordColumn.AX], record[RecordColumn.AY] = ax, ay
@@ -334,6 +335,7 @@ def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: 
         record[RecordColumn.UTILISATION + i] = math.hypot(w[Wheel.FX, i], w[Wheel.FY, i]) / (
             u[Control.MU, i] * w[Wheel.FZ, i]
         )
+        record[RecordColumn.THETA + i] = w[Wheel.THETA, i]
     record[RecordColumn.SLOPE], record[RecordColumn.BANK] = u[Control.TILT, 0], u[Control.TILT, 1]
     if held(x, p, u):
         _observe_held(x, p, u, record)
@@ -350,6 +352,7 @@ def _observe_held(x: FloatArray, p: FloatArray, u: FloatArray, record: FloatArra
     for i in range(4):
         brake_share = p[TrueParameter.BRAKE_FRONT] if i < 2 else 1.0 - p[TrueParameter.BRAKE_FRONT]
         record[RecordColumn.OMEGA + i] = 0.0
+        record[RecordColumn.THETA + i] = 0.0
         record[RecordColumn.TORQUE + i] = -0.5 * brake_share * p[Parameter.MASS] * along * p[Parameter.RADIUS]
         record[RecordColumn.UTILISATION + i] = math.hypot(along, across) / (u[Control.MU, i] * GRAVITY * share)
 

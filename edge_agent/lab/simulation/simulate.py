@@ -119,7 +119,7 @@ class ProvingGround(NamedTuple):
 def _drive(
     manoeuvre: Manoeuvre, truth: TrueVehicle, world: ProvingGround, speed: float, rate_hz: float, samples: int
 ) -> FloatArray:
-    """True records (T, 32) of the drive; the driver gives as much more gas as a slope takes."""
+    """True records (T, RECORD) of the drive; the driver gives as much more gas as a slope takes."""
     p, x, u, w = truth.row(), np.zeros(STATES), np.zeros((len(Control), 4)), np.zeros((len(Wheel), 4))
     records = np.empty((samples, RECORD))
     substeps, dt = substeps_of(rate_hz), 1.0 / rate_hz
