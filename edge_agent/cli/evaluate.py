@@ -130,7 +130,7 @@ def _ahead(args: argparse.Namespace, count: int) -> int:
 
 
 def _detection(args: argparse.Namespace, count: int) -> int:
-    from edge_agent.lab.evaluation.bars import detection_figures
+    from edge_agent.lab.evaluation.detection_bars import detection_figures
     from edge_agent.lab.evaluation.detection_campaign import campaign
     from edge_agent.lab.evaluation.report import detection_report
     from edge_agent.lab.seeds import FIGURES

@@ -18,14 +18,15 @@ Legend
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from edge_agent.lab.evaluation.detection_drives import RATE_HZ, DetectionDrive, slippery_favoured
-from edge_agent.lab.evaluation.real_world import SETTLED_S, interval_score, lately
+from edge_agent.lab.evaluation.real_world import FALSE_GRIP, SETTLED_S, interval_score, lately
 from edge_agent.lab.evaluation.slide_oracle import visit_evidence
 from edge_agent.lab.evaluation.slip_flag import FLAGGED_MU
 from schemas.numeric import FloatArray
@@ -44,7 +45,6 @@ FAVOURED_NATS: Final = 3.0
 MOVES: Final = 0.1
 PASS_S: Final = 0.5
 EVENT_GAP_S: Final = 1.0
-FALSE_GRIP: Final = 0.05
 ICE_MU: Final = SURFACES["ice"][1]
 SNOW_MU: Final = SURFACES["snow"][1]
 ROC_NATS: Final = (0.5, 1.0, 2.0, 3.0, 5.0, 8.0)
@@ -211,7 +211,7 @@ def _judge_slides(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
 
 
 def _judge_contradictions(tally: DetectionTally, drive: DetectionDrive, n: int, slides: Stretches) -> None:
-    """Onsets of CONTRADICTION in slides on slippery road, and outside of all slides, per second of each."""
+    """Onsets of CONTRADICTION in slides on slippery road and outside of slides, and the seconds of each without it."""
     sliding, extended = np.zeros(len(drive.mu), np.bool_), np.zeros(len(drive.mu), np.bool_)
     for first, end in slides:
         sliding[first:end] = True
@@ -224,8 +224,8 @@ def _judge_contradictions(tally: DetectionTally, drive: DetectionDrive, n: int, 
     in_slide = extended[onset]
     tally.add("contradictions.slide", np.array([float((in_slide & was_low[onset]).sum())]))
     tally.add("contradictions.elsewhere", np.array([float((~in_slide).sum())]))
-    tally.add("s.slide", np.array([float((sliding & low).sum()) / RATE_HZ]))
-    tally.add("s.elsewhere", np.array([float((~sliding).sum()) / RATE_HZ]))
+    tally.add("s.slide", np.array([float((sliding & low & ~flagged).sum()) / RATE_HZ]))
+    tally.add("s.elsewhere", np.array([float((~sliding & ~flagged).sum()) / RATE_HZ]))
 
 
 def _judge_false_events(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
@@ -274,14 +274,28 @@ def _note_visit(tally: DetectionTally, kind: str, likelihood: FloatArray, slid: 
         tally.note(f"{kind}favoured{among}{slid[1]}", holds=favoured)
 
 
+class TownTally(NamedTuple):
+    """What one town told, and whether it was a winter town."""
+
+    winter: bool
+    tally: DetectionTally
+
+
 @dataclass
 class DetectionResults:
-    """Tallies by (length, kind): of all towns together, and of each town."""
+    """Tallies of towns by (length, kind)."""
 
-    pooled: dict[tuple[str, str], DetectionTally] = field(default_factory=dict)
-    towns: dict[tuple[str, str], list[DetectionTally]] = field(default_factory=dict)
+    towns: dict[tuple[str, str], list[TownTally]] = field(default_factory=dict)
 
-    def add(self, length: str, kind: str, tally: DetectionTally) -> None:
+    def add(self, length: str, kind: str, town: TownTally) -> None:
         """Add a town."""
-        self.pooled.setdefault((length, kind), DetectionTally()).merge(tally)
-        self.towns.setdefault((length, kind), []).append(tally)
+        self.towns.setdefault((length, kind), []).append(town)
+
+    def pooled(self, lengths: Sequence[str], kind: str, *, winter: bool | None = None) -> DetectionTally:
+        """Return all towns of a kind together, or the winter towns, or the others."""
+        found = DetectionTally()
+        for length in lengths:
+            for town in self.towns.get((length, kind), []):
+                if winter is None or town.winter == winter:
+                    found.merge(town.tally)
+        return found

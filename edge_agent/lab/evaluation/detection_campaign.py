@@ -1,7 +1,10 @@
 """Detection campaign: towns of rough and of plain cars, short and long, judged one after the other.
 
-`python -m edge_agent.lab.evaluation.detection_campaign 50001:rough 50002:plain:900` judges chosen towns and prints a
-table; each is SEED, SEED:KIND or SEED:KIND:SECONDS.
+Half of the towns are winter towns, in which all cars have winter equipment. Chosen towns, with a table:
+
+    python -m edge_agent.lab.evaluation.detection_campaign 50001:rough 50002:plain:900 50003:rough:120:winter
+
+Each is SEED, SEED:KIND, SEED:KIND:SECONDS or SEED:KIND:SECONDS:winter.
 """
 
 from __future__ import annotations
@@ -15,10 +18,13 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from edge_agent.app.estimator_factory import bank_of
-from edge_agent.lab.evaluation.bars import detection_figures
-from edge_agent.lab.evaluation.detection import KINDS, DetectionResults, judge_drive
-from edge_agent.lab.evaluation.detection_drives import BankMaker, drive_town
+from edge_agent.lab.evaluation.detection import KINDS, DetectionResults, TownTally, judge_drive
+from edge_agent.lab.evaluation.detection_bars import detection_figures
+from edge_agent.lab.evaluation.detection_drives import RATE_HZ, BankMaker, DetectionDrive, drive_fleet
+from edge_agent.lab.evaluation.real_world import in_winter
 from edge_agent.lab.evaluation.report import detection_table
+from edge_agent.lab.simulation import SimulatedFleet
+from edge_agent.lab.simulation.scenarios import drawn, winter
 from schemas.errors import InputError
 from schemas.runtime.figures import Figure
 
@@ -34,12 +40,13 @@ DEFAULT: Final = "aco-fckf"
 
 
 class DetectionTown(NamedTuple):
-    """A town to judge: its seed, "rough" or "plain", how long it lasts [s] and how many cars drive in it."""
+    """A town to judge: its seed, "rough" or "plain" cars, length [s], how many cars, and whether it is winter there."""
 
     seed: int
     kind: str
     seconds: float
     cars: int = CARS
+    winter: bool = False
 
     @property
     def length(self) -> str:
@@ -48,12 +55,23 @@ class DetectionTown(NamedTuple):
 
 
 def towns(seeds: Sequence[int], *, quick: bool) -> list[DetectionTown]:
-    """Return the towns of the campaign: short and long ones have seeds of their own, both kinds the same ones."""
+    """Return the towns of the campaign: short and long ones have seeds of their own, both kinds the same ones.
+
+    Towns with an odd seed are winter towns.
+    """
     if quick:
-        return [DetectionTown(seeds[0], kind, QUICK_S, QUICK_CARS) for kind in KINDS]
+        return [DetectionTown(seeds[0], kind, QUICK_S, QUICK_CARS, winter=kind == "plain") for kind in KINDS]
     short, long = seeds[:SHORT_TOWNS], seeds[SHORT_TOWNS:][:LONG_TOWNS] or seeds[:LONG_TOWNS]
-    found = [DetectionTown(seed, kind, SHORT_S) for kind in KINDS for seed in short]
-    return found + [DetectionTown(seed, kind, LONG_S) for kind in KINDS for seed in long]
+    lengths = [(seed, SHORT_S) for seed in short] + [(seed, LONG_S) for seed in long]
+    return [DetectionTown(seed, kind, s, winter=in_winter(seed)) for kind in KINDS for seed, s in lengths]
+
+
+def drive_town(town: DetectionTown, make_bank: BankMaker) -> DetectionDrive:
+    """Drive and estimate a town."""
+    scenario = winter(town.seed) if town.winter else drawn(town.seed)
+    rough = float(town.kind == "rough")
+    fleet = SimulatedFleet(scenario, town.cars, town.seed, RATE_HZ, rough=rough, winter=float(town.winter))
+    return drive_fleet(fleet, make_bank(fleet.vehicles), town.seconds)
 
 
 def judge_towns(
@@ -62,12 +80,11 @@ def judge_towns(
     """Drive and judge towns; `oracle`: ask the oracle about short towns; `log_line` gets a line per town."""
     results = DetectionResults()
     for town in chosen:
-        drive = drive_town(town.seed, make_bank, town.cars, town.seconds, float(town.kind == "rough"))
-        tally = judge_drive(drive, oracle=oracle and town.length == "short")
-        results.add(town.length, town.kind, tally)
+        tally = judge_drive(drive_town(town, make_bank), oracle=oracle and town.length == "short")
+        results.add(town.length, town.kind, TownTally(town.winter, tally))
         log_line(
-            f"town {town.seed}, {town.kind}, {town.seconds:.0f} s: ice visits with a value "
-            f"{tally.mean('ice.yield'):.2f}, passes found {tally.mean('passes.ice'):.2f}, "
+            f"town {town.seed}{' in winter' if town.winter else ''}, {town.kind}, {town.seconds:.0f} s: "
+            f"ice visits with a value {tally.mean('ice.yield'):.2f}, passes found {tally.mean('passes.ice'):.2f}, "
             f"false ice {tally.mean('false_ice'):.5f}"
         )
     return results
@@ -81,21 +98,24 @@ def campaign(
 
 
 def town_named(text: str) -> DetectionTown:
-    """Return the town of SEED[:KIND[:SECONDS]].
+    """Return the town of SEED[:KIND[:SECONDS[:winter]]].
 
     Raises:
         InputError: it is not one.
     """
-    seed, kind, seconds = [*text.split(":"), *("rough", "120")[len(text.split(":")) - 1 :]][:3]
-    if not seed.isdecimal() or kind not in KINDS or not seconds.replace(".", "", 1).isdecimal():
-        raise InputError("town", f"{text!r} is no town", "give SEED, SEED:rough or SEED:plain:900")
-    return DetectionTown(int(seed), kind, float(seconds))
+    usual = ("", "rough", "120", "")
+    given = text.split(":")
+    seed, kind, seconds, season = [*given, *usual[len(given) :]][:4]
+    sound = seed.isdecimal() and kind in KINDS and seconds.replace(".", "", 1).isdecimal() and season in ("", "winter")
+    if len(given) > len(usual) or not sound:
+        raise InputError("town", f"{text!r} is no town", "give SEED, SEED:plain:900 or SEED:plain:900:winter")
+    return DetectionTown(int(seed), kind, float(seconds), winter=season == "winter")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Judge the named towns and print a table."""
     parse = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parse.add_argument("towns", nargs="+", type=town_named, help="SEED, SEED:KIND or SEED:KIND:SECONDS")
+    parse.add_argument("towns", nargs="+", type=town_named, help="SEED, SEED:KIND, SEED:KIND:SECONDS[:winter]")
     parse.add_argument("--estimator", default=DEFAULT)
     parse.add_argument("--cars", type=int, default=CARS)
     parse.add_argument("--no-oracle", action="store_true")

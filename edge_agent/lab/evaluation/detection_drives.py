@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from edge_agent.estimators import Estimates, EstimatorBank
 from edge_agent.lab.evaluation.slip_flag import friction_flagged
 from edge_agent.lab.simulation import SimulatedFleet
-from edge_agent.lab.simulation.scenarios import drawn
 from edge_agent.observe.cell_tracker import locate, new_tracks
 from edge_agent.observe.observation_builder import OpenVisits, observe
 from schemas import mugrid
@@ -75,12 +74,6 @@ class DetectionDrive:
     flagged: Samples
     stood: BoolArray
     visits: DetectionVisits
-
-
-def drive_town(seed: int, make_bank: BankMaker, cars: int, seconds: float, rough: float) -> DetectionDrive:
-    """Drive `cars` cars for `seconds` through the town that the seed draws, and estimate; `rough`: share of them."""
-    fleet = SimulatedFleet(drawn(seed), cars, seed, RATE_HZ, rough=rough)
-    return drive_fleet(fleet, make_bank(fleet.vehicles), seconds)
 
 
 def drive_fleet(fleet: SimulatedFleet, bank: EstimatorBank, seconds: float) -> DetectionDrive:

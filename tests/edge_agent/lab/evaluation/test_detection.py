@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from edge_agent.app.estimator_factory import bank_of
-from edge_agent.lab.evaluation.bars import DETECTION, detection_figures
 from edge_agent.lab.evaluation.detection import (
     DetectionResults,
     DetectionTally,
@@ -17,6 +16,7 @@ from edge_agent.lab.evaluation.detection import (
     runs_of,
     slides_of,
 )
+from edge_agent.lab.evaluation.detection_bars import DETECTION, detection_figures
 from edge_agent.lab.evaluation.detection_campaign import DetectionTown, judge_towns, town_named, towns
 from edge_agent.lab.evaluation.detection_drives import (
     DetectionDrive,
@@ -48,12 +48,22 @@ def drive_saying(lower: float, upper: float) -> DetectionDrive:
     likelihood[0, CENTRES > 0.3] = -5.0
     visits = DetectionVisits(np.array([0, 0]), np.array([250, 700]), np.array([550, 900]), likelihood)
     return DetectionDrive(
-        speed=10.0 * ones, ax=-1.0 * ones, ay=0.0 * ones, mu=mu, mu_wheel=wheels, theta=theta,
-        used=np.where(theta > 0.0, 0.95, 0.1).astype(np.float32), lower=lower * ones, median=lower * ones,
-        upper=upper * ones, health=np.zeros((SAMPLES, 1), np.int32), favoured=0.0 * ones,
+        speed=10.0 * ones,
+        ax=-1.0 * ones,
+        ay=0.0 * ones,
+        mu=mu,
+        mu_wheel=wheels,
+        theta=theta,
+        used=np.where(theta > 0.0, 0.95, 0.1).astype(np.float32),
+        lower=lower * ones,
+        median=lower * ones,
+        upper=upper * ones,
+        health=np.zeros((SAMPLES, 1), np.int32),
+        favoured=0.0 * ones,
         flagged=np.where(theta[..., 0] > 0.0, 0.1, np.inf).astype(np.float32),
-        stood=np.zeros((SAMPLES, 1), np.bool_), visits=visits,
-    )  # fmt: skip
+        stood=np.zeros((SAMPLES, 1), np.bool_),
+        visits=visits,
+    )
 
 
 def test_an_estimator_that_always_reports_ice_misses_none_and_is_false_everywhere() -> None:
@@ -132,13 +142,14 @@ def test_the_oracle_finds_the_friction_of_a_slide_and_only_bounds_it_without() -
 
 def test_a_town_goes_through_the_whole_pipeline_and_fills_the_table() -> None:
     lines: list[str] = []
-    chosen = [DetectionTown(FIGURES, "rough", 45.0, 3)]
+    chosen = [DetectionTown(FIGURES, "rough", 45.0, 3), DetectionTown(FIGURES, "rough", 45.0, 3, winter=True)]
     results = judge_towns(chosen, lambda vehicles: bank_of("aco-fckf", vehicles), lines.append)
     found = {figure.name: figure.value for figure in detection_figures(results)}
-    assert len(lines) == 1
+    assert len(lines) == 2
+    assert found["coverage90.dry.short.rough.winter"] != found["coverage90.dry.short.rough.other"]
     assert 0.0 <= found["false_ice.short.rough"] < 0.05
     assert 0.5 < found["coverage90.dry.short.rough"] <= 1.0
-    assert results.pooled["short", "rough"].count["false_visits"] > 20
+    assert results.pooled(["short"], "rough").count["false_visits"] > 20
     table = detection_table(detection_figures(results))
     assert "| `coverage90.ice.short` |" in table
 
@@ -150,6 +161,9 @@ def test_names_of_detection_figures_are_unique_and_towns_are_named() -> None:
     assert town_named("50001") == DetectionTown(50001, "rough", 120.0)
     with pytest.raises(InputError, match="town"):
         town_named("50001:wet")
-    assert {town.length for town in towns(range(20), quick=False)} == {"short", "long"}
+    assert town_named("50003:rough:120:winter").winter
+    campaign = towns(range(20), quick=False)
+    assert {town.length for town in campaign} == {"short", "long"}
+    assert sum(town.winter for town in campaign) == len(campaign) / 2
     assert not detection_figures(DetectionResults())
     assert np.isnan(DetectionTally().mean("nothing"))
