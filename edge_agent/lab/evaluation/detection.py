@@ -188,8 +188,9 @@ def _judge_passes(tally: DetectionTally, drive: DetectionDrive, n: int, slides: 
             if slid is None:
                 continue
             activity = activity_of(drive, n, slid[0], min(slid[1], end))
-            tally.note(f"passes.{kind}.{activity}", holds=bool(called.any()))
-            tally.note(f"flag.passes.{kind}.{activity}", holds=bool(flag.any()))
+            for among in ("slide", activity):
+                tally.note(f"passes.{kind}.{among}", holds=bool(called.any()))
+                tally.note(f"flag.passes.{kind}.{among}", holds=bool(flag.any()))
             for name, found in (("seconds", called), ("flag.seconds", flag)):
                 if found.any():
                     wait = max(0.0, (first + int(np.argmax(found)) - slid[0]) / RATE_HZ)
@@ -275,7 +276,7 @@ def _note_visit(tally: DetectionTally, kind: str, likelihood: FloatArray, slid: 
 
 
 class TownTally(NamedTuple):
-    """What one town told, and whether it was a winter town."""
+    """Tally of one town, with its season."""
 
     winter: bool
     tally: DetectionTally
@@ -291,7 +292,7 @@ class DetectionResults:
         """Add a town."""
         self.towns.setdefault((length, kind), []).append(town)
 
-    def pooled(self, lengths: Sequence[str], kind: str, *, winter: bool | None = None) -> DetectionTally:
+    def pool_towns(self, lengths: Sequence[str], kind: str, *, winter: bool | None = None) -> DetectionTally:
         """Return all towns of a kind together, or the winter towns, or the others."""
         found = DetectionTally()
         for length in lengths:

@@ -113,7 +113,7 @@ DETECTION: Final = (
             "coverage90.snow",
             "coverage90.wet",
             "coverage90.dry",
-            *(f"passes.ice.{activity}" for activity in ACTIVITIES),
+            *(f"passes.ice.{activity}" for activity in ("slide", *ACTIVITIES)),
         )
         if (name, length)
         not in {
@@ -128,7 +128,7 @@ DETECTION: Final = (
         DetectionBar(f"{name}.short", "short", mean_of(name), SHARE)
         for name in (
             *(f"oracle.ice.{what}{among}" for what in ("yield", "favoured") for among in ("", ".slide", ".calm")),
-            *(f"flag.passes.ice.{activity}" for activity in ACTIVITIES),
+            *(f"flag.passes.ice.{activity}" for activity in ("slide", *ACTIVITIES)),
         )
     ),
     *(
@@ -167,7 +167,7 @@ def detection_figures(results: DetectionResults) -> list[Figure]:
             if not towns:
                 continue
             limit = None if bar.bars is None else bar.bars[k]
-            value = bar.read(results.pooled(lengths, kind))
+            value = bar.read(results.pool_towns(lengths, kind))
             listed.append(Figure(f"{bar.name}.{kind}", value, bar.unit, limit, bar.better))
             if limit is None:
                 continue
@@ -178,6 +178,6 @@ def detection_figures(results: DetectionResults) -> list[Figure]:
                 listed.append(Figure(f"{bar.name}.{kind}.se", error, bar.unit))
             if len({town.winter for town in towns}) > 1:
                 for name, winter in (("winter", True), ("other", False)):
-                    part = bar.read(results.pooled(lengths, kind, winter=winter))
+                    part = bar.read(results.pool_towns(lengths, kind, winter=winter))
                     listed.append(Figure(f"{bar.name}.{kind}.{name}", part, bar.unit))
     return listed

@@ -89,7 +89,7 @@ def drive_fleet(fleet: SimulatedFleet, bank: EstimatorBank, seconds: float) -> D
         left -= steps
         t, signals = fleet.step(steps)
         tracks, located = locate(tracks, t, signals)
-        estimates, favoured = _estimated(bank, t, signals, located.closes)
+        estimates, favoured = _estimate_chunk(bank, t, signals, located.closes)
         time = np.rint(t * NS).astype(np.int64)
         open_visits, observations, _ = observe(open_visits, time, located, estimates, config, signals)
         columns = observations.columns
@@ -136,7 +136,7 @@ def stood_where_it_appeared(
     return out
 
 
-def _estimated(
+def _estimate_chunk(
     bank: EstimatorBank, t: FloatArray, signals: FloatArray, closes: BoolArray
 ) -> tuple[Estimates, FloatArray]:
     """Return the estimates of a chunk with evidence, and the favour of slippery road (T, N)."""

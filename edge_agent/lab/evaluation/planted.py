@@ -195,8 +195,8 @@ def figures(count: int, seed: int) -> list[Figure]:
     return [
         Figure("doctor.faults_named", _share(hit for hit, _ in tries), "1", 0.95, "more"),
         Figure("doctor.faults_named.winter", _share(hit for hit, _ in cold_tries), "1", 0.95, "more"),
-        Figure("doctor.false_accusations", _accused(clean), "1", 0.01),
-        Figure("doctor.false_accusations.winter", _accused(cold_clean), "1", 0.0),
+        Figure("doctor.false_accusations", _accusations(clean), "1", 0.01),
+        Figure("doctor.false_accusations.winter", _accusations(cold_clean), "1", 0.0),
         Figure("doctor.clean_passed", _share(diagnosis.passed for diagnosis in clean), "1"),
         Figure("doctor.clean_passed.winter", _share(diagnosis.passed for diagnosis in cold_clean), "1"),
         Figure("doctor.published_wrong", float(sum(passed for _, passed in tries)), "drives", 0.0),
@@ -210,7 +210,7 @@ def _share(held: Iterable[bool]) -> float:
     return sum(every) / len(every)
 
 
-def _accused(clean: Sequence[Diagnosis]) -> float:
+def _accusations(clean: Sequence[Diagnosis]) -> float:
     """Return the share of channels of sound drives that the doctor accuses."""
     channels = sum(len(diagnosis.sound) + len(diagnosis.unknown) + len(diagnosis.findings) for diagnosis in clean)
     return sum(len(diagnosis.findings) for diagnosis in clean) / channels

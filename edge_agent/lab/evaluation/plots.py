@@ -265,7 +265,8 @@ def draw_detection(figures: Sequence[Figure], path: Path) -> Path:
             axis.axhline(oracle, color="0.5", ls=":", label="oracle, excited visits on ice")
         axis.set(xlabel="false events per 1000 km of wet and dry road", title=f"{kind} cars", ylim=(0.0, 1.02))
         axis.set_xscale("symlog", linthresh=10.0)
-        axis.legend(fontsize="x-small")
+        if axis.lines:
+            axis.legend(fontsize="x-small")
     axes[0].set_ylabel("share of passes found")
     drawn.savefig(path, dpi=DPI)
     plt.close(drawn)

@@ -74,7 +74,7 @@ class Tally:
 
 
 def in_winter(seed: int) -> bool:
-    """Whether the town of a seed is a winter town: half of them are."""
+    """Return True if the town of a seed is a winter town: half of them are."""
     return seed % 2 == 1
 
 

@@ -1,4 +1,4 @@
-"""Oracle for visits: the evidence of an observer who knows the motion and every tyre's force, but not the tyre.
+"""Oracle for visits: the evidence of an observer with knowledge of the motion and every tyre's force, but not the tyre.
 
 It bounds what any estimator can conclude from a visit. Unknown are the shape of the tyre's curve and its stiffness.
 

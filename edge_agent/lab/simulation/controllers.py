@@ -1,6 +1,6 @@
 """Controllers of a vehicle with modulated slip control: ABS, traction control, drag torque control and ESC.
 
-They act in steps of the plant, on slip that they know exactly: what is modelled is the way they act, not their sensors.
+They act in steps of the plant, on slip that they know exactly: only their action is modelled, not their sensors.
 
     ABS    a wheel beyond its slip limit loses brake torque by DUMP, keeps it until the slip is half of the limit, and
            gets it back, fast up to NEARLY of the torque at which it let go, then slowly: 6 to 10 cycles per second;

@@ -45,7 +45,7 @@ RECORD: Final = 39
 
 @compiled
 def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: FloatArray) -> None:
-    """Fill `record` (RECORD,) with what is true at this instant under the inputs `u`; fills `w` too."""
+    """Fill `record` (RECORD,) with the truth of this instant under the inputs `u`; fills `w` too."""
     wheel_forces(x, p, u, w)
     ax, ay, _ = body_accelerations(x, p, u, w)
     record[RecordColumn.AX], record[RecordColumn.AY] = ax, ay
@@ -78,7 +78,7 @@ def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: 
 
 @compiled
 def _observe_held(x: FloatArray, p: FloatArray, u: FloatArray, record: FloatArray) -> None:
-    """What is true of a vehicle that is held: brakes and tyres give what the slope asks for."""
+    """Fill the record of a vehicle that is held: brakes and tyres balance the slope."""
     along, across, share = gravity(u)
     record[RecordColumn.AX], record[RecordColumn.AY] = -along, -across
     record[RecordColumn.AX_FELT] = -along + p[TrueParameter.PITCH_LEAK] * x[Motion.AX_LAGGED]

@@ -157,40 +157,44 @@ def winter(seed: int) -> Scenario:
     patches = list(town.patches)
     for lane in range(network.roads):
         kind = ON_LANES[order[lane % len(ON_LANES)]]
-        patches += _on_lane(kind, network.lane(lane), lane, [uniform(key, 100 + 4 * lane + k) for k in range(4)])
+        patches += _patches_on_lane(
+            kind, network.lane(lane), lane, [uniform(key, 100 + 4 * lane + k) for k in range(3)]
+        )
     temperature = -6.0 + 7.0 * uniform(key, 99)
     about = "a winter town on drawn hills"
     return replace(town, name=f"{WINTER}{seed}", about=about, patches=tuple(patches), air_temperature=temperature)
 
 
-def _on_lane(kind: str, points: FloatArray, lane: int, drawn_numbers: list[float]) -> list[Patch]:
-    """Return the patches of a kind on the points of a lane; four numbers in [0, 1) draw place, length and friction."""
-    place, size, grip, _ = drawn_numbers
+def _patches_on_lane(kind: str, points: FloatArray, lane: int, numbers: list[float]) -> list[Patch]:
+    """Return the patches of a kind on the points of a lane; three numbers in [0, 1) draw place, length and friction."""
+    place, size, grip = numbers
     ice, slush = 0.10 + 0.095 * grip, 0.28 + 0.12 * grip
     last = len(points) - 1
     if kind == "braking":
         length = 12.0 + 13.0 * size
         row = last - int(4.0 + 6.0 * place + 0.5 * length)
-        return [_laid(f"ice before junction {lane}", points, row, (length, 3.6), ice)]
+        return [_lay_patch(f"ice before junction {lane}", points, row, (length, 3.6), ice)]
     if kind == "bend":
         edge = len(points) // 5
         row = edge + int(np.argmax(np.abs(points[edge:-edge, LanePoint.CURVATURE])))
-        return [_laid(f"ice in bend {lane}", points, row, (9.0 + 5.0 * size, 4.5), ice)]
+        return [_lay_patch(f"ice in bend {lane}", points, row, (9.0 + 5.0 * size, 4.5), ice)]
     if kind in ("left", "right"):
         length, side = 25.0 + 15.0 * size, 1.5 if kind == "left" else -1.5
         row = last - int(8.0 + 15.0 * place + 0.5 * length)
-        return [_laid(f"ice {kind} of lane {lane}", points, row, (length, 3.0), ice, side)]
+        return [_lay_patch(f"ice {kind} of lane {lane}", points, row, (length, 3.0), ice, side)]
     if kind == "ruts":
         length = 25.0 + 20.0 * size
         row = last - int(5.0 + 20.0 * place + 0.5 * length)
         return [
-            _laid(f"rut {side:+.0f} of lane {lane}", points, row, (length, 0.7), slush, side * 0.5 * TRACK_M)
+            _lay_patch(f"rut {side:+.0f} of lane {lane}", points, row, (length, 0.7), slush, side * 0.5 * TRACK_M)
             for side in (-1.0, 1.0)
         ]
     return []
 
 
-def _laid(name: str, points: FloatArray, row: int, size: tuple[float, float], mu: float, left: float = 0.0) -> Patch:
+def _lay_patch(
+    name: str, points: FloatArray, row: int, size: tuple[float, float], mu: float, left: float = 0.0
+) -> Patch:
     """Return a patch of (length, width) [m] along a lane at the point `row`, `left` [m] of its centre."""
     point = points[min(max(row, 0), len(points) - 1)]
     x = float(point[LanePoint.X] - left * point[LanePoint.SIN])

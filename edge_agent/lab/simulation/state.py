@@ -39,7 +39,7 @@ STATES: Final = 38
 
 
 class TrueParameter(IntEnum):
-    """What only the true vehicle has; these continue the row of `edge_agent.dynamics.parameters.P`."""
+    """Parameters that only the true vehicle has; they continue the row of `edge_agent.dynamics.parameters.P`."""
 
     SHAPE = len(Parameter)  # c and e of the tyre curve
     CURVATURE = len(Parameter) + 1
@@ -70,7 +70,7 @@ PARAMETERS: Final = len(Parameter) + len(TrueParameter)
 
 
 class Control(IntEnum):
-    """Rows of what is done to the four wheels, and of the road under the vehicle, shape (5, 4)."""
+    """Rows of inputs to the four wheels, and of the road under the vehicle, shape (5, 4)."""
 
     STEER = 0  # [rad at the road wheel]
     DRIVE = 1  # [N·m] asked for; slip control may allow less
@@ -83,7 +83,7 @@ INPUTS: Final = len(Control)
 
 
 class Wheel(IntEnum):
-    """Rows of what the four wheels do at an instant, shape (8, 4)."""
+    """Rows of the four wheels' forces and motion at an instant, shape (8, 4)."""
 
     FX = 0  # [N] in the wheel's axes
     FY = 1

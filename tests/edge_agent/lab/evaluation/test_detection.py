@@ -66,7 +66,7 @@ def drive_saying(lower: float, upper: float) -> DetectionDrive:
     )
 
 
-def test_an_estimator_that_always_reports_ice_misses_none_and_is_false_everywhere() -> None:
+def test_always_reporting_ice_misses_none_and_is_false_on_every_road() -> None:
     found = judge_drive(drive_saying(0.05, 0.3))
     assert found.mean("passes.ice") == found.mean("slide.told.some_wheels") == found.mean("coverage90.ice") == 1.0
     assert found.mean("false_ice") == found.mean("false_ice.settled") == 1.0
@@ -75,7 +75,7 @@ def test_an_estimator_that_always_reports_ice_misses_none_and_is_false_everywher
     assert found.seconds["seconds.ice.braking"] == [0.0]
 
 
-def test_an_estimator_that_always_reports_grip_finds_nothing_and_is_false_on_ice() -> None:
+def test_always_reporting_grip_finds_nothing_and_is_false_grip_on_ice() -> None:
     found = judge_drive(drive_saying(0.7, 1.1))
     assert found.mean("passes.ice") == found.mean("slide.told.some_wheels") == found.mean("warned") == 0.0
     assert found.mean("false_ice") == found.total["false_events"] == 0.0
@@ -131,7 +131,7 @@ def test_the_slip_flag_sees_a_slide_on_ice_and_nothing_on_dry_road() -> None:
     assert found[1] > 0.35, "no road is called slippery while the car stops"
 
 
-def test_the_oracle_finds_the_friction_of_a_slide_and_only_bounds_it_without() -> None:
+def test_the_oracle_finds_the_friction_of_a_slide_and_not_of_rolling() -> None:
     slip, speed, rng = np.full((50, 4), 0.6), np.full(50, 10.0), np.random.default_rng(0)
     slid = visit_evidence(np.full((50, 4), 0.15), slip, speed, rng)
     calm = visit_evidence(np.full((50, 4), 0.05), np.full((50, 4), 0.05), speed, rng)
@@ -149,7 +149,7 @@ def test_a_town_goes_through_the_whole_pipeline_and_fills_the_table() -> None:
     assert found["coverage90.dry.short.rough.winter"] != found["coverage90.dry.short.rough.other"]
     assert 0.0 <= found["false_ice.short.rough"] < 0.05
     assert 0.5 < found["coverage90.dry.short.rough"] <= 1.0
-    assert results.pooled(["short"], "rough").count["false_visits"] > 20
+    assert results.pool_towns(["short"], "rough").count["false_visits"] > 20
     table = detection_table(detection_figures(results))
     assert "| `coverage90.ice.short` |" in table
 

@@ -75,7 +75,7 @@ def test_who_says_ice_of_every_road_is_right_on_ice_alone(driven: tuple[DriveSet
     assert found["score"] > 3.0
 
 
-def test_ice_is_missed_by_the_prior_and_grip_is_false_where_it_is_always_reported(
+def test_the_prior_misses_ice_and_always_reporting_grip_is_false_grip(
     driven: tuple[DriveSet, FloatArray],
 ) -> None:
     prior, ice, grip = (figures(driven, saying(driven[0], *ends)) for ends in (PRIOR, (0.05, 0.3), (0.7, 1.1)))

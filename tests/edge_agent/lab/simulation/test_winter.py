@@ -1,4 +1,4 @@
-"""Winter: controllers that work in cycles, tyres that relax, drag at lift-off, and what lies on the roads."""
+"""Winter: controllers that work in cycles, tyres that relax, drag at lift-off, and winter roads."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_no_controller_works_in_ordinary_driving_on_dry_road() -> None:
         assert not any(column(log, f"true_{name}_active").any() for name in ("abs", "tcs", "esc")), manoeuvre
 
 
-def test_regeneration_brakes_the_driven_axle_alone_and_fades_at_walking_pace() -> None:
+def test_regeneration_brakes_the_driven_axle_alone() -> None:
     log, _ = simulate_manoeuvre(
         "gentle-braking", mu=0.9, vehicle=equipped("van", regeneration=3.0), sensors="ideal", duration_s=9.0
     )
@@ -127,7 +127,7 @@ def test_blocks_of_a_winter_fleet_do_not_depend_on_how_they_are_cut() -> None:
     assert whole.truth.abs.dtype == whole.truth.tcs.dtype == whole.truth.esc.dtype == np.bool_
 
 
-def test_a_winter_town_has_ice_before_junctions_in_bends_on_both_sides_and_ruts_of_slush() -> None:
+def test_a_winter_town_has_ice_in_each_place_and_ruts_of_slush() -> None:
     town = winter(50_001)
     own = town.patches[len(drawn(50_001).patches) :]
     assert town.name == "winter-50001" == scenario_named("winter-50001").name
