@@ -179,6 +179,7 @@ def _judge_passes(tally: DetectionTally, drive: DetectionDrive, n: int, slides: 
                 continue
             tally.note(f"passes.{kind}", holds=bool(called.any()))
             tally.note(f"flag.passes.{kind}", holds=bool(flag.any()))
+            tally.note(f"controller.passes.{kind}", holds=bool(drive.controlled[first:end, n].any()))
             tally.note(f"either.passes.{kind}", holds=bool(flag.any() or called.any()))
             for nats in ROC_NATS:
                 tally.note(f"roc.{nats:g}.{kind}", holds=bool((drive.favoured[first:end, n] > nats).any()))

@@ -108,6 +108,7 @@ DETECTION: Final = (
             "flag.passes.ice",
             "flag.passes.snow",
             "either.passes.ice",
+            "controller.passes.ice",
             "contradiction_share.ice.excited",
             "contradiction_share",
             "coverage90.snow",

@@ -56,6 +56,7 @@ class DetectionDrive:
         lower, median, upper, health: estimates
         favoured: ln of the best belief below SLIPPERY_MU over the best above; NaN where the estimator has no belief
         flagged: friction that the slip flag reports, infinite where none is up
+        controlled: ABS, traction control or ESC works, of cars with winter equipment
         stood: ice or snow appeared under the car while it stood, and it has not left it since
     """
 
@@ -72,6 +73,7 @@ class DetectionDrive:
     health: NDArray[np.int32]
     favoured: Samples
     flagged: Samples
+    controlled: BoolArray
     stood: BoolArray
     visits: DetectionVisits
 
@@ -108,10 +110,13 @@ def drive_fleet(fleet: SimulatedFleet, bank: EstimatorBank, seconds: float) -> D
     t = np.repeat(np.arange(len(signals))[:, None] / RATE_HZ, len(vehicles), axis=1)
     flagged = friction_flagged(t, signals.astype(np.float64), vehicles).astype(np.float32)
     health = joined.pop("health").astype(np.int32)
-    values = {name: value.astype(np.float32) for name, value in joined.items()}
     starts = [patch.start for patch in fleet.scenario.events]
+    controlled = joined.pop("controlled").astype(np.bool_)
+    values = {name: value.astype(np.float32) for name, value in joined.items()}
     stood = stood_where_it_appeared(values["mu"], values["speed"], starts)
-    return DetectionDrive(**values, health=health, flagged=flagged, stood=stood, visits=_joined(visits))
+    return DetectionDrive(
+        **values, health=health, flagged=flagged, controlled=controlled, stood=stood, visits=_joined(visits)
+    )
 
 
 def stood_where_it_appeared(
@@ -177,6 +182,7 @@ def _samples_of(fleet: SimulatedFleet, estimates: Estimates, favoured: FloatArra
         "upper": estimates.mu_upper,
         "health": estimates.health,
         "favoured": favoured,
+        "controlled": true.abs | true.tcs | true.esc,
     }
 
 

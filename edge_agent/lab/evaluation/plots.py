@@ -265,6 +265,7 @@ def draw_detection(figures: Sequence[Figure], path: Path) -> Path:
             axis.axhline(oracle, color="0.5", ls=":", label="oracle, excited visits on ice")
         axis.set(xlabel="false events per 1000 km of wet and dry road", title=f"{kind} cars", ylim=(0.0, 1.02))
         axis.set_xscale("symlog", linthresh=10.0)
+        axis.set_xlim(left=-1.0)
         if axis.lines:
             axis.legend(fontsize="x-small")
     axes[0].set_ylabel("share of passes found")

@@ -249,7 +249,7 @@ def detection_table(figures: Sequence[Figure]) -> str:
             cells.append(
                 f"{figure.value:.3g}"
                 + (f" ± {error.value:.1g}" if error else "")
-                + (f" ({winter.value:.3g})" if winter else "")
+                + (f" ({winter.value:.3g})" if winter and math.isfinite(winter.value) else "")
                 if figure and shown
                 else "–"
             )

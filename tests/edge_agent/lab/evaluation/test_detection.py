@@ -61,6 +61,7 @@ def drive_saying(lower: float, upper: float) -> DetectionDrive:
         health=np.zeros((SAMPLES, 1), np.int32),
         favoured=0.0 * ones,
         flagged=np.where(theta[..., 0] > 0.0, 0.1, np.inf).astype(np.float32),
+        controlled=theta[..., 0] > 0.0,
         stood=np.zeros((SAMPLES, 1), np.bool_),
         visits=visits,
     )
@@ -96,7 +97,7 @@ def test_slip_flag_and_contradictions_are_counted_in_the_slide() -> None:
     drive.health[350:500] = Health.CONTRADICTION
     drive.health[900:] = Health.CONTRADICTION
     found = judge_drive(drive)
-    assert found.mean("flag.passes.ice") == 1.0
+    assert found.mean("flag.passes.ice") == found.mean("controller.passes.ice") == 1.0
     assert found.seconds["flag.seconds.ice.braking"] == [0.0]
     assert found.total["contradictions.slide"] == found.total["contradictions.elsewhere"] == 1.0
     assert found.total["s.slide"] == pytest.approx(0.5), "what is contradicted already cannot be so again"
