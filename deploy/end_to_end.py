@@ -1,6 +1,7 @@
 """From wheels to observations on disk, without a network: what the fusion's campaign needs end to end.
 
-    python -m deploy.end_to_end --out DIR [--vehicles 200] [--duration 60] [--seed 20000] [--scenario demo] [--rough 0]
+    python -m deploy.end_to_end --out DIR [--vehicles 200] [--duration 60] [--seed 20000] [--scenario demo]
+        [--rough 0] [--winter 0]
 
 Simulated vehicles with the default estimator drive a scenario; DIR/observations.parquet gets what they would have sent,
 DIR/truth.parquet what they drove over.
@@ -74,9 +75,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=FIGURES)
     parser.add_argument("--scenario", default="demo", help="demo (default), hills; hills-7: drawn by seed 7")
     parser.add_argument("--rough", type=float, default=0.0, help="share of vehicles as real cars are (default 0)")
+    parser.add_argument("--winter", type=float, default=0.0, help="share with winter equipment (default 0)")
     args = parser.parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
-    fleet = SimulatedFleet(args.scenario, args.vehicles, args.seed, RATE_HZ, rough=args.rough)
+    fleet = SimulatedFleet(args.scenario, args.vehicles, args.seed, RATE_HZ, rough=args.rough, winter=args.winter)
     write(fleet, args.duration, args.out)
     return 0
 

@@ -125,6 +125,7 @@ def fleet(folder: Path, vehicles: int, duration_s: float, seed: int, warned: flo
         "--vehicles": vehicles,
         "--scenario": SCENARIO,
         "--rough": 0.5,  # half of them as real cars are
+        "--winter": 0.5,  # half of them, half of the rough ones too, with controllers and tyres that matter in winter
         "--warned": warned,
         "--duration": duration_s,
         "--seed": seed,

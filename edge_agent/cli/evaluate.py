@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 LEAST_SEEDS: Final = 20  # of a campaign whose bars count
 QUICK_SEEDS: Final = 2
-ONLY: Final = ("inputs", "ahead")
+ONLY: Final = ("inputs", "ahead", "detection")
 LEARNED_CARS: Final = 20
 LIVE_S: Final = 60.0
 QUICK_S: Final = 10
@@ -36,7 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--only",
         choices=ONLY,
         help="a campaign of its own: inputs: readers, signal doctor, calibration, live sources; "
-        "ahead: warnings, their cost and delay, the map as a prior",
+        "ahead: warnings, their cost and delay, the map as a prior; "
+        "detection: slippery road found, missed and falsely reported, in short and long drives",
     )
     parser.add_argument(
         "--plots", choices=("png", "svg", "pdf"), default="png", help="their format (default %(default)s)"
@@ -60,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     count = args.seeds if args.seeds is not None else QUICK_SEEDS if args.quick else LEAST_SEEDS
     if count < 2:
         raise InputError("seeds", f"{count} drives have no spread", "give at least 2")
-    if not args.no_plots and not args.only and importlib.util.find_spec("matplotlib") is None:
+    if not args.no_plots and args.only in (None, "detection") and importlib.util.find_spec("matplotlib") is None:
         raise InputError("plots", "matplotlib is not installed", "install gripmap[demo], or give --no-plots")
     try:
         args.out.mkdir(parents=True, exist_ok=True)
@@ -68,6 +69,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("out", f"cannot make {args.out} ({error.strerror})", "name another folder") from error
     if args.only == "ahead":
         return _ahead(args, count)
+    if args.only == "detection":
+        return _detection(args, count)
     if args.only:
         return _inputs(args)
     began, seeds = time.monotonic(), range(FIGURES, FIGURES + count)
@@ -122,6 +125,32 @@ def _ahead(args: argparse.Namespace, count: int) -> int:
     write(args.out / "figures.json", f"edge-agent evaluate --only ahead{part}", list(seeds), figures)
     text = f"# What lies ahead\n\n{markdown(figures)}\n"
     (args.out / "report.md").write_text(text, encoding="utf-8")
+    print(text)
+    return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
+
+
+def _detection(args: argparse.Namespace, count: int) -> int:
+    from edge_agent.lab.evaluation.detection_bars import detection_figures
+    from edge_agent.lab.evaluation.detection_campaign import campaign
+    from edge_agent.lab.evaluation.report import detection_report
+    from edge_agent.lab.seeds import FIGURES
+    from schemas.runtime.figures import write
+
+    began, seeds = time.monotonic(), range(FIGURES, FIGURES + count)
+    results = campaign(
+        seeds,
+        lambda line: print(f"{time.monotonic() - began:6.1f} s  {line}", file=sys.stderr, flush=True),
+        quick=args.quick,
+    )
+    figures = detection_figures(results)
+    part = " --quick" if args.quick else ""
+    write(args.out / "figures.json", f"edge-agent evaluate --only detection{part}", list(seeds), figures)
+    text = detection_report(figures)
+    (args.out / "report.md").write_text(text, encoding="utf-8")
+    if not args.no_plots:
+        from edge_agent.lab.evaluation.plots import draw_detection
+
+        draw_detection(figures, args.out / f"detection.{args.plots}")
     print(text)
     return 0 if all(figure.holds for figure in figures if figure.bar is not None) else 1
 

@@ -16,8 +16,13 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--vehicles", type=int, default=36, help="how many (default 36)")
-    parser.add_argument("--scenario", default="demo", help="demo (default), hills, test; hills-7: drawn by seed 7")
+    parser.add_argument(
+        "--scenario", default="demo", help="demo (default), hills, test; hills-7, winter-7: drawn by seed 7"
+    )
     parser.add_argument("--rough", type=float, default=0.0, help="share of them as real cars are (default 0)")
+    parser.add_argument(
+        "--winter", type=float, default=0.0, help="share of them with winter tyres and controllers (default 0)"
+    )
     parser.add_argument("--warned", type=float, default=0.0, help="share of them that hear the map and are warned")
     add_estimator(parser)
     parser.add_argument("--config", type=Path, help="agent configuration (JSON)")
@@ -41,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     config = load(args.config, AgentConfig)
     if args.truth:
         writable("truth", args.truth)
-    fleet = SimulatedFleet(args.scenario, args.vehicles, args.seed, args.rate, rough=args.rough)
+    fleet = SimulatedFleet(args.scenario, args.vehicles, args.seed, args.rate, rough=args.rough, winter=args.winter)
     warm_up_simulation(args.scenario, args.rate, args.rough)
     recorder = TruthRecorder(tuple(fleet.names)) if args.truth else None
     source = blocks(fleet, args.rate, recorder)

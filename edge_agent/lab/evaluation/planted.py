@@ -7,12 +7,12 @@ speed, exchanged columns, and a vehicle file with another tyre.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from edge_agent.inputs.doctor.findings import diagnose
+from edge_agent.inputs.doctor.findings import Diagnosis, diagnose
 from edge_agent.inputs.units import DEG, SPEED
 from edge_agent.lab.simulation import SimulatedFleet
 from schemas.numeric import FloatArray
@@ -161,9 +161,13 @@ PLANTED: Final = {
 RADII_ALIKE: Final = ({"km/h", "radius", "mph", "kn"},)  # factors near one: no drive tells a unit from another tyre
 
 
-def drives(count: int, seed: int, *, rough: bool, seconds: int = DRIVE_S) -> list[Recorded]:
-    """Drives through the demonstration's town; rough: on its hills, with the devices of real cars."""
-    fleet = SimulatedFleet("hills" if rough else "demo", count, seed, RATE_HZ, rough=float(rough))
+def drives(count: int, seed: int, *, rough: bool, winter: bool = False, seconds: int = DRIVE_S) -> list[Recorded]:
+    """Drive through the demonstration's town; rough: on its hills, with the devices of real cars.
+
+    winter: in a winter town that the seed draws, with winter equipment.
+    """
+    scenario = f"winter-{seed}" if winter else "hills" if rough else "demo"
+    fleet = SimulatedFleet(scenario, count, seed, RATE_HZ, rough=float(rough), winter=float(winter))
     parts = [fleet.step(round(RATE_HZ)) for _ in range(seconds)]
     t, signals = (np.concatenate([part[k] for part in parts]) for k in range(2))
     return [Recorded(t[:, n], signals[:, n], fleet.vehicles[n]) for n in range(count)]
@@ -178,15 +182,35 @@ def named(planted: Planted, drive: Recorded) -> tuple[bool, bool]:
 
 
 def figures(count: int, seed: int) -> list[Figure]:
-    """Shares over all mistakes and drives, smooth and rough; the drives without a mistake as the control."""
+    """Return shares over all mistakes and drives, smooth and rough; the drives without a mistake are the control.
+
+    In winter, smooth and rough cars drive in a winter town.
+    """
     cars = [*drives(count, seed, rough=False), *drives(count, seed + 1, rough=True)]
-    clean = [diagnose(*drive) for drive in cars]
+    cold = [*drives(count, seed + 2, rough=False, winter=True), *drives(count, seed + 3, rough=True, winter=True)]
     tries = [named(planted, drive) for planted in PLANTED.values() for drive in cars]
-    channels = sum(len(diagnosis.sound) + len(diagnosis.unknown) + len(diagnosis.findings) for diagnosis in clean)
+    cold_tries = [named(planted, drive) for planted in PLANTED.values() for drive in cold]
+    clean = [diagnose(*drive) for drive in cars]
+    cold_clean = [diagnose(*drive) for drive in cold]
     return [
-        Figure("doctor.faults_named", sum(hit for hit, _ in tries) / len(tries), "1", 0.95, "more"),
-        Figure("doctor.false_accusations", sum(len(diagnosis.findings) for diagnosis in clean) / channels, "1", 0.01),
-        Figure("doctor.clean_passed", sum(diagnosis.passed for diagnosis in clean) / len(clean), "1"),
+        Figure("doctor.faults_named", _share(hit for hit, _ in tries), "1", 0.95, "more"),
+        Figure("doctor.faults_named.winter", _share(hit for hit, _ in cold_tries), "1", 0.95, "more"),
+        Figure("doctor.false_accusations", _accusations(clean), "1", 0.01),
+        Figure("doctor.false_accusations.winter", _accusations(cold_clean), "1", 0.0),
+        Figure("doctor.clean_passed", _share(diagnosis.passed for diagnosis in clean), "1"),
+        Figure("doctor.clean_passed.winter", _share(diagnosis.passed for diagnosis in cold_clean), "1"),
         Figure("doctor.published_wrong", float(sum(passed for _, passed in tries)), "drives", 0.0),
+        Figure("doctor.published_wrong.winter", float(sum(passed for _, passed in cold_tries)), "drives", 0.0),
         Figure("doctor.tries", float(len(tries)), "drives", 150.0, "more"),
     ]
+
+
+def _share(held: Iterable[bool]) -> float:
+    every = list(held)
+    return sum(every) / len(every)
+
+
+def _accusations(clean: Sequence[Diagnosis]) -> float:
+    """Return the share of channels of sound drives that the doctor accuses."""
+    channels = sum(len(diagnosis.sound) + len(diagnosis.unknown) + len(diagnosis.findings) for diagnosis in clean)
+    return sum(len(diagnosis.findings) for diagnosis in clean) / channels

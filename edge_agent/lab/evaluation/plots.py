@@ -12,6 +12,7 @@ from edge_agent.adaptation.memberships import Memberships
 from edge_agent.app.tuned_memberships import shipped
 from edge_agent.estimators import TUNED
 from edge_agent.lab.evaluation.campaign import DEFAULT, PlottedDrive, Results
+from edge_agent.lab.evaluation.detection import KINDS, ROC_FLAG_MU, ROC_NATS
 from edge_agent.lab.evaluation.measures import bounds, nees
 from edge_agent.lab.evaluation.real_world import RealWorldResults
 from edge_agent.lab.evaluation.scenarios import OTHERS, PAPERS, VEHICLES
@@ -226,6 +227,48 @@ def _reliability(figures: Sequence[Figure], path: Path) -> Path:
         axis.plot(list(levels), list(levels.values()), marker="o", ms=3, **_line(estimator), label=estimator)
     axis.set(xlabel="stated", ylabel="share of truths below", title="reliability of friction")
     axis.legend(fontsize="x-small")
+    drawn.savefig(path, dpi=DPI)
+    plt.close(drawn)
+    return path
+
+
+def draw_detection(figures: Sequence[Figure], path: Path) -> Path:
+    """Write the ROC plot: passes found against settled false events, estimator, slip flag and oracle."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    values = {figure.name: figure.value for figure in figures}
+    drawn, axes = plt.subplots(1, 2, figsize=(11, 4.5), sharey=True, layout="constrained")
+    estimator = line_of(DEFAULT)
+    for axis, kind in zip(axes, KINDS, strict=True):
+        for road, dash in (("ice", "-"), ("snow", "--")):
+            for way, limits, colour, name in (
+                ("roc", ROC_NATS, estimator.colour, f"belief of {DEFAULT}"),
+                ("flag", ROC_FLAG_MU, TRUTH.colour, "slip flag"),
+            ):
+                found = [
+                    (values.get(f"{way}.{limit:g}.false_events.{kind}"), values.get(f"{way}.{limit:g}.{road}.{kind}"))
+                    for limit in limits
+                ]
+                known = [(events, share) for events, share in found if events is not None and share is not None]
+                if known:
+                    axis.plot(
+                        *zip(*known, strict=True), marker="o", ms=3, ls=dash, color=colour, label=f"{name}, {road}"
+                    )
+            told = values.get(f"passes.{road}.short.{kind}"), values.get(f"false_events.short.{kind}")
+            if None not in told:
+                axis.plot(told[1], told[0], "*", ms=11, color=estimator.colour, label=f"reported, {road}, short drives")
+        oracle = values.get(f"oracle.ice.favoured.short.{kind}")
+        if oracle is not None:
+            axis.axhline(oracle, color="0.5", ls=":", label="oracle, excited visits on ice")
+        axis.set(xlabel="false events per 1000 km of wet and dry road", title=f"{kind} cars", ylim=(0.0, 1.02))
+        axis.set_xscale("symlog", linthresh=10.0)
+        axis.set_xlim(left=-1.0)
+        if axis.lines:
+            axis.legend(fontsize="x-small")
+    axes[0].set_ylabel("share of passes found")
     drawn.savefig(path, dpi=DPI)
     plt.close(drawn)
     return path

@@ -5,6 +5,8 @@ are over samples, so that a minute on dry road weighs a minute.
 
 Legend
     surface       by the mean friction of the four wheels: ice to .2, snow to .45, wet to .75, dry above
+    missed ice    share of the samples on ice where excited whose upper end is not below SLIPPERY_MU
+    false grip    share of the samples on ice whose lower end lies FALSE_GRIP or more above the truth
     false ice     share of the samples on wet and dry road whose whole interval lies below SLIPPERY_MU; "settled": of
                   those that left snow and ice SETTLED_S ago, or never met any: who drives off the ice learns of it
                   when he uses the grip; "of_all": share of all samples that are such on a road above SURE_GRIP
@@ -27,7 +29,7 @@ from edge_agent.estimators import Estimates
 from edge_agent.lab.evaluation.batch import USUAL, DriveSet, DriveSpec, estimates, realistic
 from edge_agent.lab.evaluation.measures import covered, errors
 from edge_agent.lab.simulation import PRESETS, SimulatedFleet
-from edge_agent.lab.simulation.scenarios import drawn
+from edge_agent.lab.simulation.scenarios import drawn, winter
 from schemas.errors import InputError
 from schemas.mugrid import LOWER, UPPER
 from schemas.numeric import BoolArray, FloatArray
@@ -35,6 +37,7 @@ from schemas.signals import Health, S, per_wheel
 from schemas.thresholds import EXCITED_SHARE, GRAVITY, SLIPPERY_MU, SURFACES, UTILISED_WINDOW_S, Z_95
 
 LOST_M_S: Final = 1.0
+FALSE_GRIP: Final = 0.05
 MISS: Final = 20.0  # of the interval score of Gneiting and Raftery (2007) at 90 %
 PRIOR: Final = (LOWER + 0.05 * (UPPER - LOWER), UPPER - 0.05 * (UPPER - LOWER))  # 90 % of it
 NOISE: Final = 0.03  # of the grip in use, which is smoothed over SMOOTH_S
@@ -70,9 +73,18 @@ class Tally:
         }
 
 
+def in_winter(seed: int) -> bool:
+    """Return True if the town of a seed is a winter town: half of them are."""
+    return seed % 2 == 1
+
+
 def town(seed: int, cars: int, seconds: float) -> tuple[DriveSet, FloatArray]:
-    """Rough cars in a town that the seed draws, and the largest share of the grip they use (T, N)."""
-    fleet = SimulatedFleet(drawn(seed), cars, seed, RATE_HZ, rough=1.0)
+    """Rough cars in a town that the seed draws, and the largest share of the grip they use (T, N).
+
+    In winter towns all cars have winter equipment.
+    """
+    cold = in_winter(seed)
+    fleet = SimulatedFleet(winter(seed) if cold else drawn(seed), cars, seed, RATE_HZ, rough=1.0, winter=float(cold))
     t, signals = fleet.step(round(seconds * RATE_HZ))
     true = fleet.truth
     truth = {f"true_{name}": getattr(true, name) for name in ("vx", "vy", "yaw_rate", "ax", "ay", "slope")}
@@ -115,6 +127,9 @@ def count(tally: Tally, batch: DriveSet, reported: Estimates, used: FloatArray) 
             tally.add(f"contradiction_share.{name}.{kind}", contradicted, (mu > above) & (mu <= most) & among)
     tally.add("coverage90.no_torque", inside[:, np.isnan(batch.signals[:, :, S.TORQUE]).all(axis=0)])
     icy, grips = reported.mu_upper < SLIPPERY_MU, mu > SURFACES["wet"][0]
+    ice = mu <= SURFACES["ice"][1]
+    tally.add("missed_ice", ~icy, ice & excited)
+    tally.add("false_grip", reported.mu_lower > mu + FALSE_GRIP, ice)
     tally.add("false_ice", icy, grips)
     tally.add("false_ice.of_all", icy & (mu > SURE_GRIP))
     tally.add("false_ice.settled", icy, grips & ~lately(~grips, SETTLED_S).astype(bool))

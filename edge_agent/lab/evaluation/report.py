@@ -41,7 +41,9 @@ Ordinary sensors. NEES of (v_x, v_y) and NIS per row: 1 is expected; where R hol
 WORLD_HEAD: Final = """\
 ## The world as it is
 
-Rough cars in hilly towns that nobody tuned on (`real_world.py`), half of them without torque, for every estimator.
+Rough cars in hilly towns that nobody tuned on (`real_world.py`), half of them without torque, every estimator. Every
+second town is a winter town. Missed ice: the upper end is not below .4 on ice where grip is used. False grip: the lower
+end lies .05 or more above the friction of ice.
 False ice: the whole interval below .4 on a road above .6; strict: the share of the samples on wet and dry road (from
 .45); settled: of those whose car left snow and ice 3 s ago or never met any. Below: the upper end lies under the grip
 in use, which is wrong for certain. Width where excited, over the prior's. Coverage of v_x and v_y: of what the stated
@@ -59,6 +61,15 @@ ORACLE_HEAD: Final = """\
 
 Two bars of the papers that are hard, and an oracle on the same sensors (`oracle.py`): a Bayesian who knows the friction
 and the motion, and knows everything but what vehicle file and data sheet leave open."""
+DETECTION_HEAD: Final = """\
+# Detection
+
+Towns drawn by seeds that nobody tuned on, rough cars and plain cars apart; short: 120 s, long: 900 s, because faults
+that silence a car only show there. Half of the towns are winter towns (`scenarios.winter`, all cars with winter
+equipment); their figure stands in brackets. Definitions: `edge_agent/lab/evaluation/detection.py`. ± is the standard
+error over towns. `flag`: ordinary ABS and ESC logic on the same signals (`slip_flag.py`); `oracle`: an observer who
+knows motion and forces (`slide_oracle.py`); `roc`: the estimator's belief at other thresholds. Cars under which ice
+appeared while they stood are counted as `stood` and nowhere else."""
 FRICTION: Final = ("paper-aco-fckf", "federated-ckf", "sr-ukf")  # papers' estimators that estimate friction
 SHOWN_LEVELS: Final = LEVELS[::2]
 
@@ -141,7 +152,8 @@ def oracles(barred: Sequence[Figure], values: dict[str, float]) -> str:
 def world(values: dict[str, float]) -> str:
     """One row per estimator in the rough world."""
     shown = {
-        "coverage90": "coverage", "coverage90.ice": "on ice", "false_ice": "false ice",
+        "coverage90": "coverage", "coverage90.ice": "on ice", "missed_ice": "missed ice", "false_grip": "false grip",
+        "false_ice": "false ice",
         "false_ice.of_all": "of all", "false_ice.settled": "settled", "below": "below",
         "width": "width, excited", "score": "score", "rmse_vx": "rmse_vx", "coverage90.vx": "coverage of v_x",
         "rmse_vy": "rmse_vy", "coverage90.vy": "coverage of v_y", "lost": "lost",
@@ -216,3 +228,35 @@ def reliability(values: dict[str, float]) -> str:
         for name in estimators(values, "reliability.", ".below_05")
     ]
     return grid(("estimator", *(f"{100 * level:.0f} %" for level in SHOWN_LEVELS)), rows)
+
+
+def detection_report(figures: Sequence[Figure]) -> str:
+    """Return the report of the detection judge."""
+    return f"{DETECTION_HEAD}\n\n{detection_table(figures)}\n"
+
+
+def detection_table(figures: Sequence[Figure]) -> str:
+    """Return one row per figure of the detection judge: rough and plain cars with standard errors, and the bars."""
+    by_name = {figure.name: figure for figure in figures}
+    names = dict.fromkeys(name.rpartition(".")[0] for name in by_name if name.endswith((".rough", ".plain")))
+    rows = []
+    for name in names:
+        cells, limits, held = [], [], []
+        for kind in ("rough", "plain"):
+            figure, error = by_name.get(f"{name}.{kind}"), by_name.get(f"{name}.{kind}.se")
+            winter = by_name.get(f"{name}.{kind}.winter")
+            shown = figure is not None and not math.isnan(figure.value)
+            cells.append(
+                f"{figure.value:.3g}"
+                + (f" ± {error.value:.1g}" if error else "")
+                + (f" ({winter.value:.3g})" if winter and math.isfinite(winter.value) else "")
+                if figure and shown
+                else "–"
+            )
+            if figure is not None and figure.bar is not None:
+                limits.append(f"{figure.bar:g}")
+                held += [figure.holds] if shown else []
+        sign = "" if not limits else "≤ " if by_name[f"{name}.rough"].better == "less" else "≥ "
+        verdict_ = "" if not held else "holds" if all(held) else "✗"
+        rows.append([f"`{name}`", *cells, sign + "; ".join(dict.fromkeys(limits)), verdict_])
+    return grid(("figure", "rough", "plain", "bar", ""), rows)

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.lab.simulation.counter_rng import uniform
 from edge_agent.lab.simulation.friction import PatchColumn, look_up
-from edge_agent.lab.simulation.plant import Motion, Wheel, strongest_pull
+from edge_agent.lab.simulation.plant import strongest_pull
 from edge_agent.lab.simulation.roads import LanePoint
+from edge_agent.lab.simulation.state import Motion, Wheel
 from schemas.numeric import FloatArray, IntArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY

@@ -11,23 +11,9 @@ from edge_agent.lab.simulation.counter_rng import checked_seed, key_of, uniform
 from edge_agent.lab.simulation.driver import ALERT_STREAM, ROUTE_STREAM, Driver, KeyArray, Lanes, Route, drive, ways_of
 from edge_agent.lab.simulation.friction import PatchColumn, look_up
 from edge_agent.lab.simulation.misaligned import memory_of
-from edge_agent.lab.simulation.plant import (
-    INPUTS,
-    RECORD,
-    STATES,
-    Control,
-    Motion,
-    RecordColumn,
-    Wheel,
-    advance,
-    command,
-    gravity,
-    observe,
-    start_at,
-    substeps_of,
-    wheel_place,
-)
-from edge_agent.lab.simulation.presets import nominal, one_of_a_fleet
+from edge_agent.lab.simulation.plant import advance, command, gravity, regenerate, start_at, substeps_of, wheel_place
+from edge_agent.lab.simulation.presets import nominal, one_of_a_fleet, winter_equipped
+from edge_agent.lab.simulation.record import RECORD, RecordColumn, observe
 from edge_agent.lab.simulation.relief import cross_slope, gradient, tilt
 from edge_agent.lab.simulation.roads import LanePoint, Network
 from edge_agent.lab.simulation.scenarios import Scenario, scenario_named
@@ -40,12 +26,14 @@ from edge_agent.lab.simulation.sensors import (
     sense,
     sensors_named,
 )
+from edge_agent.lab.simulation.state import INPUTS, STATES, Control, Motion, TrueParameter, Wheel
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.jit import compiled
 
 TURN_OVER_M = 6.0  # in which a road turns over from one crossfall to another
 VEHICLE_STREAM = 0
+WINTER_STREAM = 4
 STOPS = 0.3  # share of the 7 s in which a driver of a rough vehicle stops: two or three times a minute
 TOLD_S = 1.5  # from a warning to the foot on the brake (Green, Transportation Human Factors 2, 2000: 1.2 to 1.5 s)
 GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0  # multiples of it, modulo 1, are spread evenly however many there are
@@ -55,7 +43,10 @@ GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0  # multiples of it, modulo 1, are spread e
 class Truth:
     """What was true in a block, (T, N) or (T, N, 4): pose [m, m, rad], speed [m/s], friction, |F|/(μ F_z).
 
-    ax, ay: what an accelerometer feels [m/s^2]; slope: rise of the road per metre ahead.
+    ax, ay: acceleration that an accelerometer measures [m/s^2]; slope: rise of the road per metre ahead.
+    theta: normalised slip of each wheel; a wheel slides beyond about 2.6.
+    abs, tcs, esc: while the controller works, of vehicles with winter equipment, else False.
+    air_temperature: outside [degrees Celsius].
     """
 
     x: FloatArray
@@ -69,6 +60,11 @@ class Truth:
     ax: FloatArray
     ay: FloatArray
     slope: FloatArray
+    theta: FloatArray
+    abs: BoolArray
+    tcs: BoolArray
+    esc: BoolArray
+    air_temperature: FloatArray
 
 
 @compiled
@@ -77,7 +73,7 @@ def run(
     ground: tuple[Lanes, FloatArray, FloatArray], keys: tuple[KeyArray, KeyArray], first: int, steps: int,
     timing: tuple[float, int],
 ) -> FloatArray:  # fmt: skip
-    """Records (T, N, 32) of the next `steps` samples; the states are carried on in place.
+    """Records (T, N, RECORD) of the next `steps` samples; the states are carried on in place.
 
     states: vehicles (N, 12), drivers (N, 10), routes (N, 4), wheels (N, 8, 4); ground: lanes, tables
     of friction and of relief; keys: of routes and of alerts (N,);
@@ -101,6 +97,8 @@ def run(
             now = (t, period, gravity(u)[0])
             drive(x, (d, g), (lanes, friction), p, w, now, (keys[0][n], keys[1][n]))
             command(p, u, d[Driver.STEER], d[Driver.FORCE])
+            if p[TrueParameter.REGENERATION] > 0.0:
+                regenerate(x, p, u)
             for i in range(4):
                 px, py = wheel_place(x, p, i)
                 u[Control.MU, i] = look_up(friction, PatchColumn.MU, t, px, py)
@@ -119,6 +117,7 @@ class SimulatedFleet:
         rate_hz: of the samples.
         sensors: a key of SENSORS.
         rough: share of the vehicles that are as real cars are: ROUGH_FLEET sensors, and drivers who stop now and then.
+        winter: share of the vehicles with `winter_equipped` tyres and controllers; half of them are rough if half are.
 
     Raises:
         InputError: an argument is out of range or unknown.
@@ -126,14 +125,15 @@ class SimulatedFleet:
 
     def __init__(
         self, scenario: str | Scenario, vehicles: int, seed: int, rate_hz: float,
-        sensors: str | Sensors = "mems-patchy", rough: float = 0.0,
+        sensors: str | Sensors = "mems-patchy", rough: float = 0.0, winter: float = 0.0,
     ) -> None:  # fmt: skip
         if vehicles < 1:
             raise InputError("vehicles", f"{vehicles} vehicles cannot drive", "give a positive number")
         if not (math.isfinite(rate_hz) and rate_hz > 0.0):
             raise InputError("rate_hz", f"{rate_hz} is not possible", "give a positive number")
-        if not 0.0 <= rough <= 1.0:
-            raise InputError("rough", f"{rough} is not a share", "give a number from 0 to 1")
+        for name, share in (("rough", rough), ("winter", winter)):
+            if not 0.0 <= share <= 1.0:
+                raise InputError(name, f"{share} is not a share", "give a number from 0 to 1")
         seed = checked_seed(seed)
         self.scenario = scenario_named(scenario)
         self.rate_hz = rate_hz
@@ -141,6 +141,9 @@ class SimulatedFleet:
         rngs = [np.random.default_rng([seed, k, VEHICLE_STREAM]) for k in range(vehicles)]
         truths = [one_of_a_fleet(k, name, rng) for k, (name, rng) in enumerate(zip(self.names, rngs, strict=True))]
         self.vehicles = [nominal(truth, rng) for truth, rng in zip(truths, rngs, strict=True)]
+        self.winter = winter_ones(vehicles, winter)
+        for k in np.flatnonzero(self.winter):
+            truths[k] = winter_equipped(truths[k], np.random.default_rng([seed, int(k), WINTER_STREAM]))
         self._parameters = np.stack([truth.row() for truth in truths])
         self.rough = rough_ones(vehicles, rough)
         ordinary, origin = sensors_named(sensors), self.scenario.origin
@@ -160,7 +163,7 @@ class SimulatedFleet:
         self._wander = np.zeros((vehicles, 3))
         self._relief = self.scenario.relief.table
         self._next = 0
-        self.truth = _truth(np.empty((0, vehicles, RECORD)))
+        self.truth = _truth(np.empty((0, vehicles, RECORD)), self.scenario.air_temperature)
 
     def step(self, steps: int) -> tuple[FloatArray, FloatArray]:
         """The next `steps` samples: t (T, N) [s] from 0 and signals (T, N, 18); `truth` is then that of this block."""
@@ -179,7 +182,7 @@ class SimulatedFleet:
         self._before = known[len(known) - min(memory, len(known)) :]
         t = np.repeat((np.arange(self._next, self._next + steps) / self.rate_hz)[:, None], len(self.names), axis=1)
         self._next += steps
-        self.truth = _truth(records)
+        self.truth = _truth(records, self.scenario.air_temperature)
         return t, signals
 
     def route_ahead(self, k: int, length: float) -> tuple[FloatArray, FloatArray]:
@@ -211,19 +214,34 @@ def rough_ones(vehicles: int, share: float) -> BoolArray:
     return np.asarray(np.floor((number + 1) * share) > np.floor(number * share))
 
 
-def _truth(records: FloatArray) -> Truth:
+def winter_ones(vehicles: int, share: float) -> BoolArray:
+    """Return which vehicles have winter equipment, (N,), by number in pairs: half of them are rough if half are."""
+    return np.repeat(rough_ones((vehicles + 1) // 2, share), 2)[:vehicles]
+
+
+def _truth(records: FloatArray, air_temperature: float) -> Truth:
     x, y, yaw, vx, vy = (
         records[..., column]
         for column in (RecordColumn.X, RecordColumn.Y, RecordColumn.YAW, RecordColumn.VX, RecordColumn.VY)
     )
-    wheels = (
-        records[..., RecordColumn.MU : RecordColumn.MU + 4],
-        records[..., RecordColumn.UTILISATION : RecordColumn.UTILISATION + 4],
+    return Truth(
+        x,
+        y,
+        yaw,
+        vx,
+        vy,
+        mu_wheel=records[..., RecordColumn.MU : RecordColumn.MU + 4],
+        utilisation=records[..., RecordColumn.UTILISATION : RecordColumn.UTILISATION + 4],
+        yaw_rate=records[..., RecordColumn.YAW_RATE],
+        ax=records[..., RecordColumn.AX],
+        ay=records[..., RecordColumn.AY],
+        slope=records[..., RecordColumn.SLOPE],
+        theta=records[..., RecordColumn.THETA : RecordColumn.THETA + 4],
+        abs=records[..., RecordColumn.ABS] > 0.0,
+        tcs=records[..., RecordColumn.TCS] > 0.0,
+        esc=records[..., RecordColumn.ESC] > 0.0,
+        air_temperature=np.full(records.shape[:2], air_temperature),
     )
-    felt = (
-        records[..., column] for column in (RecordColumn.YAW_RATE, RecordColumn.AX, RecordColumn.AY, RecordColumn.SLOPE)
-    )
-    return Truth(x, y, yaw, vx, vy, *wheels, *felt)
 
 
 def _start(

@@ -23,7 +23,7 @@ from typing import Final
 import numpy as np
 
 from edge_agent.lab.simulation.counter_rng import key_of, normal, uniform
-from edge_agent.lab.simulation.plant import RecordColumn
+from edge_agent.lab.simulation.record import RecordColumn
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.signals import S

@@ -19,6 +19,9 @@ load that is transferred goes by what is felt, and the loads add up to the weigh
 K does not know μ, unless the tyre softens: friction acts by similarity (Pacejka, Tyre and Vehicle Dynamics, 3rd ed.,
 §4.2), and |F| ≤ μ F_z.
 
+A vehicle may have tyres that relax (RELAXATION: four fifths of the slip is built up over that length) and controllers
+that work in cycles and are reported (ABS_HZ: `controllers.py`). Without them slip control is smooth, as it was before.
+
 Explicit Euler for the body and linearly implicit Euler for the wheels, whose slip is stiff: with the secant slope of
 the tyre in the denominator a wheel step is stable at any speed. The tyre's force is taken at the step's end, where the
 ground has changed its speed too; without that term a wheel would seem to have twice its inertia.
@@ -28,7 +31,6 @@ Wheel order fl, fr, rl, rr; ISO 8855 signs.
 from __future__ import annotations
 
 import math
-from enum import IntEnum
 from typing import Final
 
 from edge_agent.dynamics.body import accelerations
@@ -36,86 +38,20 @@ from edge_agent.dynamics.loads import wheel_loads
 from edge_agent.dynamics.parameters import Parameter, body
 from edge_agent.dynamics.slip import SLOWEST_M_S, slips, wheel_position, wheel_velocity
 from edge_agent.dynamics.tyres import TINY, brush, magic_formula
+from edge_agent.lab.simulation.controllers import control_slip, slip_limit
+from edge_agent.lab.simulation.state import STATES, Control, Motion, TrueParameter, Wheel
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled
 from schemas.thresholds import GRAVITY
 
 LONGEST_SUBSTEP: Final = 1e-3  # [s]; lateral dynamics at 1 m/s have poles near 150/s
 SOFTEST: Final = 0.3  # stiffness never degrades below this share of proportional, however overloaded the wheel
-REAR_LIMIT: Final = 0.5  # slip control lets go of the rear wheels at this share of the limit, so that they still guide
 FIRM: Final = 1.0  # friction at which a softening tyre has its full stiffness
 STANDING: Final = 1.0  # [rad/s] below it rolling resistance fades
+DIRECT: Final = 0.2  # share of the slip that a relaxing tyre takes at once
+FREE_SPIN: Final = (6.0, 12.0)  # [m/s] that driven wheels may be faster than the car: from there the engine gives less
 BRAKED: Final = 0.1  # [rad/s] below it a brake does, so that it holds a wheel and does not turn it backwards
 STILL: Final = 0.02  # [m/s, rad/s] slower than this in every direction, brakes hold the vehicle where it is
-
-
-class Motion(IntEnum):
-    """State of one vehicle."""
-
-    VX = 0  # [m/s]
-    VY = 1
-    YAW_RATE = 2  # [rad/s]
-    OMEGA = 3  # four wheels [rad/s]
-    AX_LAGGED = 7  # [m/s^2], what the suspension has followed so far
-    AY_LAGGED = 8
-    X = 9  # [m] east
-    Y = 10  # [m] north
-    YAW = 11  # [rad], not wrapped
-
-
-STATES: Final = 12
-
-
-class TrueParameter(IntEnum):
-    """What only the true vehicle has; these continue the row of `edge_agent.dynamics.parameters.P`."""
-
-    SHAPE = len(Parameter)  # c and e of the tyre curve
-    CURVATURE = len(Parameter) + 1
-    DEGRESSION = len(Parameter) + 2  # ε
-    LAG = len(Parameter) + 3  # [s] of the sprung body behind the accelerations
-    ROLL_LEAK = (
-        len(Parameter) + 4
-    )  # gravity that an accelerometer feels in the rolled and pitched body, per a_y and per a_x
-    PITCH_LEAK = len(Parameter) + 5
-    DRAG = len(Parameter) + 6  # D [N per (m/s)^2]
-    ROLLING = len(Parameter) + 7  # k_r
-    SLIP_LIMIT = len(Parameter) + 8  # slip at which anti-lock and traction control begin to let go; inf: none
-    BRAKE_FRONT = len(Parameter) + 9  # share of the braking torque at the front axle
-    POWER = len(Parameter) + 10  # [W]
-    BRUSH = len(Parameter) + 11  # 1: the tyre's curve is that of the brush model, not the Magic Formula
-    SOFTENING = (
-        len(Parameter) + 12
-    )  # stiffness falls with friction, as (mu/FIRM)^softening; 0: it does not know friction
-    REAR_STEER = len(Parameter) + 13  # angle of the rear wheels over that of the front wheels; 0: they do not steer
-
-
-PARAMETERS: Final = len(Parameter) + len(TrueParameter)
-
-
-class Control(IntEnum):
-    """Rows of what is done to the four wheels, and of the road under the vehicle, shape (5, 4)."""
-
-    STEER = 0  # [rad at the road wheel]
-    DRIVE = 1  # [N·m] asked for; slip control may allow less
-    BRAKE = 2  # [N·m], positive, asked for
-    MU = 3  # friction under the wheel
-    TILT = 4  # rise of the road per metre ahead of the vehicle, and to its left; two numbers are of no use
-
-
-INPUTS: Final = len(Control)
-
-
-class Wheel(IntEnum):
-    """Rows of what the four wheels do at an instant, shape (8, 4)."""
-
-    FX = 0  # [N] in the wheel's axes
-    FY = 1
-    FZ = 2
-    SPEED = 3  # [m/s] of the wheel's centre along the wheel
-    SLIP = 4  # longitudinal
-    THETA = 5  # normalised slip; beyond about 2 the wheel slides
-    SLOPE = 6  # dF_x/dω along the secant [N·s/rad]
-    TORQUE = 7  # [N·m] that acts, driving positive
 
 
 @compiled
@@ -139,14 +75,41 @@ def allowed(slip: float, limit: float) -> float:
 
 
 @compiled
-def slip_limit(p: FloatArray, i: int) -> float:
-    """Slip at which the control of wheel `i` begins to let go."""
-    return float(p[TrueParameter.SLIP_LIMIT] if i < 2 else REAR_LIMIT * p[TrueParameter.SLIP_LIMIT])
+def wheel_torques(x: FloatArray, p: FloatArray, u: FloatArray, i: int, slip: float) -> tuple[float, float]:
+    """Return the driving and the braking torque [N·m] that controllers leave to wheel `i` at its slip."""
+    drive, brake = u[Control.DRIVE, i], u[Control.BRAKE, i]
+    if p[TrueParameter.ABS_HZ] > 0.0:
+        drive *= 1.0 - x[Motion.CUT]
+        brake += x[Motion.HELD + i]
+        if x[Motion.LIMIT + i] > 0.0:
+            brake = min(brake, x[Motion.LIMIT + i])
+        if drive > 0.0 and p[TrueParameter.TCS] <= 0.0:
+            faster = p[Parameter.RADIUS] * x[Motion.OMEGA + i] - abs(x[Motion.VX])
+            drive *= min(max((FREE_SPIN[1] - faster) / (FREE_SPIN[1] - FREE_SPIN[0]), 0.0), 1.0)
+    elif slip > 0.0:
+        drive *= allowed(slip, slip_limit(p, i))
+    else:
+        brake *= allowed(slip, slip_limit(p, i))
+    if drive < 0.0:
+        drive *= min(max(x[Motion.OMEGA + i] / STANDING, 0.0), 1.0)
+    return drive, brake
+
+
+@compiled
+def relax(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
+    """Let the tyres build up slip for `dt` [s] over their relaxation length, after the wheels have turned."""
+    for i in range(4):
+        along, across = wheel_velocity(p, i, x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE], u[Control.STEER, i])
+        slip_x, slip_y = slips(p[Parameter.RADIUS], x[Motion.OMEGA + i], along, across)
+        rolled = max(abs(along), abs(p[Parameter.RADIUS] * x[Motion.OMEGA + i]), SLOWEST_M_S)
+        share = -math.expm1(-dt * rolled / p[TrueParameter.RELAXATION])
+        x[Motion.SLIP_X + i] += share * (slip_x - x[Motion.SLIP_X + i])
+        x[Motion.SLIP_Y + i] += share * (slip_y - x[Motion.SLIP_Y + i])
 
 
 @compiled
 def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> None:
-    """Fill `w` (8, 4) for the state `x` (12,), parameters `p` (26,) and inputs `u` (5, 4)."""
+    """Fill `w` (8, 4) for the state `x`, parameters `p` and inputs `u` (5, 4)."""
     loads = wheel_loads(body(p), x[Motion.AX_LAGGED], x[Motion.AY_LAGGED])
     at_rest = wheel_loads(body(p), 0.0, 0.0)
     _, _, share = gravity(u)
@@ -154,6 +117,10 @@ def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> 
         load, omega = share * loads[i], x[Motion.OMEGA + i]
         along, across = wheel_velocity(p, i, x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE], u[Control.STEER, i])
         slip_x, slip_y = slips(p[Parameter.RADIUS], omega, along, across)
+        raw_slip = slip_x
+        if p[TrueParameter.RELAXATION] > 0.0:
+            slip_x = DIRECT * slip_x + (1.0 - DIRECT) * x[Motion.SLIP_X + i]
+            slip_y = DIRECT * slip_y + (1.0 - DIRECT) * x[Motion.SLIP_Y + i]
         slope_x = stiffness_per_load(p[Parameter.SLOPE_X], p[TrueParameter.DEGRESSION], load, at_rest[i])
         slope_y = stiffness_per_load(p[Parameter.SLOPE_Y], p[TrueParameter.DEGRESSION], load, at_rest[i])
         if p[TrueParameter.SOFTENING] > 0.0:
@@ -168,14 +135,12 @@ def wheel_forces(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray) -> 
         )
         secant = curve / theta if theta > TINY else 1.0
         pull = secant * u[Control.MU, i] * load
-        drive, brake = u[Control.DRIVE, i], u[Control.BRAKE, i]
-        if slip_x > 0.0:
-            drive *= allowed(slip_x, slip_limit(p, i))
-        else:
-            brake *= allowed(slip_x, slip_limit(p, i))
+        drive, brake = wheel_torques(x, p, u, i, raw_slip)
         w[Wheel.FX, i], w[Wheel.FY, i], w[Wheel.FZ, i] = pull * theta_x, pull * theta_y, load
-        w[Wheel.SPEED, i], w[Wheel.SLIP, i], w[Wheel.THETA, i] = along, slip_x, theta
+        w[Wheel.SPEED, i], w[Wheel.SLIP, i], w[Wheel.THETA, i] = along, raw_slip, theta
         w[Wheel.SLOPE, i] = secant * slope_x * load * p[Parameter.RADIUS] / max(abs(along), SLOWEST_M_S)
+        if p[TrueParameter.RELAXATION] > 0.0:
+            w[Wheel.SLOPE, i] *= DIRECT
         w[Wheel.TORQUE, i] = drive - brake * omega / max(abs(omega), BRAKED)
 
 
@@ -205,7 +170,8 @@ def turn_wheels(
         resistance = p[TrueParameter.ROLLING] * radius * w[Wheel.FZ, i] * omega / slow
         excess = w[Wheel.TORQUE, i] - resistance - radius * w[Wheel.FX, i] + dt * w[Wheel.SLOPE, i] * ground
         damping = radius * w[Wheel.SLOPE, i]
-        if slip_limit(p, i) < slip < 2.0 * slip_limit(p, i):
+        smooth = p[TrueParameter.ABS_HZ] <= 0.0
+        if smooth and slip_limit(p, i) < slip < 2.0 * slip_limit(p, i):
             asked = u[Control.DRIVE, i] if w[Wheel.SLIP, i] > 0.0 else u[Control.BRAKE, i]
             damping += asked * radius / (max(abs(w[Wheel.SPEED, i]), SLOWEST_M_S) * slip_limit(p, i))
         if abs(omega) < BRAKED:
@@ -234,6 +200,7 @@ def stand(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> None:
     along, across, _ = gravity(u)
     x[Motion.VX] = x[Motion.VY] = x[Motion.YAW_RATE] = 0.0
     x[Motion.OMEGA : Motion.OMEGA + 4] = 0.0
+    x[Motion.SLIP_X : STATES] = 0.0
     follow = min(dt / p[TrueParameter.LAG], 1.0)
     x[Motion.AX_LAGGED] += follow * (-along - x[Motion.AX_LAGGED])
     x[Motion.AY_LAGGED] += follow * (-across - x[Motion.AY_LAGGED])
@@ -251,6 +218,10 @@ def advance(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: floa
         ax, ay, yaw_acceleration = body_accelerations(x, p, u, w)
         vx, vy, r = x[Motion.VX], x[Motion.VY], x[Motion.YAW_RATE]
         turn_wheels(x, p, u, w, dt, ax + r * vy + along, yaw_acceleration)
+        if p[TrueParameter.RELAXATION] > 0.0:
+            relax(x, p, u, dt)
+        if p[TrueParameter.ABS_HZ] > 0.0:
+            control_slip(x, p, u, w, dt)
         c, s = math.cos(x[Motion.YAW] + 0.5 * dt * r), math.sin(x[Motion.YAW] + 0.5 * dt * r)
         x[Motion.X] += dt * (c * vx - s * vy)
         x[Motion.Y] += dt * (s * vx + c * vy)
@@ -285,73 +256,20 @@ def command(p: FloatArray, u: FloatArray, steer: float, force: float) -> None:
         u[Control.BRAKE, i] = 0.5 * brake_share * max(-force, 0.0) * p[Parameter.RADIUS]
 
 
-class RecordColumn(IntEnum):
-    """Columns of a record: the truth of one sample of one vehicle."""
-
-    AX = 0  # [m/s^2] that an accelerometer at the centre of gravity feels, as the road lies
-    AY = 1
-    AX_FELT = 2  # [m/s^2] by an accelerometer fixed to the rolling and pitching body
-    AY_FELT = 3
-    YAW_RATE = 4
-    DELTA = 5  # four wheels each, from here on
-    OMEGA = 9
-    TORQUE = 13
-    X = 17
-    Y = 18
-    YAW = 19
-    VX = 20
-    VY = 21
-    MU = 22
-    UTILISATION = 26  # |F| / (μ F_z)
-    SLOPE = 30  # rise of the road per metre ahead
-    BANK = 31  # and to the left
-
-
-RECORD: Final = 32
-
-
 @compiled
-def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: FloatArray) -> None:
-    """Fill `record` (32,) with what is true at this instant under the inputs `u`; fills `w` too."""
-    wheel_forces(x, p, u, w)
-    ax, ay, _ = body_accelerations(x, p, u, w)
-    record[RecordColumn.AX], record[RecordColumn.AY] = ax, ay
-    record[RecordColumn.AX_FELT] = ax + p[TrueParameter.PITCH_LEAK] * x[Motion.AX_LAGGED]
-    record[RecordColumn.AY_FELT] = ay + p[TrueParameter.ROLL_LEAK] * x[Motion.AY_LAGGED]
-    record[RecordColumn.YAW_RATE], record[RecordColumn.VX], record[RecordColumn.VY] = (
-        x[Motion.YAW_RATE],
-        x[Motion.VX],
-        x[Motion.VY],
-    )
-    record[RecordColumn.X], record[RecordColumn.Y], record[RecordColumn.YAW] = x[Motion.X], x[Motion.Y], x[Motion.YAW]
+def regenerate(x: FloatArray, p: FloatArray, u: FloatArray) -> None:
+    """Let engine or generator give the first part of the braking in `u`, at the driven wheels alone."""
+    total = 0.0
     for i in range(4):
-        record[RecordColumn.DELTA + i], record[RecordColumn.OMEGA + i], record[RecordColumn.TORQUE + i] = (
-            u[Control.STEER, i],
-            x[Motion.OMEGA + i],
-            w[Wheel.TORQUE, i],
-        )
-        record[RecordColumn.MU + i] = u[Control.MU, i]
-        record[RecordColumn.UTILISATION + i] = math.hypot(w[Wheel.FX, i], w[Wheel.FY, i]) / (
-            u[Control.MU, i] * w[Wheel.FZ, i]
-        )
-    record[RecordColumn.SLOPE], record[RecordColumn.BANK] = u[Control.TILT, 0], u[Control.TILT, 1]
-    if held(x, p, u):
-        _observe_held(x, p, u, record)
-
-
-@compiled
-def _observe_held(x: FloatArray, p: FloatArray, u: FloatArray, record: FloatArray) -> None:
-    """What is true of a vehicle that is held: brakes and tyres give what the slope asks for."""
-    along, across, share = gravity(u)
-    record[RecordColumn.AX], record[RecordColumn.AY] = -along, -across
-    record[RecordColumn.AX_FELT] = -along + p[TrueParameter.PITCH_LEAK] * x[Motion.AX_LAGGED]
-    record[RecordColumn.AY_FELT] = -across + p[TrueParameter.ROLL_LEAK] * x[Motion.AY_LAGGED]
-    record[RecordColumn.YAW_RATE] = record[RecordColumn.VX] = record[RecordColumn.VY] = 0.0
+        total += u[Control.BRAKE, i] / p[Parameter.RADIUS]
+    if total <= 0.0:
+        return
+    fades = min(max(0.5 * (x[Motion.VX] - 1.0), 0.0), 1.0)
+    part = min(total, p[Parameter.MASS] * p[TrueParameter.REGENERATION] * fades)
     for i in range(4):
-        brake_share = p[TrueParameter.BRAKE_FRONT] if i < 2 else 1.0 - p[TrueParameter.BRAKE_FRONT]
-        record[RecordColumn.OMEGA + i] = 0.0
-        record[RecordColumn.TORQUE + i] = -0.5 * brake_share * p[Parameter.MASS] * along * p[Parameter.RADIUS]
-        record[RecordColumn.UTILISATION + i] = math.hypot(along, across) / (u[Control.MU, i] * GRAVITY * share)
+        drive_share = p[Parameter.DRIVE_FRONT] if i < 2 else 1.0 - p[Parameter.DRIVE_FRONT]
+        u[Control.BRAKE, i] *= 1.0 - part / total
+        u[Control.DRIVE, i] -= 0.5 * drive_share * part * p[Parameter.RADIUS]
 
 
 @compiled

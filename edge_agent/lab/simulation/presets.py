@@ -37,6 +37,11 @@ class TrueVehicle:
     brush: bool = False  # the brush model's curve in place of the Magic Formula's
     softening: float = 0.0  # power of friction by which the stiffness falls; real tyres 0 to .3
     rear_steer: float = 0.0  # angle of the rear wheels over that of the front wheels; negative at low speed
+    relaxation: float = 0.0  # [m] in which the tyres build up slip
+    abs_hz: float = 0.0  # cycles per second of anti-lock control; 0: smooth slip control that is not reported
+    tcs: float = 0.0  # 1: traction control, of vehicles with abs_hz
+    esc: float = 0.0  # 1: stability control, likewise
+    regeneration: float = 0.0  # [m/s^2] of braking by engine or generator, at the driven wheels
 
     def row(self) -> FloatArray:
         """The parameters for `plant`, shape (PARAMETERS,), in the order of `P` and `TrueParameter`."""
@@ -46,6 +51,7 @@ class TrueVehicle:
         return np.array([
             *nominal, *own, self.drag, self.rolling, self.slip_limit, self.brake_front, self.power,
             float(self.brush), self.softening, self.rear_steer,
+            self.relaxation, self.abs_hz, self.tcs, self.esc, self.regeneration,
         ])  # fmt: skip
 
 
@@ -138,4 +144,20 @@ def one_of_a_fleet(index: int, name: str, rng: np.random.Generator) -> TrueVehic
         curvature=rng.uniform(-0.5, 0.1),
         roll_leak=base.roll_leak * rng.uniform(0.7, 1.3),
         rolling=rng.uniform(0.006, 0.011),
+    )
+
+
+def winter_equipped(truth: TrueVehicle, rng: np.random.Generator) -> TrueVehicle:
+    """Return the vehicle with relaxing tyres, ABS in cycles, mostly traction control and ESC, and drag at lift-off.
+
+    A third of the vehicles regenerate as electric cars do; the others have the drag of an engine.
+    """
+    electric = rng.uniform() < 1.0 / 3.0
+    return replace(
+        truth,
+        relaxation=rng.uniform(0.30, 0.60),
+        abs_hz=rng.uniform(6.0, 10.0),
+        tcs=float(rng.uniform() < 0.85),
+        esc=float(rng.uniform() < 0.85),
+        regeneration=rng.uniform(1.0, 2.0) if electric else 0.35,
     )

@@ -13,11 +13,23 @@ from edge_agent.lab.simulation.counter_rng import checked_seed, key_of, uniform
 from edge_agent.lab.simulation.friction import DRY, ICE, SNOW, WET, Patch, PatchColumn, friction_table, look_up_many
 from edge_agent.lab.simulation.place import GOTHENBURG, Origin
 from edge_agent.lab.simulation.relief import LEVEL, Relief, Wave
-from edge_agent.lab.simulation.roads import Network, Road, build_network
+from edge_agent.lab.simulation.roads import LanePoint, Network, Road, build_network
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 
 DRAWN: Final = "hills-"  # names of drawn scenarios: this and the seed
+WINTER: Final = "winter-"  # the same with winter on its roads
+WINTER_STREAM: Final = 22
+# what lies on a lane of a winter town, in an order that is drawn; where there is nothing the road is as it was
+ON_LANES: Final = (
+    *("braking",) * 3,
+    *("bend",) * 3,
+    *("left",) * 2,
+    *("right",) * 2,
+    *("ruts",) * 3,
+    *("",) * 3,
+)
+TRACK_M: Final = 1.5  # between the ruts
 DRAWN_STREAM: Final = 21
 
 
@@ -33,6 +45,7 @@ class Scenario:
     patches: tuple[Patch, ...]
     relief: Relief = LEVEL
     origin: Origin = field(default=GOTHENBURG)
+    air_temperature: float = 1.0  # outside [degrees Celsius]
 
     @cached_property
     def network(self) -> Network:
@@ -132,6 +145,64 @@ def drawn(seed: int) -> Scenario:
     )
 
 
+def winter(seed: int) -> Scenario:
+    """Return the town `drawn` by the seed with winter on its lanes.
+
+    On each lane lies one of these: black ice where drivers brake before a junction, or in a bend; ice under the left or
+    under the right wheels alone; two ruts of slush; or nothing. No ice is seen; slush looks wet.
+    """
+    town = drawn(seed)
+    key, network = key_of(checked_seed(seed), WINTER_STREAM), town.network
+    order = sorted(range(len(ON_LANES)), key=lambda k: uniform(key, k))
+    patches = list(town.patches)
+    for lane in range(network.roads):
+        kind = ON_LANES[order[lane % len(ON_LANES)]]
+        patches += _patches_on_lane(
+            kind, network.lane(lane), lane, [uniform(key, 100 + 4 * lane + k) for k in range(3)]
+        )
+    temperature = -6.0 + 7.0 * uniform(key, 99)
+    about = "a winter town on drawn hills"
+    return replace(town, name=f"{WINTER}{seed}", about=about, patches=tuple(patches), air_temperature=temperature)
+
+
+def _patches_on_lane(kind: str, points: FloatArray, lane: int, numbers: list[float]) -> list[Patch]:
+    """Return the patches of a kind on the points of a lane; three numbers in [0, 1) draw place, length and friction."""
+    place, size, grip = numbers
+    ice, slush = 0.10 + 0.095 * grip, 0.28 + 0.12 * grip
+    last = len(points) - 1
+    if kind == "braking":
+        length = 12.0 + 13.0 * size
+        row = last - int(4.0 + 6.0 * place + 0.5 * length)
+        return [_lay_patch(f"ice before junction {lane}", points, row, (length, 3.6), ice)]
+    if kind == "bend":
+        edge = len(points) // 5
+        row = edge + int(np.argmax(np.abs(points[edge:-edge, LanePoint.CURVATURE])))
+        return [_lay_patch(f"ice in bend {lane}", points, row, (9.0 + 5.0 * size, 4.5), ice)]
+    if kind in ("left", "right"):
+        length, side = 25.0 + 15.0 * size, 1.5 if kind == "left" else -1.5
+        row = last - int(8.0 + 15.0 * place + 0.5 * length)
+        return [_lay_patch(f"ice {kind} of lane {lane}", points, row, (length, 3.0), ice, side)]
+    if kind == "ruts":
+        length = 25.0 + 20.0 * size
+        row = last - int(5.0 + 20.0 * place + 0.5 * length)
+        return [
+            _lay_patch(f"rut {side:+.0f} of lane {lane}", points, row, (length, 0.7), slush, side * 0.5 * TRACK_M)
+            for side in (-1.0, 1.0)
+        ]
+    return []
+
+
+def _lay_patch(
+    name: str, points: FloatArray, row: int, size: tuple[float, float], mu: float, left: float = 0.0
+) -> Patch:
+    """Return a patch of (length, width) [m] along a lane at the point `row`, `left` [m] of its centre."""
+    point = points[min(max(row, 0), len(points) - 1)]
+    x = float(point[LanePoint.X] - left * point[LanePoint.SIN])
+    y = float(point[LanePoint.Y] + left * point[LanePoint.COS])
+    angle = math.atan2(point[LanePoint.SIN], point[LanePoint.COS])
+    return Patch(name, x, y, size[0], size[1], mu, angle, looks=WET if name.startswith("rut") else None)
+
+
 def tiny() -> Scenario:
     """A triangle of three streets, half of it snow, an ice patch at 5 s: for tests."""
     return Scenario(
@@ -151,7 +222,7 @@ SCENARIOS: Final = {scenario.name: scenario for scenario in (demo(), hills(), ti
 
 
 def scenario_named(name: str | Scenario) -> Scenario:
-    """The scenario of that name; "hills-7" is the one `drawn` by the seed 7.
+    """The scenario of that name; "hills-7" is the one `drawn` by the seed 7, "winter-7" the same in winter.
 
     Raises:
         InputError: there is none.
@@ -160,7 +231,9 @@ def scenario_named(name: str | Scenario) -> Scenario:
         return name
     if name.startswith(DRAWN) and name[len(DRAWN) :].isdecimal():
         return drawn(int(name[len(DRAWN) :]))
+    if name.startswith(WINTER) and name[len(WINTER) :].isdecimal():
+        return winter(int(name[len(WINTER) :]))
     if name not in SCENARIOS:
-        choices = f"choose one of {', '.join(SCENARIOS)}, {DRAWN}SEED"
+        choices = f"choose one of {', '.join(SCENARIOS)}, {DRAWN}SEED, {WINTER}SEED"
         raise InputError("scenario", f"there is no scenario {name!r}", choices)
     return SCENARIOS[name]

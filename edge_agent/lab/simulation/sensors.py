@@ -30,7 +30,7 @@ from edge_agent.lab.simulation.misaligned import (
     misalignment_row,
 )
 from edge_agent.lab.simulation.place import Origin
-from edge_agent.lab.simulation.plant import RecordColumn
+from edge_agent.lab.simulation.record import RecordColumn
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.runtime.jit import compiled

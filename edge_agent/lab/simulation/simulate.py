@@ -15,24 +15,20 @@ from edge_agent.lab.simulation.faults import Fault, apply_faults
 from edge_agent.lab.simulation.manoeuvres import MANOEUVRES, Friction, Manoeuvre, Moment
 from edge_agent.lab.simulation.place import GOTHENBURG, Origin
 from edge_agent.lab.simulation.plant import (
-    RECORD,
-    STATES,
-    Control,
-    Motion,
-    RecordColumn,
-    Wheel,
     advance,
     command,
     gravity,
-    observe,
+    regenerate,
     start_at,
     strongest_pull,
     substeps_of,
     wheel_place,
 )
 from edge_agent.lab.simulation.presets import TrueVehicle, nominal, true_vehicle
+from edge_agent.lab.simulation.record import RECORD, RecordColumn, observe
 from edge_agent.lab.simulation.relief import Relief, cross_slope, gradient, road_named, tilt
 from edge_agent.lab.simulation.sensors import SENSORS, Sensors, error_row, noise_keys, sense, sensors_named
+from edge_agent.lab.simulation.state import STATES, Control, Motion, TrueParameter, Wheel
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, per_wheel
@@ -45,6 +41,8 @@ TRUTH: Final = (
     *((name, RecordColumn.MU + i) for i, name in enumerate(per_wheel("true_mu"))),
     *((name, RecordColumn.UTILISATION + i) for i, name in enumerate(per_wheel("true_utilisation"))),
     ("true_slope", RecordColumn.SLOPE), ("true_bank", RecordColumn.BANK),
+    ("true_abs_active", RecordColumn.ABS), ("true_tcs_active", RecordColumn.TCS),
+    ("true_esc_active", RecordColumn.ESC),
 )  # fmt: skip
 STEERING_LAG_S: Final = 0.1  # from the wish to the road wheel
 PEDAL_LAG_S: Final = 0.15
@@ -119,7 +117,7 @@ class ProvingGround(NamedTuple):
 def _drive(
     manoeuvre: Manoeuvre, truth: TrueVehicle, world: ProvingGround, speed: float, rate_hz: float, samples: int
 ) -> FloatArray:
-    """True records (T, 32) of the drive; the driver gives as much more gas as a slope takes."""
+    """True records (T, RECORD) of the drive; the driver gives as much more gas as a slope takes."""
     p, x, u, w = truth.row(), np.zeros(STATES), np.zeros((len(Control), 4)), np.zeros((len(Wheel), 4))
     records = np.empty((samples, RECORD))
     substeps, dt = substeps_of(rate_hz), 1.0 / rate_hz
@@ -137,6 +135,8 @@ def _drive(
         force += (float(p[Parameter.MASS]) * acceleration - force) * -math.expm1(-dt / PEDAL_LAG_S)
         force = min(force, strongest_pull(p, float(x[Motion.VX])))
         command(p, u, steer, force)
+        if p[TrueParameter.REGENERATION] > 0.0:
+            regenerate(x, p, u)
         for i in range(4):
             u[Control.MU, i] = world.friction(*wheel_place(x, p, i))
         observe(x, p, u, w, records[k])

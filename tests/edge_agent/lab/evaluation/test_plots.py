@@ -10,7 +10,9 @@ from edge_agent.app.estimator_factory import bank_of
 from edge_agent.lab.evaluation import plots
 from edge_agent.lab.evaluation.batch import estimates, realistic
 from edge_agent.lab.evaluation.campaign import PlottedDrive
+from edge_agent.lab.evaluation.detection import ROC_FLAG_MU, ROC_NATS
 from edge_agent.lab.seeds import FIGURES
+from schemas.runtime.figures import Figure
 from schemas.runtime.palette import line_of
 
 
@@ -25,6 +27,16 @@ def test_a_title_says_manoeuvre_speed_friction_vehicle_and_seed(drives: dict[str
     said = plots.title("004.dlc", drives["ckf"], 7)
     assert said == "004.dlc: double lane change, 80 km/h\nfrom 22 m/s, μ 0.85, sedan, seed 7"
     assert plots.title("of a user", drives["ckf"], 7).startswith("of a user: drive\n")
+
+
+def test_the_roc_plot_shows_belief_slip_flag_and_oracle(tmp_path: Path) -> None:
+    names = [f"roc.{limit:g}" for limit in ROC_NATS] + [f"flag.{limit:g}" for limit in ROC_FLAG_MU]
+    found = [Figure(f"{name}.{what}.rough", 0.5, "1") for name in names for what in ("ice", "snow", "false_events")]
+    found += [Figure("passes.ice.short.rough", 0.8, "1"), Figure("false_events.short.rough", 50.0, "per 1000 km")]
+    found += [Figure("oracle.ice.favoured.short.rough", 0.9, "1")]
+    text = plots.draw_detection(found, tmp_path / "detection.svg").read_text()
+    assert text.startswith("<?xml")
+    assert line_of("aco-fckf").colour in text
 
 
 def test_a_plot_is_a_picture_or_print_and_an_estimator_has_its_colour(

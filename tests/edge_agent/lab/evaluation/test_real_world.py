@@ -75,6 +75,21 @@ def test_who_says_ice_of_every_road_is_right_on_ice_alone(driven: tuple[DriveSet
     assert found["score"] > 3.0
 
 
+def test_the_prior_misses_ice_and_always_reporting_grip_is_false_grip(
+    driven: tuple[DriveSet, FloatArray],
+) -> None:
+    prior, ice, grip = (figures(driven, saying(driven[0], *ends)) for ends in (PRIOR, (0.05, 0.3), (0.7, 1.1)))
+    assert (prior["missed_ice"], prior["false_grip"]) == (1.0, 0.0)
+    assert (ice["missed_ice"], ice["false_grip"]) == (0.0, 0.0)
+    assert (grip["missed_ice"], grip["false_grip"]) == (1.0, 1.0)
+
+
+def test_every_second_town_is_in_winter() -> None:
+    assert [real_world.in_winter(seed) for seed in range(FIGURES, FIGURES + 4)] == [False, True, False, True]
+    batch, _ = real_world.town(FIGURES + 1, 2, 2.0)
+    assert np.isfinite(batch.mu).all()
+
+
 def test_each_surface_and_cars_without_torque_are_met_in_a_town(driven: tuple[DriveSet, FloatArray]) -> None:
     batch, used = driven
     for above, most in SURFACES.values():

@@ -9,20 +9,9 @@ import pytest
 
 from edge_agent.dynamics.parameters import Parameter
 from edge_agent.lab.simulation import PRESETS, simulate_manoeuvre
-from edge_agent.lab.simulation.plant import (
-    STATES,
-    Control,
-    Motion,
-    TrueParameter,
-    Wheel,
-    advance,
-    body_accelerations,
-    command,
-    start_at,
-    substeps_of,
-    wheel_forces,
-)
+from edge_agent.lab.simulation.plant import advance, body_accelerations, command, start_at, substeps_of, wheel_forces
 from edge_agent.lab.simulation.presets import TrueVehicle
+from edge_agent.lab.simulation.state import STATES, Control, Motion, TrueParameter, Wheel
 from schemas.numeric import FloatArray
 from schemas.thresholds import GRAVITY
 
@@ -221,10 +210,16 @@ def test_a_sample_is_cut_into_steps_of_a_millisecond_at_most(rate: float) -> Non
 
 @pytest.mark.parametrize("name", [f.name for f in fields(TrueVehicle) if f.name != "vehicle"])
 def test_every_parameter_of_the_true_vehicle_matters(name: str) -> None:
-    changed = replace(PRESETS["van"], **{name: getattr(PRESETS["van"], name) * 0.8 + 0.01})
+    of_controllers = name in ("tcs", "esc")  # which only vehicles with modulated slip control have
+    usual = replace(PRESETS["van"], abs_hz=8.0) if of_controllers else PRESETS["van"]
+    mu = 0.3 if of_controllers else None
+    changed = replace(usual, **{name: getattr(usual, name) * 0.8 + 0.01})
     logs = []
-    for vehicle in (PRESETS["van"], changed):
-        drives = [simulate_manoeuvre(m, vehicle=vehicle, sensors="mems-leak")[0] for m in ("acceleration", "braking")]
-        drives.append(simulate_manoeuvre("j-turn", vehicle=vehicle, sensors="mems-leak")[0])
+    for vehicle in (usual, changed):
+        drives = [
+            simulate_manoeuvre(m, mu=mu, vehicle=vehicle, sensors="mems-leak")[0] for m in ("acceleration", "braking")
+        ]
+        drives.append(simulate_manoeuvre("j-turn", mu=mu, vehicle=vehicle, sensors="mems-leak")[0])
+        drives += [simulate_manoeuvre("double-lane-change", mu=mu, vehicle=vehicle)[0]] if of_controllers else []
         logs.append(np.concatenate([drive[c].to_numpy() for drive in drives for c in ("ax", "ay", "omega_fl")]))
     assert np.abs(logs[0] - logs[1]).max() > 1e-3

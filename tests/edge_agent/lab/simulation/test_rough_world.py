@@ -20,22 +20,12 @@ from edge_agent.lab.simulation import (
     simulate_manoeuvre,
 )
 from edge_agent.lab.simulation.misaligned import DEVICE_OF, DEVICES, WIDE, Misaligned, Misalignment, misalignment_row
-from edge_agent.lab.simulation.plant import (
-    INPUTS,
-    STATES,
-    Control,
-    Motion,
-    Wheel,
-    advance,
-    command,
-    held,
-    start_at,
-    wheel_forces,
-)
+from edge_agent.lab.simulation.plant import advance, command, held, start_at, wheel_forces
 from edge_agent.lab.simulation.relief import STEEPEST, cross_slope, gradient, tilt
 from edge_agent.lab.simulation.roads import LanePoint
 from edge_agent.lab.simulation.scenarios import scenario_named
 from edge_agent.lab.simulation.sensors import ROUGH_FLEET, Sensors
+from edge_agent.lab.simulation.state import INPUTS, STATES, Control, Motion, Wheel
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
 from schemas.signals import CHANNELS, S, per_wheel

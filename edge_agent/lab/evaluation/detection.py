@@ -1,0 +1,303 @@
+"""Detection judge: does the estimator find slippery road, how soon, and does it report ice where there is none?
+
+Towns are drawn by the seed; cars are rough ones (ROUGH_FLEET) or plain ones. "short" drives last 120 s, "long" ones
+900 s, because faults that silence a car only show there. All figures of one kind pool the samples of its towns.
+
+Legend
+    slide       a stretch in which the normalised slip θ of some wheel exceeds SLIDING for at least SLIDE_S
+    value       the visit's likelihood falls by VALUE_NATS or more to the upper end of the grid
+    favoured    max ln L(μ < .4) - max ln L(μ >= .4) >= FAVOURED_NATS
+    on ice      of a visit: its mean friction is at most .2 and moves by less than MOVES; of a sample: friction <= .2
+    excited     of a visit: some wheel uses more than EXCITED_SHARE of its grip in it
+    pass        a stretch of PASS_S or longer of one car on ice, or on snow; found: mu_upper < .4 at some time of it
+    settled     not within SETTLED_S of snow and ice
+    false event a settled stretch with mu_upper < .4 on wet or dry road; gaps up to EVENT_GAP_S do not end it
+    false grip  mu_lower more than FALSE_GRIP above the true friction
+    stood       ice or snow appeared under the standing car: judged apart, and not in any other figure
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edge_agent.lab.evaluation.detection_drives import RATE_HZ, DetectionDrive, slippery_favoured
+from edge_agent.lab.evaluation.real_world import FALSE_GRIP, SETTLED_S, interval_score, lately
+from edge_agent.lab.evaluation.slide_oracle import visit_evidence
+from edge_agent.lab.evaluation.slip_flag import FLAGGED_MU
+from schemas.numeric import FloatArray
+from schemas.signals import Health
+from schemas.thresholds import EXCITED_SHARE, SLIPPERY_MU, SURFACES
+
+SLIDING: Final = 2.6
+SLIDE_S: Final = 0.1
+BRIDGED_S: Final = 0.1  # gaps in a slide that do not end it: anti-lock control makes them
+TOLD_SLIDE_S: Final = 0.2
+TOLD_MU: Final = 0.36
+TOLD_AFTER_S: Final = 0.1
+AFTER_SLIDE_S: Final = 0.5  # a contradiction so soon after a slide is one of the slide
+VALUE_NATS: Final = 1.0
+FAVOURED_NATS: Final = 3.0
+MOVES: Final = 0.1
+PASS_S: Final = 0.5
+EVENT_GAP_S: Final = 1.0
+ICE_MU: Final = SURFACES["ice"][1]
+SNOW_MU: Final = SURFACES["snow"][1]
+ROC_NATS: Final = (0.5, 1.0, 2.0, 3.0, 5.0, 8.0)
+ROC_FLAG_MU: Final = (0.25, FLAGGED_MU, 0.45)
+ACTIVITIES: Final = ("braking", "driving", "cornering")
+KINDS: Final = ("rough", "plain")
+LENGTHS: Final = ("short", "long")
+
+Stretches: TypeAlias = list[tuple[int, int]]
+
+
+@dataclass
+class DetectionTally:
+    """Sums of one town or of several: means by name, counts by name, and lists of seconds by name."""
+
+    total: dict[str, float] = field(default_factory=dict)
+    count: dict[str, int] = field(default_factory=dict)
+    seconds: dict[str, list[float]] = field(default_factory=dict)
+
+    def add(self, name: str, values: NDArray[np.generic]) -> None:
+        """Add values of which the name is the mean."""
+        self.total[name] = self.total.get(name, 0.0) + float(np.sum(values, dtype=np.float64))
+        self.count[name] = self.count.get(name, 0) + int(np.size(values))
+
+    def note(self, name: str, *, holds: bool) -> None:
+        """Add one case to a share."""
+        self.add(name, np.array([holds]))
+
+    def merge(self, other: DetectionTally) -> None:
+        """Add another town."""
+        for name, value in other.total.items():
+            self.total[name] = self.total.get(name, 0.0) + value
+            self.count[name] = self.count.get(name, 0) + other.count[name]
+        for name, times in other.seconds.items():
+            self.seconds.setdefault(name, []).extend(times)
+
+    def mean(self, name: str) -> float:
+        """Return the mean by name; NaN of nothing."""
+        return self.total[name] / self.count[name] if self.count.get(name) else float("nan")
+
+    def rate(self, over: str, under: str) -> float:
+        """Return the sum of one name over that of another; NaN without the other."""
+        return self.total.get(over, 0.0) / self.total[under] if self.total.get(under) else float("nan")
+
+    def quantile(self, name: str, share: float) -> float:
+        """Return a quantile of the seconds by name; NaN of nothing."""
+        return float(np.quantile(self.seconds[name], share)) if self.seconds.get(name) else float("nan")
+
+
+def runs_of(on: NDArray[np.bool_]) -> Stretches:
+    """Return first and one past the last index of each stretch where `on` (T,) holds."""
+    edge = np.flatnonzero(np.diff(np.concatenate([[0], on.astype(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in zip(edge[::2], edge[1::2], strict=True)]
+
+
+def bridge_gaps(on: NDArray[np.bool_], seconds: float) -> NDArray[np.bool_]:
+    """Return `on` (T,) with gaps up to `seconds` filled."""
+    out, most = on.copy(), round(seconds * RATE_HZ)
+    for first, end in runs_of(~on):
+        if first > 0 and end < len(on) and end - first <= most:
+            out[first:end] = True
+    return out
+
+
+def slides_of(theta: NDArray[np.floating], seconds: float = SLIDE_S) -> Stretches:
+    """Return the slides of a car in θ (T, 4): some wheel beyond SLIDING for `seconds` or longer."""
+    some = bridge_gaps(np.asarray((theta > SLIDING).any(axis=1)), BRIDGED_S)
+    least = round(seconds * RATE_HZ)
+    return [(first, end) for first, end in runs_of(some) if end - first >= least]
+
+
+def activity_of(drive: DetectionDrive, n: int, first: int, end: int) -> str:
+    """Return by which of ACTIVITIES a slide was caused: the larger acceleration, and its sign."""
+    along, across = float(drive.ax[first:end, n].mean()), float(drive.ay[first:end, n].mean())
+    if abs(across) > abs(along):
+        return "cornering"
+    return "braking" if along < 0.0 else "driving"
+
+
+def judge_drive(drive: DetectionDrive, *, oracle: bool = False) -> DetectionTally:
+    """Return everything that one town tells; `oracle`: ask the oracle about excited visits to ice too."""
+    tally = DetectionTally()
+    _judge_samples(tally, drive)
+    for n in range(drive.mu.shape[1]):
+        slides = slides_of(drive.theta[:, n])
+        _judge_passes(tally, drive, n, slides)
+        _judge_slides(tally, drive, n)
+        _judge_contradictions(tally, drive, n, slides)
+        _judge_false_events(tally, drive, n)
+        _judge_visits(tally, drive, n, slides, oracle=oracle)
+    return tally
+
+
+def _judge_samples(tally: DetectionTally, drive: DetectionDrive) -> None:
+    """Coverage, false ice, false grip and interval score over samples."""
+    mu, apart = drive.mu, ~drive.stood
+    inside = (drive.lower <= mu) & (mu <= drive.upper)
+    for name, (above, most) in SURFACES.items():
+        among = (mu > above) & (mu <= most)
+        tally.add(f"coverage90.{name}", inside[among & apart])
+        tally.add(f"coverage90.{name}.stood", inside[among & ~apart])
+        score = interval_score(drive.lower.astype(np.float64), drive.upper.astype(np.float64), mu.astype(np.float64))
+        tally.add(f"score.{name}", score[among & apart])
+    ice, called, grips = (mu <= ICE_MU) & apart, drive.upper < SLIPPERY_MU, mu > SNOW_MU
+    tally.add("false_grip", (drive.lower > mu + FALSE_GRIP)[ice])
+    tally.add("false_grip.sure", (drive.lower > SLIPPERY_MU)[ice])
+    excited = lately(drive.used.max(axis=-1)) >= EXCITED_SHARE
+    tally.add("warned", called[ice & excited])
+    tally.add("false_ice", called[grips])
+    settled = grips & ~lately(~grips, SETTLED_S).astype(bool)
+    tally.add("false_ice.settled", called[settled])
+    tally.add("km", np.array([float(drive.speed[settled].sum(dtype=np.float64)) / RATE_HZ / 1e3]))
+    contradicted = (drive.health & int(Health.CONTRADICTION)) > 0
+    tally.add("contradiction_share.ice.excited", contradicted[ice & excited])
+    tally.add("contradiction_share", contradicted)
+
+
+def passes_of(drive: DetectionDrive, n: int, kind: str) -> Stretches:
+    """Return stretches of PASS_S or longer of car n on ice, or on snow up to SLIPPERY_MU."""
+    mu = drive.mu[:, n]
+    on = mu <= ICE_MU if kind == "ice" else (mu > ICE_MU) & (mu <= SLIPPERY_MU)
+    return [(first, end) for first, end in runs_of(on) if end - first >= round(PASS_S * RATE_HZ)]
+
+
+def _judge_passes(tally: DetectionTally, drive: DetectionDrive, n: int, slides: Stretches) -> None:
+    for kind in ("ice", "snow"):
+        for first, end in passes_of(drive, n, kind):
+            called = drive.upper[first:end, n] < SLIPPERY_MU
+            flag = drive.flagged[first:end, n] < FLAGGED_MU
+            if drive.stood[first:end, n].any():
+                tally.note(f"passes.{kind}.stood", holds=bool(called.any()))
+                continue
+            tally.note(f"passes.{kind}", holds=bool(called.any()))
+            tally.note(f"flag.passes.{kind}", holds=bool(flag.any()))
+            tally.note(f"controller.passes.{kind}", holds=bool(drive.controlled[first:end, n].any()))
+            tally.note(f"either.passes.{kind}", holds=bool(flag.any() or called.any()))
+            for nats in ROC_NATS:
+                tally.note(f"roc.{nats:g}.{kind}", holds=bool((drive.favoured[first:end, n] > nats).any()))
+            for mu in ROC_FLAG_MU:
+                tally.note(f"flag.{mu:g}.{kind}", holds=bool((drive.flagged[first:end, n] < mu).any()))
+            slid = next(((max(a, first), b) for a, b in slides if b > first and a < end), None)
+            if slid is None:
+                continue
+            activity = activity_of(drive, n, slid[0], min(slid[1], end))
+            for among in ("slide", activity):
+                tally.note(f"passes.{kind}.{among}", holds=bool(called.any()))
+                tally.note(f"flag.passes.{kind}.{among}", holds=bool(flag.any()))
+            for name, found in (("seconds", called), ("flag.seconds", flag)):
+                if found.any():
+                    wait = max(0.0, (first + int(np.argmax(found)) - slid[0]) / RATE_HZ)
+                    for key in (f"{name}.{kind}", f"{name}.{kind}.{activity}"):
+                        tally.seconds.setdefault(key, []).append(wait)
+
+
+def _judge_slides(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
+    """Slides on slippery road: does the estimator report it before they end?"""
+    beyond = drive.theta[:, n] > SLIDING
+    for first, end in slides_of(drive.theta[:, n], TOLD_SLIDE_S):
+        if float(drive.mu_wheel[first:end, n].mean()) >= TOLD_MU or drive.stood[first:end, n].any():
+            continue
+        late = end + round(TOLD_AFTER_S * RATE_HZ)
+        told = bool((drive.upper[first:late, n] < SLIPPERY_MU).any())
+        four = bridge_gaps(np.asarray(beyond[first:end].all(axis=1)), BRIDGED_S)
+        whole = any(b - a >= round(TOLD_SLIDE_S * RATE_HZ) for a, b in runs_of(four))
+        tally.note("slide.told.all_wheels" if whole else "slide.told.some_wheels", holds=told)
+
+
+def _judge_contradictions(tally: DetectionTally, drive: DetectionDrive, n: int, slides: Stretches) -> None:
+    """Onsets of CONTRADICTION in slides on slippery road and outside of slides, and the seconds of each without it."""
+    sliding, extended = np.zeros(len(drive.mu), np.bool_), np.zeros(len(drive.mu), np.bool_)
+    for first, end in slides:
+        sliding[first:end] = True
+        extended[first : end + round(AFTER_SLIDE_S * RATE_HZ)] = True
+    low = drive.mu[:, n] <= SNOW_MU
+    flagged = (drive.health[:, n] & int(Health.CONTRADICTION)) > 0
+    onset = np.flatnonzero(flagged[1:] & ~flagged[:-1]) + 1
+    # a slide may end on dry road: what counts is that it was on slippery road within the last moment
+    was_low = lately(low[:, None], AFTER_SLIDE_S)[:, 0].astype(bool)
+    in_slide = extended[onset]
+    tally.add("contradictions.slide", np.array([float((in_slide & was_low[onset]).sum())]))
+    tally.add("contradictions.elsewhere", np.array([float((~in_slide).sum())]))
+    tally.add("s.slide", np.array([float((sliding & low & ~flagged).sum()) / RATE_HZ]))
+    tally.add("s.elsewhere", np.array([float((~sliding & ~flagged).sum()) / RATE_HZ]))
+
+
+def _judge_false_events(tally: DetectionTally, drive: DetectionDrive, n: int) -> None:
+    """Settled false events of the estimator, of its belief at each threshold, and of the slip flag."""
+    grips = drive.mu[:, n] > SNOW_MU
+    settled = grips & ~lately(~grips[:, None], SETTLED_S)[:, 0].astype(bool)
+    ways = {"false_events": drive.upper[:, n] < SLIPPERY_MU, "flag.false_events": drive.flagged[:, n] < FLAGGED_MU}
+    ways |= {f"roc.{nats:g}.false_events": drive.favoured[:, n] > nats for nats in ROC_NATS}
+    ways |= {f"flag.{mu:g}.false_events": drive.flagged[:, n] < mu for mu in ROC_FLAG_MU}
+    for name, called in ways.items():
+        events = runs_of(bridge_gaps(called & settled, EVENT_GAP_S))
+        tally.add(name, np.array([float(len(events))]))
+
+
+def _judge_visits(tally: DetectionTally, drive: DetectionDrive, n: int, slides: Stretches, *, oracle: bool) -> None:
+    visits = drive.visits
+    for v in np.flatnonzero(visits.vehicle == n):
+        now = slice(int(visits.first[v]), int(visits.last[v]) + 1)
+        mu = drive.mu[now, n]
+        if not len(mu):
+            continue
+        likelihood = visits.likelihood[v]
+        if float(mu.min()) > SNOW_MU:
+            tally.note("false_visits", holds=bool(slippery_favoured(likelihood) >= FAVOURED_NATS))
+        if float(np.ptp(mu)) >= MOVES or float(mu.mean()) > SNOW_MU:
+            continue
+        kind = "ice" if float(mu.mean()) <= ICE_MU else "snow"
+        slid = any(min(b, now.stop) - max(a, now.start) >= round(SLIDE_S * RATE_HZ) for a, b in slides)
+        if not slid and float(drive.used[now, n].max()) <= EXCITED_SHARE:
+            continue
+        apart = ".stood" if drive.stood[now, n].any() else ""
+        _note_visit(tally, f"{kind}.", likelihood, (slid, apart))
+        if oracle and kind == "ice":
+            grip = drive.mu_wheel[now, n].astype(np.float64)
+            force, slip = drive.used[now, n] * grip, drive.theta[now, n] * grip
+            rng = np.random.default_rng([n, now.start])
+            found = visit_evidence(force, slip, drive.speed[now, n].astype(np.float64), rng)
+            _note_visit(tally, f"oracle.{kind}.", found, (slid, apart))
+
+
+def _note_visit(tally: DetectionTally, kind: str, likelihood: FloatArray, slid: tuple[bool, str]) -> None:
+    value = bool(likelihood.max() - likelihood[-1] >= VALUE_NATS)
+    favoured = bool(slippery_favoured(likelihood) >= FAVOURED_NATS)
+    for among in ("", ".slide") if slid[0] else ("", ".calm"):
+        tally.note(f"{kind}yield{among}{slid[1]}", holds=value)
+        tally.note(f"{kind}favoured{among}{slid[1]}", holds=favoured)
+
+
+class TownTally(NamedTuple):
+    """Tally of one town, with its season."""
+
+    winter: bool
+    tally: DetectionTally
+
+
+@dataclass
+class DetectionResults:
+    """Tallies of towns by (length, kind)."""
+
+    towns: dict[tuple[str, str], list[TownTally]] = field(default_factory=dict)
+
+    def add(self, length: str, kind: str, town: TownTally) -> None:
+        """Add a town."""
+        self.towns.setdefault((length, kind), []).append(town)
+
+    def pool_towns(self, lengths: Sequence[str], kind: str, *, winter: bool | None = None) -> DetectionTally:
+        """Return all towns of a kind together, or the winter towns, or the others."""
+        found = DetectionTally()
+        for length in lengths:
+            for town in self.towns.get((length, kind), []):
+                if winter is None or town.winter == winter:
+                    found.merge(town.tally)
+        return found

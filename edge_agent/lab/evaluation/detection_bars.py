@@ -1,0 +1,184 @@
+"""Figures of the detection judge: how each is read from a tally, its unit, and its bars for rough and plain cars."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+
+from edge_agent.lab.evaluation.detection import (
+    ACTIVITIES,
+    KINDS,
+    LENGTHS,
+    ROC_FLAG_MU,
+    ROC_NATS,
+    DetectionResults,
+    DetectionTally,
+)
+from schemas.runtime.figures import Figure
+from schemas.thresholds import SURFACES
+
+SHARE: Final = "1"
+
+
+class DetectionBar(NamedTuple):
+    """A figure of the detection judge: which drives it is of, how it is read, its unit, and bars for both KINDS.
+
+    `length`: one of LENGTHS, or "" for both together.
+    """
+
+    name: str
+    length: str
+    read: Callable[[DetectionTally], float]
+    unit: str
+    bars: tuple[float, float] | None = None
+    better: Literal["less", "more"] = "more"
+
+
+def mean_of(name: str) -> Callable[[DetectionTally], float]:
+    """Read a mean of the tally."""
+    return lambda tally: tally.mean(name)
+
+
+def seconds_of(name: str, share: float) -> Callable[[DetectionTally], float]:
+    """Read a quantile of the tally's seconds."""
+    return lambda tally: tally.quantile(name, share)
+
+
+def rate_of(over: str, under: str) -> Callable[[DetectionTally], float]:
+    """Read 1000 times the sum of one name over that of another."""
+    return lambda tally: 1e3 * tally.rate(over, under)
+
+
+PER_1000_KM, PER_1000_S = "per 1000 km", "per 1000 s"
+DETECTION: Final = (
+    DetectionBar("ice.yield.long", "long", mean_of("ice.yield"), SHARE, (0.60, 0.58)),
+    DetectionBar("ice.yield.slide.long", "long", mean_of("ice.yield.slide"), SHARE, (0.80, 0.90)),
+    DetectionBar("ice.favoured.slide.short", "short", mean_of("ice.favoured.slide"), SHARE, (0.86, 0.90)),
+    DetectionBar("ice.passes.long", "long", mean_of("passes.ice"), SHARE, (0.80, 0.80)),
+    DetectionBar("ice.seconds.median", "short", seconds_of("seconds.ice.braking", 0.5), "s", (0.20, 0.20), "less"),
+    DetectionBar("ice.seconds.p90", "short", seconds_of("seconds.ice.braking", 0.9), "s", (0.6, 0.6), "less"),
+    DetectionBar("slide.told.short.all_wheels", "short", mean_of("slide.told.all_wheels"), SHARE, (0.92, 0.92)),
+    DetectionBar("slide.told.short.some_wheels", "short", mean_of("slide.told.some_wheels"), SHARE, (0.72, 0.72)),
+    DetectionBar(
+        "contradiction.per_1000s_slide", "", rate_of("contradictions.slide", "s.slide"), PER_1000_S, (10, 10), "less"
+    ),
+    DetectionBar(
+        "contradiction.elsewhere",
+        "",
+        rate_of("contradictions.elsewhere", "s.elsewhere"),
+        PER_1000_S,
+        (0.3, 0.3),
+        "less",
+    ),
+    DetectionBar("coverage90.ice.short", "short", mean_of("coverage90.ice"), SHARE, (0.86, 0.86)),
+    DetectionBar("coverage90.ice.long", "long", mean_of("coverage90.ice"), SHARE, (0.85, 0.85)),
+    DetectionBar("coverage90.snow.short", "short", mean_of("coverage90.snow"), SHARE, (0.94, 0.94)),
+    DetectionBar("coverage90.wet.short", "short", mean_of("coverage90.wet"), SHARE, (0.92, 0.92)),
+    DetectionBar("coverage90.dry.short", "short", mean_of("coverage90.dry"), SHARE, (0.87, 0.87)),
+    DetectionBar("false_ice.short", "short", mean_of("false_ice"), SHARE, (0.0015, 0.0015), "less"),
+    DetectionBar("false_ice.long", "long", mean_of("false_ice"), SHARE),
+    DetectionBar("false_events.short", "short", rate_of("false_events", "km"), PER_1000_KM, (70, 70), "less"),
+    DetectionBar("false_events.long", "long", rate_of("false_events", "km"), PER_1000_KM),
+    DetectionBar("false_grip.short", "short", mean_of("false_grip"), SHARE, (0.05, 0.05), "less"),
+    DetectionBar("false_grip.long", "long", mean_of("false_grip"), SHARE, (0.05, 0.05), "less"),
+    DetectionBar("false_grip.sure.short", "short", mean_of("false_grip.sure"), SHARE),
+    DetectionBar("false_grip.sure.long", "long", mean_of("false_grip.sure"), SHARE),
+    DetectionBar("score.ice.long", "long", mean_of("score.ice"), SHARE, (0.62, 0.62), "less"),
+    DetectionBar("score.ice.short", "short", mean_of("score.ice"), SHARE),
+    DetectionBar("false_visits", "", mean_of("false_visits"), SHARE),
+    *(
+        DetectionBar(f"{name}.{length}", length, mean_of(name), SHARE)
+        for length in LENGTHS
+        for name in (
+            *(
+                f"{road}.{what}{among}"
+                for road in ("ice", "snow")
+                for what in ("yield", "favoured")
+                for among in ("", ".slide", ".calm")
+            ),
+            "warned",
+            "passes.ice",
+            "passes.snow",
+            "passes.ice.stood",
+            "coverage90.ice.stood",
+            "ice.yield.stood",
+            "flag.passes.ice",
+            "flag.passes.snow",
+            "either.passes.ice",
+            "controller.passes.ice",
+            "contradiction_share.ice.excited",
+            "contradiction_share",
+            "coverage90.snow",
+            "coverage90.wet",
+            "coverage90.dry",
+            *(f"passes.ice.{activity}" for activity in ("slide", *ACTIVITIES)),
+        )
+        if (name, length)
+        not in {
+            ("ice.yield", "long"),
+            ("ice.yield.slide", "long"),
+            ("ice.favoured.slide", "short"),
+            ("passes.ice", "long"),
+            *((f"coverage90.{surface}", "short") for surface in SURFACES),
+        }
+    ),
+    *(
+        DetectionBar(f"{name}.short", "short", mean_of(name), SHARE)
+        for name in (
+            *(f"oracle.ice.{what}{among}" for what in ("yield", "favoured") for among in ("", ".slide", ".calm")),
+            *(f"flag.passes.ice.{activity}" for activity in ("slide", *ACTIVITIES)),
+        )
+    ),
+    *(
+        DetectionBar(f"ice.seconds.{activity}.{end}", "short", seconds_of(f"seconds.ice.{activity}", share), "s")
+        for activity in ACTIVITIES
+        for end, share in (("median", 0.5), ("p90", 0.9))
+    ),
+    *(
+        DetectionBar(f"flag.seconds.{end}", "short", seconds_of("flag.seconds.ice.braking", share), "s")
+        for end, share in (("median", 0.5), ("p90", 0.9))
+    ),
+    DetectionBar("flag.false_events", "", rate_of("flag.false_events", "km"), PER_1000_KM),
+    *(
+        DetectionBar(f"{way}.{limit:g}.{what}", "", read, unit)
+        for way, limits in (("roc", ROC_NATS), ("flag", ROC_FLAG_MU))
+        for limit in limits
+        for what, read, unit in (
+            ("ice", mean_of(f"{way}.{limit:g}.ice"), SHARE),
+            ("snow", mean_of(f"{way}.{limit:g}.snow"), SHARE),
+            ("false_events", rate_of(f"{way}.{limit:g}.false_events", "km"), PER_1000_KM),
+        )
+    ),
+)
+
+
+def detection_figures(results: DetectionResults) -> list[Figure]:
+    """List `NAME.KIND` for every DETECTION, those with a bar first, with the standard error over towns.
+
+    `NAME.KIND.winter` and `NAME.KIND.other`: the same in the winter towns and in the others, where both were driven.
+    """
+    listed = []
+    for bar in sorted(DETECTION, key=lambda bar: bar.bars is None):
+        for k, kind in enumerate(KINDS):
+            lengths = [length for length in LENGTHS if bar.length in ("", length)]
+            towns = [town for length in lengths for town in results.towns.get((length, kind), [])]
+            if not towns:
+                continue
+            limit = None if bar.bars is None else bar.bars[k]
+            value = bar.read(results.pool_towns(lengths, kind))
+            listed.append(Figure(f"{bar.name}.{kind}", value, bar.unit, limit, bar.better))
+            if limit is None:
+                continue
+            each = np.array([bar.read(town.tally) for town in towns])
+            each = each[np.isfinite(each)]
+            if len(each) > 1:
+                error = float(np.std(each, ddof=1) / math.sqrt(len(each)))
+                listed.append(Figure(f"{bar.name}.{kind}.se", error, bar.unit))
+            if len({town.winter for town in towns}) > 1:
+                for name, winter in (("winter", True), ("other", False)):
+                    part = bar.read(results.pool_towns(lengths, kind, winter=winter))
+                    listed.append(Figure(f"{bar.name}.{kind}.{name}", part, bar.unit))
+    return listed

@@ -1,0 +1,138 @@
+"""Detection campaign: towns of rough and of plain cars, short and long, judged one after the other.
+
+Half of the towns are winter towns, in which all cars have winter equipment. Chosen towns, with a table:
+
+    python -m edge_agent.lab.evaluation.detection_campaign 50001:rough 50002:plain:900 50003:rough:120:winter
+
+Each is SEED, SEED:KIND, SEED:KIND:SECONDS or SEED:KIND:SECONDS:winter.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from edge_agent.app.estimator_factory import bank_of
+from edge_agent.lab.evaluation.detection import KINDS, DetectionResults, TownTally, judge_drive
+from edge_agent.lab.evaluation.detection_bars import detection_figures
+from edge_agent.lab.evaluation.detection_drives import RATE_HZ, BankMaker, DetectionDrive, drive_fleet
+from edge_agent.lab.evaluation.real_world import in_winter
+from edge_agent.lab.evaluation.report import detection_table
+from edge_agent.lab.simulation import SimulatedFleet
+from edge_agent.lab.simulation.scenarios import drawn, winter
+from schemas.errors import InputError
+from schemas.runtime.figures import Figure
+
+SHORT_S: Final = 120.0
+LONG_S: Final = 900.0
+LONGER_THAN_SHORT_S: Final = 300.0  # a town that lasts so long is a long one
+CARS: Final = 16
+SHORT_TOWNS: Final = 10
+LONG_TOWNS: Final = 4
+QUICK_CARS: Final = 4
+QUICK_S: Final = 45.0
+DEFAULT: Final = "aco-fckf"
+
+
+class DetectionTown(NamedTuple):
+    """A town to judge: its seed, "rough" or "plain" cars, length [s], how many cars, and whether it is winter there."""
+
+    seed: int
+    kind: str
+    seconds: float
+    cars: int = CARS
+    winter: bool = False
+
+    @property
+    def length(self) -> str:
+        """Return "short" or "long"."""
+        return "long" if self.seconds >= LONGER_THAN_SHORT_S else "short"
+
+
+def towns(seeds: Sequence[int], *, quick: bool) -> list[DetectionTown]:
+    """Return the towns of the campaign: short and long ones have seeds of their own, both kinds the same ones.
+
+    Towns with an odd seed are winter towns.
+    """
+    if quick:
+        return [DetectionTown(seeds[0], kind, QUICK_S, QUICK_CARS, winter=kind == "plain") for kind in KINDS]
+    short, long = seeds[:SHORT_TOWNS], seeds[SHORT_TOWNS:][:LONG_TOWNS] or seeds[:LONG_TOWNS]
+    lengths = [(seed, SHORT_S) for seed in short] + [(seed, LONG_S) for seed in long]
+    return [DetectionTown(seed, kind, s, winter=in_winter(seed)) for kind in KINDS for seed, s in lengths]
+
+
+def drive_town(town: DetectionTown, make_bank: BankMaker) -> DetectionDrive:
+    """Drive and estimate a town."""
+    scenario = winter(town.seed) if town.winter else drawn(town.seed)
+    rough = float(town.kind == "rough")
+    fleet = SimulatedFleet(scenario, town.cars, town.seed, RATE_HZ, rough=rough, winter=float(town.winter))
+    return drive_fleet(fleet, make_bank(fleet.vehicles), town.seconds)
+
+
+def judge_towns(
+    chosen: Sequence[DetectionTown], make_bank: BankMaker, log_line: Callable[[str], None], *, oracle: bool = True
+) -> DetectionResults:
+    """Drive and judge towns; `oracle`: ask the oracle about short towns; `log_line` gets a line per town."""
+    results = DetectionResults()
+    for town in chosen:
+        tally = judge_drive(drive_town(town, make_bank), oracle=oracle and town.length == "short")
+        results.add(town.length, town.kind, TownTally(town.winter, tally))
+        log_line(
+            f"town {town.seed}{' in winter' if town.winter else ''}, {town.kind}, {town.seconds:.0f} s: "
+            f"ice visits with a value {tally.mean('ice.yield'):.2f}, passes found {tally.mean('passes.ice'):.2f}, "
+            f"false ice {tally.mean('false_ice'):.5f}"
+        )
+    return results
+
+
+def campaign(
+    seeds: Sequence[int], log_line: Callable[[str], None], *, quick: bool, estimator: str = DEFAULT
+) -> DetectionResults:
+    """Judge an estimator in all towns."""
+    return judge_towns(towns(seeds, quick=quick), lambda vehicles: bank_of(estimator, vehicles), log_line)
+
+
+def town_named(text: str) -> DetectionTown:
+    """Return the town of SEED[:KIND[:SECONDS[:winter]]].
+
+    Raises:
+        InputError: it is not one.
+    """
+    usual = ("", "rough", "120", "")
+    given = text.split(":")
+    seed, kind, seconds, season = [*given, *usual[len(given) :]][:4]
+    sound = seed.isdecimal() and kind in KINDS and seconds.replace(".", "", 1).isdecimal() and season in ("", "winter")
+    if len(given) > len(usual) or not sound:
+        raise InputError("town", f"{text!r} is no town", "give SEED, SEED:plain:900 or SEED:plain:900:winter")
+    return DetectionTown(int(seed), kind, float(seconds), winter=season == "winter")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Judge the named towns and print a table."""
+    parse = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parse.add_argument("towns", nargs="+", type=town_named, help="SEED, SEED:KIND, SEED:KIND:SECONDS[:winter]")
+    parse.add_argument("--estimator", default=DEFAULT)
+    parse.add_argument("--cars", type=int, default=CARS)
+    parse.add_argument("--no-oracle", action="store_true")
+    parse.add_argument("--json", type=Path, help="write name -> value")
+    args = parse.parse_args(arguments)
+    began = time.monotonic()
+    results = judge_towns(
+        [town._replace(cars=args.cars) for town in args.towns],
+        lambda vehicles: bank_of(args.estimator, vehicles),
+        lambda line: print(f"{time.monotonic() - began:6.1f} s  {line}", file=sys.stderr, flush=True),
+        oracle=not args.no_oracle,
+    )
+    figures: list[Figure] = detection_figures(results)
+    print(detection_table(figures))
+    if args.json:
+        args.json.write_text(json.dumps({figure.name: figure.value for figure in figures}, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,75 @@
+"""Oracle for visits: the evidence of an observer with knowledge of the motion and every tyre's force, but not the tyre.
+
+It bounds what any estimator can conclude from a visit. Unknown are the shape of the tyre's curve and its stiffness.
+
+    f    |F| / F_z, known with noise FORCE_STD          q    slip times stiffness per load, known with the wheels' noise
+    f = μ F(k q / μ; c, e)                              c, e shape and curvature of the Magic Formula, k ln-normal
+
+    ln L(μ) = ln mean over tyres of Π over wheels and samples N(f; μ F(k q/μ), FORCE_STD² + (slope · σ_q)²) · p(q)
+
+p(q) is the slope, at least LEAST_SLOPE: drivers ask for a force, of which all are as likely, and the slip follows.
+Every EACH-th sample counts: errors are correlated over as many.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from edge_agent.dynamics.tyres import magic_formula
+from schemas.mugrid import BINS, CENTRES
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+
+FORCE_STD: Final = 0.02
+SPEED_STD: Final = 0.03  # [m/s] of a wheel, as a filter takes it: noise, steps and unlike radii
+STIFF: Final = 20.0  # stiffness per load of an ordinary tyre, which turns the wheels' noise into that of q
+SLOWEST: Final = 0.5  # [m/s]
+EACH: Final = 4
+TYRES: Final = 128
+LEAST_SLOPE: Final = 0.1
+LEAST_NATS: Final = 100.0  # what is less likely than that is as good as excluded
+SHAPE: Final = (1.5, 0.1)  # mean and spread of c, as `one_of_a_fleet` draws it
+CURVATURE: Final = (-0.2, 0.25)
+STIFFNESS_STD: Final = 0.12  # of ln k, as well as the vehicle file is known
+
+
+def tyres_drawn() -> FloatArray:
+    """Return (TYRES, 3) tyres: shape c, curvature e and stiffness factor k, always the same ones."""
+    rng = np.random.default_rng(0)
+    shape = np.clip(rng.normal(*SHAPE, TYRES), 1.2, 1.8)
+    curvature = np.clip(rng.normal(*CURVATURE, TYRES), -0.9, 0.6)
+    return np.stack([shape, curvature, np.exp(rng.normal(0.0, STIFFNESS_STD, TYRES))], axis=1)
+
+
+def visit_evidence(force: FloatArray, slip: FloatArray, speed: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return ln L (BINS,) of a visit, maximum 0: true f and q (T, 4) [1], speed (T,) [m/s]; rng draws the noise."""
+    picked = slice(None, None, EACH)
+    noise = STIFF * SPEED_STD / np.maximum(speed[picked], SLOWEST)
+    read_force = force[picked] + FORCE_STD * rng.standard_normal(force[picked].shape)
+    read_slip = slip[picked] + noise[:, None] * rng.standard_normal(force[picked].shape)
+    rows = _evidence(np.ascontiguousarray(read_force), np.ascontiguousarray(read_slip), noise, tyres_drawn())
+    top = rows.max()
+    found = top + np.log(np.exp(np.maximum(rows - top, -LEAST_NATS)).mean(axis=0))
+    return np.asarray(found - found.max())
+
+
+@compiled
+def _evidence(force: FloatArray, slip: FloatArray, noise: FloatArray, tyres: FloatArray) -> FloatArray:
+    """Return ln L (TYRES, BINS) for each tyre by itself; noise: standard deviation of the slip (T,)."""
+    out = np.zeros((tyres.shape[0], BINS))
+    for j in range(tyres.shape[0]):
+        shape, curvature, stiffness = tyres[j]
+        for b in range(BINS):
+            total = 0.0
+            for k in range(force.shape[0]):
+                for i in range(4):
+                    x = stiffness * slip[k, i] / CENTRES[b]
+                    here = magic_formula(x, shape, curvature)
+                    slope = (magic_formula(x + 0.05, shape, curvature) - here) / 0.05 * stiffness
+                    variance = FORCE_STD**2 + (slope * noise[k]) ** 2
+                    total -= 0.5 * ((force[k, i] - CENTRES[b] * here) ** 2 / variance + np.log(variance))
+                    total += np.log(max(abs(slope), LEAST_SLOPE))
+            out[j, b] = total
+    return out

@@ -1,0 +1,126 @@
+"""Slip flag: the friction that ordinary ABS, traction control and ESC logic reports, without any estimator.
+
+Baseline for detection. It uses the recorded wheel speeds, accelerometers, yaw rate and steering, and the vehicle file.
+
+    reference speed  fastest wheel while braking, slowest while driving, else the median; it changes no faster than the
+                     accelerometer says, plus FREE; where all wheels have agreed for AGREE_S it is their speed
+    slip flag        |R ω − v_i| > SLIP max(v_i, SLOWEST) at a wheel for longer than SLIP_S; v_i includes the yaw rate
+                     wheels and cars slower than SLOWEST do not slip
+    yaw flag         |r − v tan δ / l| > YAW_OFF + YAW_SHARE |r| for longer than YAW_S
+    friction         |a| / g while a flag is up; while driving, over the share of the load on the driven axle
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+from schemas.signals import S
+from schemas.thresholds import GRAVITY
+from schemas.vehicle import Vehicle
+
+SLIP_FRONT: Final = 0.08
+SLIP_REAR: Final = 0.048
+SLIP_S: Final = 0.12
+GAP_S: Final = 0.10  # ABS makes gaps in a slip; shorter ones do not end it
+YAW_OFF: Final = 0.1  # [rad/s]
+YAW_SHARE: Final = 0.12
+YAW_S: Final = 0.15
+FREE: Final = 1.0  # [m/s^2]
+AGREE: Final = 0.04
+AGREE_S: Final = 0.3
+FAR: Final = 0.15  # share of the speed beyond which wheels that agree are not believed: all of them may slide
+SLOWEST: Final = 1.5  # [m/s]
+SMOOTH_S: Final = 0.1
+BRAKING: Final = 0.6  # [m/s^2]
+FLAGGED_MU: Final = 0.35  # below it the flag calls the road slippery
+
+
+def friction_flagged(t: FloatArray, signals: FloatArray, vehicles: list[Vehicle]) -> FloatArray:
+    """Return the friction that the flag reports, (T, N); infinite where no flag is up.
+
+    Args:
+        t: (T, N) [s].
+        signals: (T, N, channels); NaN is a missing reading.
+        vehicles: nominal vehicles, N of them.
+    """
+    out = np.empty(t.shape)
+    for n, vehicle in enumerate(vehicles):
+        split = 0.5 if vehicle.drive_split_front is None else vehicle.drive_split_front
+        base = vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle
+        rear = vehicle.cg_to_front_axle / base
+        driven = rear if split < 0.25 else 1.0 - rear if split > 0.75 else 1.0
+        car = np.array([vehicle.wheel_radius, base, 0.5 * vehicle.track_front, driven])
+        period = float(t[1, n] - t[0, n]) if len(t) > 1 else 0.01
+        out[:, n] = _follow(np.ascontiguousarray(signals[:, n]), car, period)
+    return out
+
+
+@compiled
+def _median(values: FloatArray, count: int) -> float:
+    ordered = np.sort(values[:count])
+    middle = count // 2
+    return float(ordered[middle] if count % 2 else 0.5 * (ordered[middle - 1] + ordered[middle]))
+
+
+@compiled
+def _follow(signals: FloatArray, car: FloatArray, period: float) -> FloatArray:
+    """Return the flagged friction (T,) of one car: signals (T, channels); car: radius, wheelbase, half track, share."""
+    out = np.full(signals.shape[0], np.inf)
+    smooth = 1.0 - np.exp(-period / SMOOTH_S)
+    rim, found = np.zeros(4), np.zeros(4)
+    ax = ay = yaw_rate = steer = speed = 0.0
+    agreed = slipping = yawing = 0.0
+    since_slip = since_yaw = np.inf
+    begun = False
+    for k in range(signals.shape[0]):
+        row = signals[k]
+        if np.isfinite(row[S.AX]):
+            ax += smooth * (row[S.AX] - ax)
+        if np.isfinite(row[S.AY]):
+            ay += smooth * (row[S.AY] - ay)
+        if np.isfinite(row[S.YAW_RATE]):
+            yaw_rate = row[S.YAW_RATE]
+        if np.isfinite(row[S.DELTA]):
+            steer = 0.5 * (row[S.DELTA] + row[S.DELTA + 1])
+        count = 0
+        for i in range(4):
+            if np.isfinite(row[S.OMEGA + i]):
+                side = -1.0 if i % 2 == 0 else 1.0
+                rim[i] = row[S.OMEGA + i] * car[0] - side * car[2] * yaw_rate
+                found[count] = rim[i]
+                count += 1
+        if count == 0:
+            continue
+        middle, most, least = _median(found, count), found[:count].max(), found[:count].min()
+        wanted = most if ax < -BRAKING else least if ax > BRAKING else middle
+        if not begun:
+            speed, begun = middle, True
+        speed = min(max(wanted, speed + (ax - FREE) * period), speed + (ax + FREE) * period)
+        alike = most - least < AGREE * max(middle, SLOWEST) and abs(middle - speed) < FAR * max(speed, SLOWEST)
+        agreed = agreed + period if alike else 0.0
+        if agreed > AGREE_S:
+            speed = middle
+        v = max(speed, SLOWEST)
+        slips = False
+        for i in range(4):
+            moves = max(rim[i], speed) > SLOWEST
+            if (
+                moves
+                and np.isfinite(row[S.OMEGA + i])
+                and abs(rim[i] - speed) > (SLIP_FRONT if i < 2 else SLIP_REAR) * v
+            ):
+                slips = True
+        off = abs(yaw_rate - v * np.tan(steer) / car[1])
+        turns = speed > SLOWEST and off > YAW_OFF + YAW_SHARE * abs(yaw_rate)
+        since_slip = 0.0 if slips else since_slip + period
+        slipping = slipping + period if since_slip <= GAP_S else 0.0
+        since_yaw = 0.0 if turns else since_yaw + period
+        yawing = yawing + period if since_yaw <= GAP_S else 0.0
+        if (slipping > SLIP_S and since_slip == 0.0) or (yawing > YAW_S and since_yaw == 0.0):
+            along = ax / car[3] if ax > 0.0 else ax
+            out[k] = np.hypot(along, ay) / GRAVITY
+    return out

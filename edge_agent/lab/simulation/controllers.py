@@ -1,0 +1,152 @@
+"""Controllers of a vehicle with modulated slip control: ABS, traction control, drag torque control and ESC.
+
+They act in steps of the plant, on slip that they know exactly: only their action is modelled, not their sensors.
+
+    ABS    a wheel beyond its slip limit loses brake torque by DUMP, keeps it until the slip is half of the limit, and
+           gets it back, fast up to NEARLY of the torque at which it let go, then slowly: 6 to 10 cycles per second;
+           the rear wheels share the lower torque
+    TCS    the engine's torque is cut while a driven wheel spins, and the brake holds a wheel that spins much; the same
+           cut ends the drag of engine or generator at lift-off, and while ABS works
+    ESC    where the yaw rate is off what steering asks for, one wheel is braked: the outer front wheel of a car that
+           turns too much, the inner rear wheel of one that turns too little; the engine's torque is cut
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from edge_agent.dynamics.parameters import Parameter
+from edge_agent.lab.simulation.state import Control, Motion, TrueParameter, Wheel
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+from schemas.thresholds import GRAVITY
+
+REAR_LIMIT: Final = 0.5  # slip control lets go of the rear wheels at this share of the limit, so that they still guide
+SHOWN_S: Final = 0.25  # a controller counts as active so long after it acted: its lamp blinks no faster
+ABS_SLOWEST: Final = 1.5  # [m/s] below it brakes may lock the wheels
+DUMP: Final = 22.0  # [1/s] rates of ln of the brake torque, at USUAL_HZ
+BUILD_FAST: Final = 35.0
+BUILD: Final = 2.8
+NEARLY: Final = 0.88
+USUAL_HZ: Final = 8.0
+LEAST_SHARE: Final = 0.02  # of the brake torque that was asked for
+TCS_SLOWEST: Final = 2.5  # [m/s] slip of slower cars is taken of this speed
+CUT_RATE: Final = 5.0  # [1/s] of the share of the engine's torque that is taken away, and given back
+GIVE_RATE: Final = 0.8
+MOST_CUT: Final = 0.95
+MUCH: Final = 2.0  # times the limit of traction control: the brake helps
+TCS_BRAKE: Final = 0.12  # most brake torque of traction control, over weight times radius
+ESC_SLOWEST: Final = 4.0  # [m/s]
+ESC_S: Final = 0.06  # so long the yaw rate must be off
+YAW_OFF: Final = 0.10  # [rad/s]
+FOLLOWS_S: Final = 0.12  # in which a car follows its steering
+YAW_SHARE: Final = 0.12
+CHARACTERISTIC: Final = 45.0  # [m/s] speed at which steering has half of its effect
+MOST_LATERAL: Final = 9.0  # [m/s^2] that steering may ask for
+ESC_GAIN: Final = 3.0  # brake torque of ESC over weight times radius, per rad/s
+ESC_BRAKE: Final = 0.15  # its largest value
+ESC_REAR: Final = 0.04  # of a rear wheel: more would take what guides the car
+HELD_RATE: Final = 2.0  # of these, per second
+
+
+@compiled
+def slip_limit(p: FloatArray, i: int) -> float:
+    """Slip at which the control of wheel `i` begins to let go."""
+    return float(p[TrueParameter.SLIP_LIMIT] if i < 2 else REAR_LIMIT * p[TrueParameter.SLIP_LIMIT])
+
+
+@compiled
+def control_slip(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float) -> None:
+    """Move all controllers in `x` on by `dt` [s], by the slips in `w` and the inputs `u`."""
+    x[Motion.ABS_LEFT] = max(x[Motion.ABS_LEFT] - dt, 0.0)
+    x[Motion.TCS_LEFT] = max(x[Motion.TCS_LEFT] - dt, 0.0)
+    x[Motion.ESC_LEFT] = max(x[Motion.ESC_LEFT] - dt, 0.0)
+    unit = p[Parameter.MASS] * GRAVITY * p[Parameter.RADIUS]
+    wheel, wanted = stabilise(x, p, u, dt)
+    traction_active = cut_drive(x, p, u, w, dt)
+    for i in range(4):
+        target = wanted * unit if i == wheel else 0.0
+        if traction_active and spins(x, p, w, i) > MUCH and u[Control.DRIVE, i] > 0.0:
+            target = max(target, TCS_BRAKE * unit)
+        step = HELD_RATE * unit * dt
+        x[Motion.HELD + i] += min(max(target - x[Motion.HELD + i], -step), step)
+        modulate(x, p, u, w, i, dt)
+    low = max(x[Motion.LIMIT + 2], x[Motion.LIMIT + 3])
+    if min(x[Motion.LIMIT + 2], x[Motion.LIMIT + 3]) > 0.0:
+        low = min(x[Motion.LIMIT + 2], x[Motion.LIMIT + 3])
+    if low > 0.0:
+        x[Motion.LIMIT + 2] = x[Motion.LIMIT + 3] = low
+
+
+@compiled
+def modulate(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, i: int, dt: float) -> None:
+    """Move the brake torque that ABS lets through at wheel `i` on by `dt` [s]."""
+    asked, limit, slip = u[Control.BRAKE, i] + x[Motion.HELD + i], slip_limit(p, i), w[Wheel.SLIP, i]
+    pace = p[TrueParameter.ABS_HZ] / USUAL_HZ * dt
+    if asked <= 0.0 or abs(x[Motion.VX]) < ABS_SLOWEST:
+        x[Motion.LIMIT + i] = x[Motion.PEAK + i] = 0.0
+    elif slip < -limit:
+        now = asked if x[Motion.LIMIT + i] <= 0.0 else min(x[Motion.LIMIT + i], asked)
+        if x[Motion.PEAK + i] <= 0.0:
+            x[Motion.PEAK + i] = now
+        x[Motion.LIMIT + i] = max(now * math.exp(-DUMP * pace), LEAST_SHARE * asked)
+        x[Motion.ABS_LEFT] = SHOWN_S
+    elif x[Motion.LIMIT + i] > 0.0 and slip > -0.5 * limit:
+        fast = x[Motion.LIMIT + i] < NEARLY * abs(x[Motion.PEAK + i])
+        x[Motion.LIMIT + i] *= math.exp((BUILD_FAST if fast else BUILD) * pace)
+        x[Motion.PEAK + i] = -abs(x[Motion.PEAK + i])
+        if x[Motion.LIMIT + i] >= asked:
+            x[Motion.LIMIT + i] = x[Motion.PEAK + i] = 0.0
+
+
+@compiled
+def spins(x: FloatArray, p: FloatArray, w: FloatArray, i: int) -> float:
+    """Return how much faster than the ground wheel `i` turns, over the limit of traction control."""
+    along = w[Wheel.SPEED, i]
+    faster = p[Parameter.RADIUS] * x[Motion.OMEGA + i] - along
+    return float(faster / (p[TrueParameter.SLIP_LIMIT] * max(abs(along), TCS_SLOWEST)))
+
+
+@compiled
+def cut_drive(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, dt: float) -> bool:
+    """Cut or give back the engine's torque; whether a driven wheel spins, or is dragged to a slip, now."""
+    acts = drags = False
+    for i in range(4):
+        spin = spins(x, p, w, i)
+        if (u[Control.DRIVE, i] > 0.0 and spin > 1.0) or (u[Control.DRIVE, i] < 0.0 and spin < -1.0):
+            acts = True
+        drags = drags or u[Control.DRIVE, i] < 0.0
+    acts = acts and p[TrueParameter.TCS] > 0.0
+    others_act = x[Motion.ESC_LEFT] > 0.0 or (drags and x[Motion.ABS_LEFT] > 0.0)
+    rate = CUT_RATE if acts or others_act else -GIVE_RATE
+    x[Motion.CUT] = min(max(x[Motion.CUT] + rate * dt, 0.0), MOST_CUT)
+    if acts:
+        x[Motion.TCS_LEFT] = SHOWN_S
+    return acts
+
+
+@compiled
+def stabilise(x: FloatArray, p: FloatArray, u: FloatArray, dt: float) -> tuple[int, float]:
+    """Return which wheel ESC brakes (-1: none) and with what torque, over weight times radius."""
+    vx, r = x[Motion.VX], x[Motion.YAW_RATE]
+    if p[TrueParameter.ESC] <= 0.0 or vx < ESC_SLOWEST:
+        x[Motion.DEVIATES] = 0.0
+        x[Motion.ASKED] = r
+        return -1, 0.0
+    base = p[Parameter.TO_FRONT] + p[Parameter.TO_REAR]
+    steer = 0.5 * (u[Control.STEER, 0] + u[Control.STEER, 1])
+    asked = vx * math.tan(steer) / (base * (1.0 + (vx / CHARACTERISTIC) ** 2))
+    asked = min(max(asked, -MOST_LATERAL / vx), MOST_LATERAL / vx)
+    x[Motion.ASKED] += (asked - x[Motion.ASKED]) * -math.expm1(-dt / FOLLOWS_S)
+    asked = x[Motion.ASKED]
+    off = r - asked
+    beyond = abs(off) - YAW_OFF - YAW_SHARE * abs(asked)
+    x[Motion.DEVIATES] = x[Motion.DEVIATES] + dt if beyond > 0.0 else 0.0
+    if x[Motion.DEVIATES] < ESC_S:
+        return -1, 0.0
+    x[Motion.ESC_LEFT] = SHOWN_S
+    turns_too_much = off * asked > 0.0 or abs(r) > abs(asked)
+    right_side = 1 if off > 0.0 else 0
+    wheel = right_side if turns_too_much else 2 + right_side
+    return wheel, min(ESC_GAIN * beyond, ESC_BRAKE if turns_too_much else ESC_REAR)

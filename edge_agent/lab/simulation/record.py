@@ -1,0 +1,92 @@
+"""Records: the truth of one sample of one vehicle, as sensors read it and judges compare with it."""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import Final
+
+from edge_agent.dynamics.parameters import Parameter
+from edge_agent.lab.simulation.plant import body_accelerations, gravity, held, wheel_forces
+from edge_agent.lab.simulation.state import Control, Motion, TrueParameter, Wheel
+from schemas.numeric import FloatArray
+from schemas.runtime.jit import compiled
+from schemas.thresholds import GRAVITY
+
+
+class RecordColumn(IntEnum):
+    """Columns of a record: the truth of one sample of one vehicle."""
+
+    AX = 0  # [m/s^2] that an accelerometer at the centre of gravity feels, as the road lies
+    AY = 1
+    AX_FELT = 2  # [m/s^2] by an accelerometer fixed to the rolling and pitching body
+    AY_FELT = 3
+    YAW_RATE = 4
+    DELTA = 5  # four wheels each, from here on
+    OMEGA = 9
+    TORQUE = 13
+    X = 17
+    Y = 18
+    YAW = 19
+    VX = 20
+    VY = 21
+    MU = 22
+    UTILISATION = 26  # |F| / (μ F_z)
+    SLOPE = 30  # rise of the road per metre ahead
+    BANK = 31  # and to the left
+    THETA = 32  # four wheels: normalised slip; beyond about 2.6 a wheel slides
+    ABS = 36  # 1 while the controller works
+    TCS = 37
+    ESC = 38
+
+
+RECORD: Final = 39
+
+
+@compiled
+def observe(x: FloatArray, p: FloatArray, u: FloatArray, w: FloatArray, record: FloatArray) -> None:
+    """Fill `record` (RECORD,) with the truth of this instant under the inputs `u`; fills `w` too."""
+    wheel_forces(x, p, u, w)
+    ax, ay, _ = body_accelerations(x, p, u, w)
+    record[RecordColumn.AX], record[RecordColumn.AY] = ax, ay
+    record[RecordColumn.AX_FELT] = ax + p[TrueParameter.PITCH_LEAK] * x[Motion.AX_LAGGED]
+    record[RecordColumn.AY_FELT] = ay + p[TrueParameter.ROLL_LEAK] * x[Motion.AY_LAGGED]
+    record[RecordColumn.YAW_RATE], record[RecordColumn.VX], record[RecordColumn.VY] = (
+        x[Motion.YAW_RATE],
+        x[Motion.VX],
+        x[Motion.VY],
+    )
+    record[RecordColumn.X], record[RecordColumn.Y], record[RecordColumn.YAW] = x[Motion.X], x[Motion.Y], x[Motion.YAW]
+    for i in range(4):
+        record[RecordColumn.DELTA + i], record[RecordColumn.OMEGA + i], record[RecordColumn.TORQUE + i] = (
+            u[Control.STEER, i],
+            x[Motion.OMEGA + i],
+            w[Wheel.TORQUE, i],
+        )
+        record[RecordColumn.MU + i] = u[Control.MU, i]
+        record[RecordColumn.UTILISATION + i] = math.hypot(w[Wheel.FX, i], w[Wheel.FY, i]) / (
+            u[Control.MU, i] * w[Wheel.FZ, i]
+        )
+        record[RecordColumn.THETA + i] = w[Wheel.THETA, i]
+    record[RecordColumn.ABS] = 1.0 if x[Motion.ABS_LEFT] > 0.0 else 0.0
+    record[RecordColumn.TCS] = 1.0 if x[Motion.TCS_LEFT] > 0.0 else 0.0
+    record[RecordColumn.ESC] = 1.0 if x[Motion.ESC_LEFT] > 0.0 else 0.0
+    record[RecordColumn.SLOPE], record[RecordColumn.BANK] = u[Control.TILT, 0], u[Control.TILT, 1]
+    if held(x, p, u):
+        _observe_held(x, p, u, record)
+
+
+@compiled
+def _observe_held(x: FloatArray, p: FloatArray, u: FloatArray, record: FloatArray) -> None:
+    """Fill the record of a vehicle that is held: brakes and tyres balance the slope."""
+    along, across, share = gravity(u)
+    record[RecordColumn.AX], record[RecordColumn.AY] = -along, -across
+    record[RecordColumn.AX_FELT] = -along + p[TrueParameter.PITCH_LEAK] * x[Motion.AX_LAGGED]
+    record[RecordColumn.AY_FELT] = -across + p[TrueParameter.ROLL_LEAK] * x[Motion.AY_LAGGED]
+    record[RecordColumn.YAW_RATE] = record[RecordColumn.VX] = record[RecordColumn.VY] = 0.0
+    for i in range(4):
+        brake_share = p[TrueParameter.BRAKE_FRONT] if i < 2 else 1.0 - p[TrueParameter.BRAKE_FRONT]
+        record[RecordColumn.OMEGA + i] = 0.0
+        record[RecordColumn.THETA + i] = 0.0
+        record[RecordColumn.TORQUE + i] = -0.5 * brake_share * p[Parameter.MASS] * along * p[Parameter.RADIUS]
+        record[RecordColumn.UTILISATION + i] = math.hypot(along, across) / (u[Control.MU, i] * GRAVITY * share)
