@@ -28,7 +28,7 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
-from edge_agent.calibration.lags import lags
+from edge_agent.inputs.doctor.lags import lags
 from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, prepare
 from edge_agent.inputs.doctor.identities import fits, robust
 from schemas.errors import InputError

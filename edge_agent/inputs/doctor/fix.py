@@ -19,7 +19,8 @@ LEFT_RIGHT: Final = (("omega_fl", "omega_fr"), ("omega_rl", "omega_rr"))
 FRONT_REAR: Final = (("omega_fl", "omega_rl"), ("omega_fr", "omega_rr"))
 EXCHANGED: Final = {
     "exchanged with ay": (("ax", "ay"),), "exchanged with longitude": (("latitude", "longitude"),),
-    "left and right exchanged": LEFT_RIGHT, "front and rear exchanged": FRONT_REAR,
+    "left and right exchanged": LEFT_RIGHT, "front left and right exchanged": LEFT_RIGHT[:1],
+    "rear left and right exchanged": LEFT_RIGHT[1:], "front and rear exchanged": FRONT_REAR,
 }  # fmt: skip
 
 
