@@ -135,7 +135,8 @@ def prepare(t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: FloatA
         delta=smooth(even(t, np.where(np.isfinite(delta), delta, signals[:, S.DELTA + 1]), at)), wheels=rims, v=v,
         r_wheels=r_wheels, v_ground=v_ground, course=course, course_yaw=yaw_at,
         moving=((np.abs(v) > CREEP * fast) & ~slipping(raw, fast)).astype(float),
-        grips=(~left_ground(v, v_ground, fast)).astype(float), wheelbase=vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle,
+        grips=(~left_ground(v, v_ground, fast)).astype(float),
+        wheelbase=vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle,
         torque=smooth(even(t, signals[:, S.TORQUE : S.TORQUE + 4].sum(axis=1), at)),
         yaw_front=axles[0], yaw_rear=axles[1],
     )  # fmt: skip

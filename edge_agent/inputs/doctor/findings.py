@@ -160,9 +160,7 @@ def _lags(t: FloatArray, signals: FloatArray, vehicle: Vehicle, diagnosis: Diagn
             diagnosis.findings.append(Finding(device, "clock", words, delay_s=seconds))
 
 
-def _told_twice(
-    t: FloatArray, signals: FloatArray, vehicle: Vehicle, found: dict[str, Fit]
-) -> dict[str, float]:
+def _told_twice(t: FloatArray, signals: FloatArray, vehicle: Vehicle, found: dict[str, Fit]) -> dict[str, float]:
     """Return the lags [s] that both halves of a drive agree on, of devices whose identity holds all along.
 
     A car that slides answers to its steering later or sooner than its model, and not by the same time again.
@@ -321,10 +319,11 @@ def _always(quantity: str, verdict: Verdict, found: dict[str, Fit], drive: EvenD
     fault = verdict.faults[quantity]
     if quantity == "ay" and fault is not None and "g" in fault.name and not _turns(verdict, found):
         return False
-    if quantity == "v" and fault is not None and drive is not None:
-        if abs(np.log(abs(found["ground"].gain * fault.factor))) < 0.1 and found["ground"].known:
-            if abs(np.log(fault.factor)) < NEAR_ONE and not _rolls(drive, found["ground"].gain):
-                return False
+    ground = found["ground"]
+    if quantity == "v" and fault is not None and drive is not None and ground.known:
+        like_slip = abs(np.log(fault.factor)) < NEAR_ONE
+        if like_slip and abs(np.log(abs(ground.gain * fault.factor))) < 0.1 and not _rolls(drive, ground.gain):
+            return False
     shares = []
     for name, law in LAWS.items():
         if not found[name].known or quantity not in {member.quantity for member in law.members}:
@@ -343,7 +342,7 @@ def _always(quantity: str, verdict: Verdict, found: dict[str, Fit], drive: EvenD
 def _rolls(drive: EvenDrive, gain: float) -> bool:
     """Return True if speed over ground over the wheels' is the same while the car gains and loses speed.
 
-    Wheels that spin turn too fast while they are driven, wheels under brakes too slowly; a wrong radius is always wrong.
+    Wheels that spin turn too fast while they are driven, wheels under brakes too slowly; a wrong radius always is.
     """
     ratio = smooth(drive.v_ground, 1.0) / np.where(drive.v == 0.0, np.nan, smooth(drive.v, 1.0))
     known = np.isfinite(ratio) & (drive.moving > 0)

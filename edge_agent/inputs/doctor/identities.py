@@ -88,7 +88,9 @@ def _steering(d: EvenDrive) -> Relation:
     # times v: turns at walking speed, where the angle is large and its map bent, would else outweigh all others
     fast = np.nanpercentile(np.abs(d.v), 95) if np.isfinite(d.v).any() else 1.0
     v = np.where(np.abs(d.v) > 0.25 * fast, d.v, np.nan)
-    return Relation(d.delta * v, d.wheelbase * d.r, per=v, bend=np.square(v / max(float(fast), 1e-9)), length=d.wheelbase)
+    return Relation(
+        d.delta * v, d.wheelbase * d.r, per=v, bend=np.square(v / max(float(fast), 1e-9)), length=d.wheelbase
+    )
 
 
 def _axle(d: EvenDrive) -> Relation:
@@ -116,7 +118,9 @@ IDENTITIES: Final[dict[str, Callable[[EvenDrive], Relation]]] = {
 
 def fits(drive: EvenDrive) -> dict[str, Fit]:
     """Every identity of a drive."""
-    return {name: fit(sides(drive), drive.moving, drive.grips, level=name == "ground") for name, sides in IDENTITIES.items()}
+    return {
+        name: fit(sides(drive), drive.moving, drive.grips, level=name == "ground") for name, sides in IDENTITIES.items()
+    }
 
 
 def fit(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) -> Fit:
@@ -178,9 +182,7 @@ def fit(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) 
     )  # fmt: skip
 
 
-def _bend_of(
-    x: FloatArray, y: FloatArray, constant: FloatArray, bend: FloatArray, count: float
-) -> tuple[float, float]:
+def _bend_of(x: FloatArray, y: FloatArray, constant: FloatArray, bend: FloatArray, count: float) -> tuple[float, float]:
     """Share of `bend` in the right side, and the standard deviation of ln gain that its uncertainty makes.
 
     Each share is tried: what it leaves of the left side, of `count` independent moments, against what cars have.
@@ -198,9 +200,7 @@ def _bend_of(
     return float(weights @ BENDS), float(np.sqrt(weights @ np.square(gains - centre)))
 
 
-def _loose(
-    table: FloatArray, y: FloatArray, loose: tuple[float, ...], count: float
-) -> tuple[FloatArray, FloatArray]:
+def _loose(table: FloatArray, y: FloatArray, loose: tuple[float, ...], count: float) -> tuple[FloatArray, FloatArray]:
     """Robust least squares with the last columns' gains drawn to zero, and standard deviations of all gains."""
     solution = robust(table, y)
     off = np.abs(y - table @ solution)
