@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, even, prepare, smooth
-from edge_agent.inputs.doctor.identities import Fit, fits, robust
+from edge_agent.inputs.doctor.identities import PARTS, Fit, fits, robust
 from edge_agent.inputs.doctor.lags import lags
 from edge_agent.inputs.doctor.places import exchanged, yaw_findings
 from edge_agent.inputs.doctor.scales import CLOCK_SETTLED, LAWS, SETTLED, Verdict, clocks, explain
@@ -44,6 +44,7 @@ NEAR_ONE: Final = 0.35  # of a factor's logarithm: slip is not larger for long
 SURE: Final = 2.0
 TURNS_LIKE: Final = 0.8  # correlation of the yaw rate with steering or course, below which the car may spin
 STEADY: Final = 0.4
+NOISIEST: Final = 1.0  # in logarithms, up to which a part's gain may be noise
 STEADY_SHARE: Final = 0.75
 CHANNELS_OF: Final = {"ax": "ax", "ay": "ay", "r": "yaw_rate", "delta": "delta", "v": "omega"}
 
@@ -294,7 +295,7 @@ def _sides_exchanged(drive: EvenDrive) -> list[tuple[str, tuple[int, int]]]:
 
     front = likeness(drive.yaw_front)
     rear = likeness(drive.yaw_rear)
-    if min(abs(front), abs(rear)) < 0.7 or front * rear > 0.0:
+    if min(abs(front), abs(rear)) < 0.5 or front * rear > 0.0:
         return []
     good = np.isfinite(drive.ay) & np.isfinite(drive.r) & (drive.moving > 0)
     steered = np.isfinite(drive.delta) & good
@@ -334,7 +335,10 @@ def _always(quantity: str, verdict: Verdict, found: dict[str, Fit], drive: EvenD
             if other is not None:
                 gain *= other.factor**member.power
         off = abs(np.log(abs(gain / law.centre)))
-        within = STEADY if off == 0.0 or name != "ground" else min(STEADY, max(0.04, 0.4 * off))
+        noise = min(1.5 * found[name].error * np.sqrt(PARTS), NOISIEST)  # of a part's gain
+        within = max(STEADY, noise if off == 0.0 else min(noise, 0.4 * off))
+        if name == "ground" and off > 0.0:
+            within = min(STEADY, max(0.04, 0.4 * off))
         shares.append(_share(found[name], gain, within))
     return bool(shares) and min(shares) >= STEADY_SHARE
 
@@ -426,7 +430,7 @@ def _offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
     if np.isfinite(beside).sum() > FEWEST_OFFSET_S * RATE_HZ:
         driven = float(np.nansum(np.abs(drive.v))) / RATE_HZ
         largest = LARGEST_AX if driven < AVERAGED_M else LARGEST_AX_FAR
-        listed.append(("ax", float(np.nanmedian(beside)), _apart(beside), largest, "m/s^2"))
+        listed.append(("ax", float(np.nanmedian(beside)), 0.5 * _apart(beside), largest, "m/s^2"))
     straight = moving & (np.abs(drive.v * drive.r) < 1.0)
     if np.isfinite(drive.delta).any():
         straight &= _followed(drive)
