@@ -44,6 +44,7 @@ NEAR_ONE: Final = 0.35  # of a factor's logarithm: slip is not larger for long
 SURE: Final = 2.0
 TURNS_LIKE: Final = 0.8  # correlation of the yaw rate with steering or course, below which the car may spin
 STEADY: Final = 0.4
+WHOLE: Final = 0.35  # in logarithms, by which the whole drive's gain may be off that of a fault
 NOISIEST: Final = 1.0  # in logarithms, up to which a part's gain may be noise
 STEADY_SHARE: Final = 0.75
 CHANNELS_OF: Final = {"ax": "ax", "ay": "ay", "r": "yaw_rate", "delta": "delta", "v": "omega"}
@@ -128,7 +129,7 @@ def diagnose(t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: Float
         _lags(t, signals, vehicle, diagnosis)
     diagnosis.findings += yaw_findings(signals, drive)
     if not scaled:
-        diagnosis.findings += _radii(drive, vehicle) + _offsets(drive, found)
+        diagnosis.findings += _radii(drive, vehicle, diagnosis.doubts) + _offsets(drive, found)
     for quantity, channel in CHANNELS_OF.items():
         if any(finding.channel == channel for finding in diagnosis.findings):
             continue
@@ -339,7 +340,9 @@ def _always(quantity: str, verdict: Verdict, found: dict[str, Fit], drive: EvenD
         within = max(STEADY, noise if off == 0.0 else min(noise, 0.4 * off))
         if name == "ground" and off > 0.0:
             within = min(STEADY, max(0.04, 0.4 * off))
-        shares.append(_share(found[name], gain, within))
+        whole = found[name].gain
+        near = whole * gain > 0.0 and abs(np.log(whole / gain)) < WHOLE
+        shares.append(_share(found[name], gain, within) if near else 0.0)
     return bool(shares) and min(shares) >= STEADY_SHARE
 
 
@@ -370,10 +373,11 @@ def _turns(verdict: Verdict, found: dict[str, Fit]) -> bool:
     return False
 
 
-def _radii(drive: EvenDrive, vehicle: Vehicle) -> list[Finding]:
+def _radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Finding]:
     """Return wheels that turn faster or slower than the others on calm, straight moments; exchanged axles.
 
-    In a bend the wheels slip by what the tyres hold, so that only moments count in which hardly anything is asked.
+    In a bend the wheels slip by what the tyres hold, so that only moments count in which hardly anything is asked. A
+    wheel that is off, but not seen to be so while the car coasts, adds the wheels to `doubts`.
     """
     findings = []
     tracks = (vehicle.track_front, vehicle.track_front, vehicle.track_rear, vehicle.track_rear)
@@ -391,6 +395,8 @@ def _radii(drive: EvenDrive, vehicle: Vehicle) -> list[Finding]:
         off = float(np.median(parts))
         rolls = drive.v_dot[good] < -0.1  # a wheel that spins does so only while it is driven
         if rolls.sum() < 2 * RATE_HZ or abs(float(np.nanmedian(ratio[rolls])) - off) > 0.3 * abs(off):
+            if abs(off) > LARGEST_RADIUS:
+                doubts.add("v")
             continue
         if abs(off) > LARGEST_RADIUS and np.all(np.abs(parts - off) < 0.3 * abs(off)):
             words = f"turns {off:+.1%} faster than the other wheels: another tyre, or its own scale"
