@@ -11,12 +11,26 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, even, prepare, smooth
+from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, even, prepare
 from edge_agent.inputs.doctor.identities import PARTS, Fit, fits, robust
-from edge_agent.inputs.doctor.lags import lags
 from edge_agent.inputs.doctor.places import exchanged, yaw_findings
 from edge_agent.inputs.doctor.scales import CLOCK_SETTLED, LAWS, SETTLED, Verdict, clocks, explain
-from schemas.numeric import BoolArray, FloatArray
+from edge_agent.inputs.doctor.slip import (
+    RADIUS_PARTS,
+    STEADY,
+    STEADY_SHARE,
+    TURNS_LIKE,
+    find_exchanged_axles,
+    find_followed,
+    has_equal_steps,
+    is_foreign,
+    is_same_when_coasting,
+    is_steady,
+    measure_lags_twice,
+    share_of_parts,
+    spread_of_parts,
+)
+from schemas.numeric import FloatArray
 from schemas.signals import WHEELS, S
 from schemas.vehicle import Vehicle
 
@@ -26,27 +40,19 @@ LARGEST_AX, LARGEST_AY = 1.3, 0.75  # [m/s^2]
 LARGEST_RATE = 0.02  # [rad/s]
 LARGEST_STEER = 0.02  # [rad]
 LARGEST_RADIUS = 0.025
-FEWEST_STEPS: Final = 5  # of a wheel away from the others, below which they are no bits
-FOREIGN_ROWS: Final = 3000  # of a moving car in which a wheel must have nothing to do with the others
 JUMPS = 0.01  # share of readings that may jump off the other wheels
 SLOWEST_HZ, FASTEST_HZ = 5.0, 2000.0
 LARGEST_AX_FAR, AVERAGED_M = 0.9, 300.0  # [m/s^2] and the way over which slopes average to less than 8 %
 CALM, CALM_ACROSS = 0.5, 0.5  # [m/s^2] up to which wheels hardly slip, on ice too
 GENTLE_ACROSS: Final = 3.5  # [m/s^2] of turns in which the axles' ways tell front from rear
-FOLLOWED: Final = 0.25  # share by which the way taken may be off the way steered
 TIGHT, TIGHT_S = 0.015, 1.5  # (L r / v)^2 of a circle of eight wheelbases; wider ones are lost in slip
-RADIUS_PARTS: Final = 4
 FEWEST_OFFSET_S: Final = 8.0
 FILTER_BEARS_S: Final = 0.025  # by which devices may be apart: standard deviation of the filter's own prior
-LAGS_APART_S: Final = 0.05  # by which the halves of a drive may differ
 LARGEST_LAG_S: Final = 0.085  # devices of sound cars lie within .06 s
 NEAR_ONE: Final = 0.35  # of a factor's logarithm: slip is not larger for long
 SURE: Final = 2.0
-TURNS_LIKE: Final = 0.8  # correlation of the yaw rate with steering or course, below which the car may spin
-STEADY: Final = 0.4
 WHOLE: Final = 0.35  # in logarithms, by which the whole drive's gain may be off that of a fault
 NOISIEST: Final = 1.0  # in logarithms, up to which a part's gain may be noise
-STEADY_SHARE: Final = 0.75
 CHANNELS_OF: Final = {"ax": "ax", "ay": "ay", "r": "yaw_rate", "delta": "delta", "v": "omega"}
 
 
@@ -105,7 +111,7 @@ def diagnose(t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: Float
         diagnosis.findings.append(Finding("latitude", "exchanged with longitude", words))
         signals[:, [S.LATITUDE, S.LONGITUDE]] = signals[:, [S.LONGITUDE, S.LATITUDE]]
         drive = prepare(t, signals, vehicle, ground)
-    for axle, (left, right) in _sides_exchanged(drive):
+    for axle, (left, right) in find_exchanged_axles(drive):
         words = f"the {axle} wheels turn against the yaw rate, the others with it: left and right exchanged?"
         diagnosis.findings.append(Finding("omega", f"{axle} left and right exchanged", words))
         signals[:, [S.OMEGA + left, S.OMEGA + right]] = signals[:, [S.OMEGA + right, S.OMEGA + left]]
@@ -148,7 +154,7 @@ def _speaks_late(axle: Fit, seconds: float) -> bool:
 
 def _lags(t: FloatArray, signals: FloatArray, vehicle: Vehicle, diagnosis: Diagnosis) -> None:
     """Measure by how much wheels and steering speak later than the inertial unit, and report what is too much."""
-    diagnosis.lags = _told_twice(t, signals, vehicle, diagnosis.fits)
+    diagnosis.lags = measure_lags_twice(t, signals, vehicle, diagnosis.fits)
     wheel = diagnosis.lags.get("wheel_lag")
     steer = diagnosis.lags.get("steer_lag")
     if wheel is not None and steer is not None and abs(wheel - steer) < 0.5 * abs(wheel) and abs(wheel) > LARGEST_LAG_S:
@@ -160,23 +166,6 @@ def _lags(t: FloatArray, signals: FloatArray, vehicle: Vehicle, diagnosis: Diagn
             way = "late" if seconds > 0.0 else "early"
             words = f"speaks {abs(seconds):.2f} s {way}; the estimator bears {FILTER_BEARS_S:g} s"
             diagnosis.findings.append(Finding(device, "clock", words, delay_s=seconds))
-
-
-def _told_twice(t: FloatArray, signals: FloatArray, vehicle: Vehicle, found: dict[str, Fit]) -> dict[str, float]:
-    """Return the lags [s] that both halves of a drive agree on, of devices whose identity holds all along.
-
-    A car that slides answers to its steering later or sooner than its model, and not by the same time again.
-    """
-    half = len(t) // 2
-    parts = [lags(t[rows], signals[rows], vehicle) for rows in (slice(None), slice(None, half), slice(half, None))]
-    told = {}
-    for name, identity in (("wheel_lag", "axle"), ("steer_lag", "steering")):
-        fit = found[identity]
-        sound = fit.known and fit.correlation > TURNS_LIKE and abs(np.log(abs(fit.gain))) < 0.35 and _steady(fit)
-        values = [part[name] for part in parts if name in part]
-        if sound and len(values) == len(parts) and np.ptp(values) < LAGS_APART_S:
-            told[name] = float(np.median(values))
-    return told
 
 
 def _seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
@@ -211,32 +200,12 @@ def _jumps(signals: FloatArray, diagnosis: Diagnosis) -> None:
         fast = float(np.percentile(np.abs(others), 95))
         above = wheels[rows, i] - others
         off = np.abs(above) > 0.3 * np.abs(others) + 0.3 * fast
-        if off.mean() <= JUMPS or not (_steps_alike(above, off) or _foreign(rest, others, off, fast)):
+        if off.mean() <= JUMPS or not (has_equal_steps(above, off) or is_foreign(rest, others, off, fast)):
             continue
         sizes = np.unique(np.round(above[off] / max(fast, 1e-9), 1))
         words = f"{off.mean():.0%} of its readings lie far off the other wheels, {len(sizes)} steps: status bits?"
         diagnosis.findings.append(Finding(f"omega_{wheel}", "status bits", words))
         signals[rows[off], S.OMEGA + i] = np.nan
-
-
-def _steps_alike(above: FloatArray, off: BoolArray) -> bool:
-    """Return True if a wheel leaves the others (n,) by sudden steps of a few sizes, FEWEST_STEPS at least."""
-    enters = np.flatnonzero(~off[:-1] & off[1:])
-    if len(enters) < FEWEST_STEPS:
-        return False
-    steps = above[enters + 1] - above[enters]
-    whole = np.abs(above[np.minimum(enters + 2, len(above) - 1)] - above[enters + 1]) < 0.1 * np.abs(steps)
-    sudden = np.abs(steps) > 0.9 * np.abs(above[enters + 1])
-    usual = float(np.median(np.abs(steps)))
-    alike = np.abs(np.abs(steps) / usual - np.maximum(np.round(np.abs(steps) / usual), 1.0)) < 0.1
-    return bool(np.mean(sudden & alike) > 0.8 and (np.mean(whole) > 0.3 or off.mean() > 0.1))
-
-
-def _foreign(rest: FloatArray, others: FloatArray, off: BoolArray, fast: float) -> bool:
-    """Return True if a wheel has nothing to do with the other three (n, 3), which agree: nobody spins for that long."""
-    agree = np.ptp(rest, axis=1) < 0.1 * np.abs(others) + 0.02 * fast
-    moves = np.abs(others) > 0.3 * fast
-    return bool(moves.sum() > FOREIGN_ROWS and np.mean(off[moves & agree]) > 0.6 and agree[moves].mean() > 0.6)
 
 
 def _axes_exchanged(drive: EvenDrive) -> bool:
@@ -282,40 +251,6 @@ def _scales(verdict: Verdict, found: dict[str, Fit], diagnosis: Diagnosis) -> No
         )
 
 
-def _sides_exchanged(drive: EvenDrive) -> list[tuple[str, tuple[int, int]]]:
-    """Return the axles whose left and right wheels are exchanged, though the other axle's are not: name and wheels.
-
-    With both exchanged the axles agree, and the identity of the axles tells it.
-    """
-
-    def likeness(yaw: FloatArray) -> float:
-        good = np.isfinite(yaw) & np.isfinite(drive.r) & (drive.moving > 0)
-        if good.sum() < 10 * RATE_HZ or yaw[good].std() == 0.0 or drive.r[good].std() == 0.0:
-            return 0.0
-        return float(np.corrcoef(yaw[good], drive.r[good])[0, 1])
-
-    front = likeness(drive.yaw_front)
-    rear = likeness(drive.yaw_rear)
-    if min(abs(front), abs(rear)) < 0.5 or front * rear > 0.0:
-        return []
-    good = np.isfinite(drive.ay) & np.isfinite(drive.r) & (drive.moving > 0)
-    steered = np.isfinite(drive.delta) & good
-    sign = 0.0
-    if steered.sum() > 10 * RATE_HZ:
-        sign = float(np.sign(np.sum(drive.ay[good] * drive.r[good]) * np.sum(drive.delta[steered] * drive.r[steered])))
-    if sign < 0.0:  # one of a_y, yaw rate and steering is flipped: nobody knows which axle is right
-        return []
-    return [("front", (0, 1))] if front < 0.0 else [("rear", (2, 3))]
-
-
-def _followed(drive: EvenDrive) -> BoolArray:
-    """Return where the car goes as it is steered, (n,): it does not slide there, whatever the road."""
-    fast = np.maximum(np.abs(drive.v), 1.0)
-    wanted = drive.wheelbase * drive.r / fast
-    steered = np.isfinite(drive.delta) & np.isfinite(wanted)
-    return steered & (np.abs(np.tan(np.clip(drive.delta, -1.0, 1.0)) - wanted) < FOLLOWED * np.abs(wanted) + 0.01)
-
-
 def _always(quantity: str, verdict: Verdict, found: dict[str, Fit], drive: EvenDrive | None) -> bool:
     """Return True if the drive's parts all have the gains that the faults make: a slide does not keep a gain."""
     fault = verdict.faults[quantity]
@@ -324,7 +259,11 @@ def _always(quantity: str, verdict: Verdict, found: dict[str, Fit], drive: EvenD
     ground = found["ground"]
     if quantity == "v" and fault is not None and drive is not None and ground.known:
         like_slip = abs(np.log(fault.factor)) < NEAR_ONE
-        if like_slip and abs(np.log(abs(ground.gain * fault.factor))) < 0.1 and not _rolls(drive, ground.gain):
+        if (
+            like_slip
+            and abs(np.log(abs(ground.gain * fault.factor))) < 0.1
+            and not is_same_when_coasting(drive, ground.gain)
+        ):
             return False
     shares = []
     for name, law in LAWS.items():
@@ -342,21 +281,8 @@ def _always(quantity: str, verdict: Verdict, found: dict[str, Fit], drive: EvenD
             within = min(STEADY, max(0.04, 0.4 * off))
         whole = found[name].gain
         near = whole * gain > 0.0 and abs(np.log(whole / gain)) < WHOLE
-        shares.append(_share(found[name], gain, within) if near else 0.0)
+        shares.append(share_of_parts(found[name], gain, within) if near else 0.0)
     return bool(shares) and min(shares) >= STEADY_SHARE
-
-
-def _rolls(drive: EvenDrive, gain: float) -> bool:
-    """Return True if speed over ground over the wheels' is the same while the car gains and loses speed.
-
-    Wheels that spin turn too fast while they are driven, wheels under brakes too slowly; a wrong radius always is.
-    """
-    ratio = smooth(drive.v_ground, 1.0) / np.where(drive.v == 0.0, np.nan, smooth(drive.v, 1.0))
-    known = np.isfinite(ratio) & (drive.moving > 0)
-    for rows in (known & (drive.v_dot > 0.1), known & (drive.v_dot < -0.1)):
-        if rows.sum() < 2 * RATE_HZ or abs(float(np.median(ratio[rows])) / gain - 1.0) > 0.04:
-            return False
-    return True
 
 
 def _turns(verdict: Verdict, found: dict[str, Fit]) -> bool:
@@ -368,7 +294,7 @@ def _turns(verdict: Verdict, found: dict[str, Fit]) -> bool:
             if fault is not None:
                 gain *= fault.factor**member.power
         fit = found[name]
-        if fit.known and abs(fit.correlation) > TURNS_LIKE and _share(fit, gain) >= STEADY_SHARE:
+        if fit.known and abs(fit.correlation) > TURNS_LIKE and share_of_parts(fit, gain) >= STEADY_SHARE:
             return True
     return False
 
@@ -382,7 +308,7 @@ def _radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Finding
     findings = []
     tracks = (vehicle.track_front, vehicle.track_front, vehicle.track_rear, vehicle.track_rear)
     half = np.array([(-0.5 if i % 2 == 0 else 0.5) * tracks[i] for i in range(4)])
-    calm = (drive.moving > 0) & (np.abs(drive.v_dot) < CALM) & np.isfinite(drive.r) & _followed(drive)
+    calm = (drive.moving > 0) & (np.abs(drive.v_dot) < CALM) & np.isfinite(drive.r) & find_followed(drive)
     calm &= np.abs(drive.v * drive.r) < CALM_ACROSS
     rims = drive.wheels - half * drive.r[:, None]
     for i, wheel in enumerate(WHEELS):
@@ -411,7 +337,7 @@ def _axles(drive: EvenDrive) -> list[Finding]:
     front, rear = drive.wheels[:, :2].mean(axis=1), drive.wheels[:, 2:].mean(axis=1)
     good = (drive.moving > 0) & np.isfinite(front) & np.isfinite(rear) & (np.abs(drive.v_dot) < 1.0) & (rear > 1.0)
     turn = np.square(drive.wheelbase * drive.r / np.where(good, rear, 1.0))
-    good &= np.isfinite(turn) & _followed(drive) & (np.abs(drive.v * drive.r) < GENTLE_ACROSS)
+    good &= np.isfinite(turn) & find_followed(drive) & (np.abs(drive.v * drive.r) < GENTLE_ACROSS)
     tight = good & (turn > TIGHT)
     if tight.sum() < TIGHT_S * RATE_HZ:
         return []
@@ -436,15 +362,15 @@ def _offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
     if np.isfinite(beside).sum() > FEWEST_OFFSET_S * RATE_HZ:
         driven = float(np.nansum(np.abs(drive.v))) / RATE_HZ
         largest = LARGEST_AX if driven < AVERAGED_M else LARGEST_AX_FAR
-        listed.append(("ax", float(np.nanmedian(beside)), 0.5 * _apart(beside), largest, "m/s^2"))
+        listed.append(("ax", float(np.nanmedian(beside)), spread_of_parts(beside), largest, "m/s^2"))
     straight = moving & (np.abs(drive.v * drive.r) < 1.0)
     if np.isfinite(drive.delta).any():
-        straight &= _followed(drive)
+        straight &= find_followed(drive)
     beside = (drive.ay - drive.v * drive.r)[straight]
     if np.isfinite(beside).sum() > FEWEST_OFFSET_S * RATE_HZ:
-        listed.append(("ay", float(np.nanmedian(beside)), _apart(beside), LARGEST_AY, "m/s^2"))
+        listed.append(("ay", float(np.nanmedian(beside)), spread_of_parts(beside), LARGEST_AY, "m/s^2"))
     if axle.known and abs(abs(axle.gain) - 1.0) < 0.2 and axle.correlation > 0.9:
-        error = float(np.hypot(axle.offset_error, _apart((drive.r_wheels - drive.r)[moving])))
+        error = float(np.hypot(axle.offset_error, spread_of_parts((drive.r_wheels - drive.r)[moving])))
         if np.sum(straight & np.isfinite(drive.r)) < 2 * RATE_HZ:  # one way round, a gain is an offset as well
             error = np.inf
         listed.append(("yaw_rate", -axle.offset / axle.gain, error, LARGEST_RATE, "rad/s"))
@@ -452,32 +378,13 @@ def _offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
         still = (drive.moving == 0) & (np.abs(drive.v) < 0.05)
         if still.sum() > RATE_HZ:
             listed.append(("yaw_rate", float(np.nanmedian(drive.r[still])), 0.0, LARGEST_RATE, "rad/s"))
-    if steering.known and abs(steering.correlation) > 0.9 and 0.7 < steering.gain < 1.6 and _steady(steering):
+    if steering.known and abs(steering.correlation) > 0.9 and 0.7 < steering.gain < 1.6 and is_steady(steering):
         listed.append(("delta", steering.offset, steering.offset_error, LARGEST_STEER, "rad"))
     return [
         Finding(channel, "offset", f"{value:+.3g} {unit} when it should be none", offset=-value)
         for channel, value, error, largest, unit in listed
         if np.isfinite(value) and abs(value) > largest + SURE * error
     ]
-
-
-def _apart(beside: FloatArray) -> float:
-    """Return by how much the parts of a drive differ in what should be constant: a tilt is in all, a slide is not."""
-    parts = [float(np.nanmedian(part)) for part in np.array_split(beside, RADIUS_PARTS) if np.isfinite(part).any()]
-    return float(np.std(parts))
-
-
-def _steady(fit: Fit) -> bool:
-    """Return True if the parts of the drive have the gain that all have together."""
-    return _share(fit, fit.gain) >= STEADY_SHARE
-
-
-def _share(fit: Fit, gain: float, within: float = STEADY) -> float:
-    """Return the share of a drive's parts whose gain is the given one, within `within` in logarithms."""
-    if not fit.parts:
-        return 0.0
-    near = [g * gain > 0.0 and abs(np.log(abs(g / gain))) < within for g in fit.parts if g]
-    return float(np.mean(near)) if near else 0.0
 
 
 __all__ = ["Diagnosis", "Finding", "diagnose", "even"]
