@@ -28,9 +28,9 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
-from edge_agent.calibration.lags import lags
 from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, prepare
 from edge_agent.inputs.doctor.identities import fits, robust
+from edge_agent.inputs.doctor.lags import lags
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, FloatArray
 from schemas.signals import WHEELS

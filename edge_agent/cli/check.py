@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.app.estimates_file import writable
     from edge_agent.inputs.bring_in import profile_of
     from edge_agent.inputs.doctor.findings import diagnose
-    from edge_agent.inputs.doctor.fix import fixed
+    from edge_agent.inputs.doctor.fix import corrections, fixed
     from edge_agent.inputs.doctor.report import advice, document, lines, page
     from edge_agent.inputs.signal_log import read_log
     from schemas.vehicle import load_vehicle
@@ -53,8 +53,9 @@ def run(args: argparse.Namespace) -> int:
         print("\n".join([*lines(diagnosis), *flags, f"{args.log}: {advice(diagnosis)}"]))
     if args.out is not None:
         writable("out", args.out).write_text(page(diagnosis, f"{args.log.name}, {vehicle.name}"), encoding="utf-8")
-    if args.fix is not None and diagnosis.findings:
-        profile, corrected, left = fixed(diagnosis.findings, profile_of(args.log), vehicle)
+    mended = corrections(diagnosis)
+    if args.fix is not None and mended:
+        profile, corrected, left = fixed(mended, profile_of(args.log), vehicle)
         writable("fix", args.fix).write_text(profile.text(), encoding="utf-8")
         if corrected != vehicle:
             writable("vehicle", file).write_text(corrected.model_dump_json(indent=1, exclude_none=True) + "\n")

@@ -85,12 +85,19 @@ def insist_on_sound(log: SignalLog, vehicle: Vehicle) -> None:
 def warn_of_faults(log: SignalLog, vehicle: Vehicle) -> None:
     """Say on stderr what the signal doctor finds wrong with a log that is only estimated."""
     from edge_agent.inputs.doctor.findings import diagnose
+    from edge_agent.inputs.doctor.fix import small_lags
 
-    found = diagnose(log.t, log.signals, vehicle, log.ground).findings
+    diagnosis = diagnose(log.t, log.signals, vehicle, log.ground)
+    found = diagnosis.findings
     for fault in found:
         print(f"warning: {fault.channel} {fault.kind}: {fault.words}", file=sys.stderr)
     if found:
         print("warning: the estimates below mean nothing until that is mended; run edge-agent check", file=sys.stderr)
+    elif not diagnosis.passed:
+        channels = ", ".join(diagnosis.unknown)
+        print(f"note: the signal doctor did not pass this log: it cannot judge {channels}", file=sys.stderr)
+    for device, seconds in small_lags(diagnosis).items():
+        print(f"note: {device} speaks {seconds:+.3f} s late; edge-agent check --fix takes it out", file=sys.stderr)
 
 
 @contextmanager

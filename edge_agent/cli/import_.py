@@ -7,11 +7,16 @@ from pathlib import Path
 
 from edge_agent.cli.options import add_json, print_list
 
+MOST_NAMES = 30  # of signals in an error
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument(
-        "source", type=Path, nargs="*", help="CSV, Parquet, BLF, ASC, candump, TRC, MF4, ROS bag, MCAP, NMEA, gpsd JSON"
+        "source",
+        type=Path,
+        nargs="*",
+        help="CSV, Parquet, BLF, ASC, candump, TRC, MF4, VBO, ROS bag, MCAP, NMEA, gpsd JSON",
     )
     parser.add_argument("--profile", help="which signal is which channel: a file, or a shipped one (--list)")
     parser.add_argument("--list", action="store_true", help="list the shipped profiles and leave")
@@ -50,6 +55,9 @@ def run(args: argparse.Namespace) -> int:
     if profile is None:
         units = {name: series.unit for one in reversed(recordings) for name, series in one.signals.items()}
         profile = draft(units, args.out.stem)
+        if not profile.channels:
+            seen = ", ".join(sorted(units)[:MOST_NAMES]) or "nothing"
+            raise InputError("source", f"no signal has a known name; seen: {seen}", "write a profile that names them")
         target = writable("draft", args.draft or out.with_suffix(".profile.json"))
         target.write_text(profile.text(), encoding="utf-8")
         print(f"{target}: drafted from names, {len(profile.channels)} channels; look it over")

@@ -13,13 +13,14 @@ import pyarrow.parquet as pq
 
 from edge_agent.inputs.merge import Merged
 from edge_agent.inputs.profile import FOLDER, Channel, Profile
-from edge_agent.inputs.readers import can_log, gnss, mdf, rosbag, tabular
+from edge_agent.inputs.readers import can_log, can_text, gnss, mdf, racelogic, rosbag, tabular
 from edge_agent.inputs.readers.dbc import Database, read_dbc
 from edge_agent.inputs.recording import Recording, foreign
 from schemas.errors import InputError
 from schemas.signals import CHANNELS, CONTEXT
 from schemas.thresholds import NS
 
+RLOGS = ("rlog", "qlog")
 PROVENANCE = b"gripmap.import"
 
 
@@ -44,14 +45,27 @@ def read_source(path: Path, profile: Profile | None, database: Database | None) 
         if content.recording is not None:
             return content.recording
         return _decoded(lambda _: content.frames or ({}, 0.0), path, profile, database)
+    if path.name.lower().startswith(RLOGS):
+        fix = "export CAN frames (candump) or a CSV with openpilot's LogReader"
+        raise InputError("source", f"{path} is an openpilot log, which is not read here", fix)
+    if suffix == ".trc" and can_text.is_bare_trace(path):
+        return _decoded(lambda ids: can_text.trace_frames(path, ids), path, profile, database)
     if suffix in can_log.SUFFIXES:
         return _decoded(lambda ids: can_log.log_frames(path, ids), path, profile, database)
     if suffix in gnss.SUFFIXES:
         return gnss.read_gnss(path)
+    if suffix in racelogic.SUFFIXES:
+        return racelogic.read_vbo(path)
     if suffix in tabular.SUFFIXES:
+        if suffix != ".parquet" and racelogic.is_vbo(path):
+            return racelogic.read_vbo(path)
+        if suffix == ".csv" and can_text.is_gvret(path):
+            return _decoded(lambda ids: can_text.gvret_frames(path, ids), path, profile, database)
         time, unit = (profile.time, profile.time_unit) if profile else (None, None)
         return tabular.read_table(path, time, unit)
-    known = sorted({*can_log.SUFFIXES, *gnss.SUFFIXES, *mdf.SUFFIXES, *rosbag.SUFFIXES, *tabular.SUFFIXES})
+    known = sorted(
+        {*can_log.SUFFIXES, *gnss.SUFFIXES, *mdf.SUFFIXES, *racelogic.SUFFIXES, *rosbag.SUFFIXES, *tabular.SUFFIXES}
+    )
     raise InputError("source", f"{path} is of no known kind", f"give one of {' '.join(known)}, or a bag's folder")
 
 

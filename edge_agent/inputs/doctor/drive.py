@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from schemas.numeric import FloatArray
+from schemas.numeric import BoolArray, FloatArray
 from schemas.signals import CHANNELS, S
 from schemas.thresholds import EARTH_RADIUS_M
 from schemas.vehicle import Vehicle
@@ -23,6 +23,9 @@ SMOOTH_S: Final = 0.5  # of a running mean, taken twice: motion of cars lies bel
 JOINED_S: Final = 1.5  # readings further apart are not joined
 FIX_S: Final = 1.0  # over which speed and course are taken from fixes
 LONGEST_S: Final = 1800.0  # of a drive that is looked at; the rest tells no more
+UNLIKE: Final = 0.1  # share by which a wheel may be off its neighbour on the same side before it is said to slip
+LEFT: Final = 0.2  # share by which the wheels' speed may leave that over ground before they are said to slip
+SLIP_S: Final = 1.0  # before and behind a moment of slip, which is left out as well
 CREEP: Final = 0.15  # of the drive's fast speed; slower is standing, whatever the unit
 
 
@@ -41,7 +44,10 @@ class EvenDrive:
     v_ground: FloatArray
     course: FloatArray
     course_yaw: FloatArray  # the log's own yaw at the same times, not smoothed
-    moving: FloatArray  # 1 where the car moves, else 0
+    moving: FloatArray  # 1 where the car moves and no wheel slips by what the wheels say of each other, else 0
+    grips: FloatArray  # 0 where the wheels' speed leaves that over ground: all spin or lock together
+    yaw_front: FloatArray  # yaw rate by the front wheels alone [rad/s]
+    yaw_rear: FloatArray  # the same by the rear wheels
     wheelbase: float
     torque: FloatArray  # of all wheels [N m]
 
@@ -107,12 +113,14 @@ def prepare(t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: FloatA
     some = np.isfinite(wheels).any(axis=1)
     middle = np.full(len(at), np.nan)
     middle[some] = np.nanmedian(wheels[some], axis=1)
+    raw = wheels
     wheels = np.where(np.abs(wheels - middle[:, None]) > 0.25 * np.abs(middle[:, None]) + 1.0, np.nan, wheels)
     rims = np.stack([smooth(wheels[:, i]) for i in range(4)], axis=1)
     v = smooth(np.where(np.isfinite(middle), middle, np.nan))
     tracks = vehicle.track_front, vehicle.track_rear
     axles = [(rims[:, 2 * k + 1] - rims[:, 2 * k]) / tracks[k] for k in range(2)]
     r_wheels = np.where(np.isfinite(axles[1]), axles[1], axles[0])
+    fast = np.nanpercentile(np.abs(v), 95) if np.isfinite(v).any() else 0.0
     place = signals[:, S.LATITUDE], signals[:, S.LONGITUDE]
     located = np.isfinite(place[0]).sum() > 5
     nothing = np.full(len(at), np.nan)
@@ -121,15 +129,53 @@ def prepare(t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: FloatA
         v_ground = smooth(even(t, ground, at))
     yaw = signals[:, S.YAW]
     yaw_at = even(t, np.unwrap(yaw), at) if np.isfinite(yaw).all() else _yaw(t, yaw, at)
-    fast = np.nanpercentile(np.abs(v), 95) if np.isfinite(v).any() else 0.0
     delta = signals[:, S.DELTA]
     return EvenDrive(
         t=at, ax=column(S.AX), ay=column(S.AY), r=column(S.YAW_RATE),
         delta=smooth(even(t, np.where(np.isfinite(delta), delta, signals[:, S.DELTA + 1]), at)), wheels=rims, v=v,
         r_wheels=r_wheels, v_ground=v_ground, course=course, course_yaw=yaw_at,
-        moving=(np.abs(v) > CREEP * fast).astype(float), wheelbase=vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle,
+        moving=((np.abs(v) > CREEP * fast) & ~slipping(raw, fast)).astype(float),
+        grips=(~left_ground(v, v_ground, fast)).astype(float),
+        wheelbase=vehicle.cg_to_front_axle + vehicle.cg_to_rear_axle,
         torque=smooth(even(t, signals[:, S.TORQUE : S.TORQUE + 4].sum(axis=1), at)),
+        yaw_front=axles[0], yaw_rear=axles[1],
     )  # fmt: skip
+
+
+def slipping(wheels: FloatArray, fast: float) -> BoolArray:
+    """Return where a wheel spins or locks, (n,), from what the wheels (n, 4) say of each other in any unit.
+
+    Front and rear wheels of a side roll nearly alike, in turns as well; a constant difference is another tyre. A wheel
+    that is off all along is left out: it is a fault of its own and would hide the rest of the drive.
+    """
+    speed = np.nanmedian(np.where(np.isfinite(wheels), wheels, 0.0), axis=1)
+    size = np.maximum(np.abs(speed), CREEP * max(fast, 1e-9))
+    moves = np.abs(speed) > CREEP * fast
+    off = np.zeros(len(wheels), bool)
+    for side in range(2):
+        apart = (wheels[:, side] - wheels[:, 2 + side]) / size
+        known = np.isfinite(apart) & moves
+        if not known.any():
+            continue
+        usual = float(np.median(apart[known]))
+        here = np.isfinite(apart) & (np.abs(apart - usual) > UNLIKE)
+        if here[moves].mean() < 0.9:
+            off |= here
+    width = 2 * round(SLIP_S * RATE_HZ) + 1
+    if not off.any():
+        return off
+    return np.asarray(np.convolve(off, np.ones(min(width, len(off))), "same") > 0.5)
+
+
+def left_ground(v: FloatArray, v_ground: FloatArray, fast: float) -> BoolArray:
+    """Return where the wheels' speed leaves that over ground (n,), in any unit: all wheels spin or lock together."""
+    known = np.isfinite(v) & np.isfinite(v_ground) & (np.abs(v) > 0.3 * fast)
+    if known.sum() < 5 * RATE_HZ:
+        return np.zeros(len(v), bool)
+    ratio = np.where(known, smooth(v_ground, 1.0) / np.where(v == 0.0, np.nan, smooth(v, 1.0)), np.nan)
+    usual = float(np.nanmedian(ratio))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.abs(ratio - usual) > LEFT * abs(usual))
 
 
 def _yaw(t: FloatArray, yaw: FloatArray, at: FloatArray) -> FloatArray:

@@ -12,9 +12,24 @@ from typing import Final
 import numpy as np
 
 from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, even, prepare
-from edge_agent.inputs.doctor.identities import Fit, fits, robust
+from edge_agent.inputs.doctor.identities import PARTS, Fit, fits, robust
 from edge_agent.inputs.doctor.places import exchanged, yaw_findings
-from edge_agent.inputs.doctor.scales import CLOCK_SETTLED, SETTLED, Verdict, clocks, explain
+from edge_agent.inputs.doctor.scales import CLOCK_SETTLED, LAWS, SETTLED, Verdict, clocks, explain
+from edge_agent.inputs.doctor.slip import (
+    RADIUS_PARTS,
+    STEADY,
+    STEADY_SHARE,
+    TURNS_LIKE,
+    find_exchanged_axles,
+    find_followed,
+    has_equal_steps,
+    is_foreign,
+    is_same_when_coasting,
+    is_steady,
+    measure_lags_twice,
+    share_of_parts,
+    spread_of_parts,
+)
 from schemas.numeric import FloatArray
 from schemas.signals import WHEELS, S
 from schemas.vehicle import Vehicle
@@ -27,6 +42,17 @@ LARGEST_STEER = 0.02  # [rad]
 LARGEST_RADIUS = 0.025
 JUMPS = 0.01  # share of readings that may jump off the other wheels
 SLOWEST_HZ, FASTEST_HZ = 5.0, 2000.0
+LARGEST_AX_FAR, AVERAGED_M = 0.9, 300.0  # [m/s^2] and the way over which slopes average to less than 8 %
+CALM, CALM_ACROSS = 0.5, 0.5  # [m/s^2] up to which wheels hardly slip, on ice too
+GENTLE_ACROSS: Final = 3.5  # [m/s^2] of turns in which the axles' ways tell front from rear
+TIGHT, TIGHT_S = 0.015, 1.5  # (L r / v)^2 of a circle of eight wheelbases; wider ones are lost in slip
+FEWEST_OFFSET_S: Final = 8.0
+FILTER_BEARS_S: Final = 0.025  # by which devices may be apart: standard deviation of the filter's own prior
+LARGEST_LAG_S: Final = 0.085  # devices of sound cars lie within .06 s
+NEAR_ONE: Final = 0.35  # of a factor's logarithm: slip is not larger for long
+SURE: Final = 2.0
+WHOLE: Final = 0.35  # in logarithms, by which the whole drive's gain may be off that of a fault
+NOISIEST: Final = 1.0  # in logarithms, up to which a part's gain may be noise
 CHANNELS_OF: Final = {"ax": "ax", "ay": "ay", "r": "yaw_rate", "delta": "delta", "v": "omega"}
 
 
@@ -57,6 +83,8 @@ class Diagnosis:
     unknown: list[str] = field(default_factory=list)
     fits: dict[str, Fit] = field(default_factory=dict)
     drive: EvenDrive | None = None
+    lags: dict[str, float] = field(default_factory=dict)  # [s] behind the gyro, by quantity, where turns tell it
+    doubts: set[str] = field(default_factory=set)  # quantities that only some parts of the drive speak against
 
     @property
     def passed(self) -> bool:
@@ -83,29 +111,61 @@ def diagnose(t: FloatArray, signals: FloatArray, vehicle: Vehicle, ground: Float
         diagnosis.findings.append(Finding("latitude", "exchanged with longitude", words))
         signals[:, [S.LATITUDE, S.LONGITUDE]] = signals[:, [S.LONGITUDE, S.LATITUDE]]
         drive = prepare(t, signals, vehicle, ground)
+    for axle, (left, right) in find_exchanged_axles(drive):
+        words = f"the {axle} wheels turn against the yaw rate, the others with it: left and right exchanged?"
+        diagnosis.findings.append(Finding("omega", f"{axle} left and right exchanged", words))
+        signals[:, [S.OMEGA + left, S.OMEGA + right]] = signals[:, [S.OMEGA + right, S.OMEGA + left]]
+        drive = prepare(t, signals, vehicle, ground)
     found = fits(drive)
     verdict = explain(found, vehicle)
     diagnosis.fits, diagnosis.drive = found, drive
     _scales(verdict, found, diagnosis)
     scaled = any(fault is not None for fault in verdict.faults.values())  # offsets and radii in wrong units say nothing
     late = clocks(found)
+    if "wheels" in late and not _speaks_late(found["axle"], late["wheels"][0]):
+        late = {}  # in a slide wheels slow down before the car does; their yaw rate is not late then
     for device, (seconds, margin) in late.items():
         if margin < CLOCK_SETTLED:
             diagnosis.unknown.append(f"clock of the {device}")
         else:
-            words = f"the clock of the {device} is {seconds:+.2f} s late"
+            way = "late" if seconds > 0.0 else "early"
+            words = f"the clock of the {device} is {abs(seconds):.2f} s {way}"
             diagnosis.findings.append(Finding(device, "clock", words, delay_s=seconds, confidence=margin))
+    if not late and not scaled:
+        _lags(t, signals, vehicle, diagnosis)
     diagnosis.findings += yaw_findings(signals, drive)
     if not scaled:
-        diagnosis.findings += _radii(drive, vehicle) + _offsets(drive, found)
+        diagnosis.findings += _radii(drive, vehicle, diagnosis.doubts) + _offsets(drive, found)
     for quantity, channel in CHANNELS_OF.items():
         if any(finding.channel == channel for finding in diagnosis.findings):
             continue
-        (diagnosis.sound if verdict.settled(quantity) else diagnosis.unknown).append(channel)
+        told = verdict.settled(quantity) and quantity not in diagnosis.doubts
+        (diagnosis.sound if told else diagnosis.unknown).append(channel)
     found_wrong = {finding.channel for finding in diagnosis.findings}
     if np.isfinite(signals[:, S.LATITUDE]).any() and not found_wrong & {"latitude", "yaw"}:
         (diagnosis.sound if found["ground"].known else diagnosis.unknown).append("latitude")
     return diagnosis
+
+
+def _speaks_late(axle: Fit, seconds: float) -> bool:
+    """Return True if the wheels' yaw rate is late as well, by half of it at least."""
+    return axle.known and np.isfinite(axle.lag_error_s) and axle.lag_s * np.sign(seconds) > 0.5 * abs(seconds)
+
+
+def _lags(t: FloatArray, signals: FloatArray, vehicle: Vehicle, diagnosis: Diagnosis) -> None:
+    """Measure by how much wheels and steering speak later than the inertial unit, and report what is too much."""
+    diagnosis.lags = measure_lags_twice(t, signals, vehicle, diagnosis.fits)
+    wheel = diagnosis.lags.get("wheel_lag")
+    steer = diagnosis.lags.get("steer_lag")
+    if wheel is not None and steer is not None and abs(wheel - steer) < 0.5 * abs(wheel) and abs(wheel) > LARGEST_LAG_S:
+        listed = [("imu", -0.5 * (wheel + steer))]
+    else:
+        listed = [("wheels", wheel or 0.0), ("steering", steer or 0.0)]
+    for device, seconds in listed:
+        if abs(seconds) > LARGEST_LAG_S:
+            way = "late" if seconds > 0.0 else "early"
+            words = f"speaks {abs(seconds):.2f} s {way}; the estimator bears {FILTER_BEARS_S:g} s"
+            diagnosis.findings.append(Finding(device, "clock", words, delay_s=seconds))
 
 
 def _seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
@@ -124,22 +184,28 @@ def _seconds(t: FloatArray, diagnosis: Diagnosis) -> tuple[FloatArray, bool]:
 
 
 def _jumps(signals: FloatArray, diagnosis: Diagnosis) -> None:
-    """Status bits above a wheel's number: readings far off the other three, and back."""
+    """Status bits above a wheel's number: readings far off the other three, and back.
+
+    A wheel that spins or locks is off as well, but gets there in steps and by any amount. A bit is whole from one
+    reading to the next, and adds the same each time.
+    """
     wheels = signals[:, S.OMEGA : S.OMEGA + 4]
     good = np.isfinite(wheels).all(axis=1)
     if good.sum() < 100:
         return
     rows = np.flatnonzero(good)
     for i, wheel in enumerate(WHEELS):
-        others = np.median(np.delete(wheels[rows], i, axis=1), axis=1)
+        rest = np.delete(wheels[rows], i, axis=1)
+        others = np.median(rest, axis=1)
         fast = float(np.percentile(np.abs(others), 95))
         above = wheels[rows, i] - others
         off = np.abs(above) > 0.3 * np.abs(others) + 0.3 * fast
-        if off.mean() > JUMPS:
-            sizes = np.unique(np.round(above[off] / max(fast, 1e-9), 1))
-            words = f"{off.mean():.0%} of its readings lie far off the other wheels, {len(sizes)} steps: status bits?"
-            diagnosis.findings.append(Finding(f"omega_{wheel}", "status bits", words))
-            signals[rows[off], S.OMEGA + i] = np.nan
+        if off.mean() <= JUMPS or not (has_equal_steps(above, off) or is_foreign(rest, others, off, fast)):
+            continue
+        sizes = np.unique(np.round(above[off] / max(fast, 1e-9), 1))
+        words = f"{off.mean():.0%} of its readings lie far off the other wheels, {len(sizes)} steps: status bits?"
+        diagnosis.findings.append(Finding(f"omega_{wheel}", "status bits", words))
+        signals[rows[off], S.OMEGA + i] = np.nan
 
 
 def _axes_exchanged(drive: EvenDrive) -> bool:
@@ -170,6 +236,9 @@ def _scales(verdict: Verdict, found: dict[str, Fit], diagnosis: Diagnosis) -> No
     for quantity, fault in verdict.faults.items():
         if fault is None or quantity == "place" or not verdict.settled(quantity):
             continue
+        if not _always(quantity, verdict, found, diagnosis.drive):
+            diagnosis.doubts.add(quantity)
+            continue
         gain = found[ASKED[quantity]].gain if quantity in ASKED else np.nan
         words = WORDS[quantity].format(
             gain=gain, wheels=fault.factor, lateral=found["lateral"].gain, axle=found["axle"].gain
@@ -182,60 +251,139 @@ def _scales(verdict: Verdict, found: dict[str, Fit], diagnosis: Diagnosis) -> No
         )
 
 
-def _radii(drive: EvenDrive, vehicle: Vehicle) -> list[Finding]:
-    """Wheels that turn faster or slower than the others, straight on and in turns; front and rear exchanged."""
-    findings, tracks = [], (vehicle.track_front, vehicle.track_front, vehicle.track_rear, vehicle.track_rear)
-    calm = (drive.moving > 0) & (np.abs(drive.v_dot) < 1.0) & np.isfinite(drive.r)
-    for i, wheel in enumerate(WHEELS):
-        good = calm & np.isfinite(drive.wheels[:, i])
-        if good.sum() < 10 * RATE_HZ:
+def _always(quantity: str, verdict: Verdict, found: dict[str, Fit], drive: EvenDrive | None) -> bool:
+    """Return True if the drive's parts all have the gains that the faults make: a slide does not keep a gain."""
+    fault = verdict.faults[quantity]
+    if quantity == "ay" and fault is not None and "g" in fault.name and not _turns(verdict, found):
+        return False
+    ground = found["ground"]
+    if quantity == "v" and fault is not None and drive is not None and ground.known:
+        like_slip = abs(np.log(fault.factor)) < NEAR_ONE
+        if (
+            like_slip
+            and abs(np.log(abs(ground.gain * fault.factor))) < 0.1
+            and not is_same_when_coasting(drive, ground.gain)
+        ):
+            return False
+    shares = []
+    for name, law in LAWS.items():
+        if not found[name].known or quantity not in {member.quantity for member in law.members}:
             continue
-        side = (-0.5 if i % 2 == 0 else 0.5) * tracks[i] * drive.r[good]
-        others = np.nanmedian(np.delete(drive.wheels[good], i, axis=1), axis=1)
-        off = float(np.median((drive.wheels[good, i] - side) / np.where(others == 0, np.nan, others)) - 1.0)
-        if abs(off) > LARGEST_RADIUS:
+        gain = law.centre
+        for member in law.members:
+            other = verdict.faults[member.quantity]
+            if other is not None:
+                gain *= other.factor**member.power
+        off = abs(np.log(abs(gain / law.centre)))
+        noise = min(1.5 * found[name].error * np.sqrt(PARTS), NOISIEST)  # of a part's gain
+        within = max(STEADY, noise if off == 0.0 else min(noise, 0.4 * off))
+        if name == "ground" and off > 0.0:
+            within = min(STEADY, max(0.04, 0.4 * off))
+        whole = found[name].gain
+        near = whole * gain > 0.0 and abs(np.log(whole / gain)) < WHOLE
+        shares.append(share_of_parts(found[name], gain, within) if near else 0.0)
+    return bool(shares) and min(shares) >= STEADY_SHARE
+
+
+def _turns(verdict: Verdict, found: dict[str, Fit]) -> bool:
+    """Return True if the car turns as it is steered or as its course does: in a spin v·r is not an acceleration."""
+    for name in ("steering", "turning"):
+        gain = 1.0
+        for member in LAWS[name].members:
+            fault = verdict.faults[member.quantity]
+            if fault is not None:
+                gain *= fault.factor**member.power
+        fit = found[name]
+        if fit.known and abs(fit.correlation) > TURNS_LIKE and share_of_parts(fit, gain) >= STEADY_SHARE:
+            return True
+    return False
+
+
+def _radii(drive: EvenDrive, vehicle: Vehicle, doubts: set[str]) -> list[Finding]:
+    """Return wheels that turn faster or slower than the others on calm, straight moments; exchanged axles.
+
+    In a bend the wheels slip by what the tyres hold, so that only moments count in which hardly anything is asked. A
+    wheel that is off, but not seen to be so while the car coasts, adds the wheels to `doubts`.
+    """
+    findings = []
+    tracks = (vehicle.track_front, vehicle.track_front, vehicle.track_rear, vehicle.track_rear)
+    half = np.array([(-0.5 if i % 2 == 0 else 0.5) * tracks[i] for i in range(4)])
+    calm = (drive.moving > 0) & (np.abs(drive.v_dot) < CALM) & np.isfinite(drive.r) & find_followed(drive)
+    calm &= np.abs(drive.v * drive.r) < CALM_ACROSS
+    rims = drive.wheels - half * drive.r[:, None]
+    for i, wheel in enumerate(WHEELS):
+        good = np.flatnonzero(calm & np.isfinite(rims).all(axis=1))
+        if len(good) < 10 * RATE_HZ:
+            continue
+        others = np.median(np.delete(rims[good], i, axis=1), axis=1)
+        ratio = rims[good, i] / np.where(others == 0, np.nan, others) - 1.0
+        parts = np.array([float(np.nanmedian(part)) for part in np.array_split(ratio, RADIUS_PARTS)])
+        off = float(np.median(parts))
+        rolls = drive.v_dot[good] < -0.1  # a wheel that spins does so only while it is driven
+        if rolls.sum() < 2 * RATE_HZ or abs(float(np.nanmedian(ratio[rolls])) - off) > 0.3 * abs(off):
+            if abs(off) > LARGEST_RADIUS:
+                doubts.add("v")
+            continue
+        if abs(off) > LARGEST_RADIUS and np.all(np.abs(parts - off) < 0.3 * abs(off)):
             words = f"turns {off:+.1%} faster than the other wheels: another tyre, or its own scale"
             findings.append(Finding(f"omega_{wheel}", "radius", words, 1.0 / (1.0 + off)))
+    if len(findings) > 1:  # three cannot all be off the median: that is a slip they share, or an axle of other tyres
+        findings = findings if len(findings) == 2 else []
     return findings + _axles(drive)
 
 
 def _axles(drive: EvenDrive) -> list[Finding]:
     """Front wheels go the longer way in a turn: v_f² = v_r² + (L r)²."""
     front, rear = drive.wheels[:, :2].mean(axis=1), drive.wheels[:, 2:].mean(axis=1)
-    good = (drive.moving > 0) & np.isfinite(front) & np.isfinite(rear) & (np.abs(drive.v_dot) < 1.5) & (rear > 1.0)
+    good = (drive.moving > 0) & np.isfinite(front) & np.isfinite(rear) & (np.abs(drive.v_dot) < 1.0) & (rear > 1.0)
     turn = np.square(drive.wheelbase * drive.r / np.where(good, rear, 1.0))
-    good &= np.isfinite(turn)
-    tight = good & (turn > 0.015)
-    if tight.sum() < 3 * RATE_HZ:
+    good &= np.isfinite(turn) & find_followed(drive) & (np.abs(drive.v * drive.r) < GENTLE_ACROSS)
+    tight = good & (turn > TIGHT)
+    if tight.sum() < TIGHT_S * RATE_HZ:
         return []
     x, y = 0.5 * turn[good], front[good] / rear[good] - 1.0
-    slope = float(robust(np.stack([x, np.ones(len(x))], axis=1), y)[0])
-    if slope < -0.4:
+    table = np.stack([x, np.ones(len(x))], axis=1)
+    solution = robust(table, y)
+    spread = 1.4826 * float(np.median(np.abs(y - table @ solution)))
+    count = max(len(x) / RATE_HZ, 1.0)
+    error = spread / max(float(x.std()) * np.sqrt(count), 1e-12)
+    if abs(solution[0] + 1.0) < 0.4 and error < 0.45:
         words = "in turns the rear wheels go the longer way: front and rear exchanged?"
         return [Finding("omega", "front and rear exchanged", words)]
     return []
 
 
 def _offsets(drive: EvenDrive, found: dict[str, Fit]) -> list[Finding]:
+    """Return constant errors that are beyond the largest usual one by SURE standard deviations."""
     moving = drive.moving > 0
     lateral, axle, steering = found["lateral"], found["axle"], found["steering"]
-    along = np.nanmedian((drive.ax - drive.v_dot)[moving]) if np.isfinite(drive.ax[moving]).any() else 0.0
+    listed: list[tuple[str, float, float, float, str]] = []  # channel, value, its error, largest, unit
+    beside = (drive.ax - drive.v_dot)[moving]
+    if np.isfinite(beside).sum() > FEWEST_OFFSET_S * RATE_HZ:
+        driven = float(np.nansum(np.abs(drive.v))) / RATE_HZ
+        largest = LARGEST_AX if driven < AVERAGED_M else LARGEST_AX_FAR
+        listed.append(("ax", float(np.nanmedian(beside)), spread_of_parts(beside), largest, "m/s^2"))
     straight = moving & (np.abs(drive.v * drive.r) < 1.0)
-    across = np.nanmedian((drive.ay - drive.v * drive.r)[straight]) if straight.any() else 0.0
-    listed = [("ax", float(along), LARGEST_AX, "m/s^2"), ("ay", float(across), LARGEST_AY, "m/s^2")]
-    if axle.known:
-        listed.append(("yaw_rate", -axle.offset / axle.gain, LARGEST_RATE, "rad/s"))
+    if np.isfinite(drive.delta).any():
+        straight &= find_followed(drive)
+    beside = (drive.ay - drive.v * drive.r)[straight]
+    if np.isfinite(beside).sum() > FEWEST_OFFSET_S * RATE_HZ:
+        listed.append(("ay", float(np.nanmedian(beside)), spread_of_parts(beside), LARGEST_AY, "m/s^2"))
+    if axle.known and abs(abs(axle.gain) - 1.0) < 0.2 and axle.correlation > 0.9:
+        error = float(np.hypot(axle.offset_error, spread_of_parts((drive.r_wheels - drive.r)[moving])))
+        if np.sum(straight & np.isfinite(drive.r)) < 2 * RATE_HZ:  # one way round, a gain is an offset as well
+            error = np.inf
+        listed.append(("yaw_rate", -axle.offset / axle.gain, error, LARGEST_RATE, "rad/s"))
     elif lateral.known and np.isfinite(drive.r).any():
-        still = ~moving & (np.abs(drive.v) < 0.05)
-        listed.append(
-            ("yaw_rate", float(np.nanmedian(drive.r[still])) if still.sum() > RATE_HZ else 0.0, LARGEST_RATE, "rad/s")
-        )
-    if steering.known:
-        listed.append(("delta", steering.offset, LARGEST_STEER, "rad"))
+        still = (drive.moving == 0) & (np.abs(drive.v) < 0.05)
+        if still.sum() > RATE_HZ:
+            listed.append(("yaw_rate", float(np.nanmedian(drive.r[still])), 0.0, LARGEST_RATE, "rad/s"))
+    if steering.known and abs(steering.correlation) > 0.9 and 0.7 < steering.gain < 1.6 and is_steady(steering):
+        listed.append(("delta", steering.offset, steering.offset_error, LARGEST_STEER, "rad"))
     return [
         Finding(channel, "offset", f"{value:+.3g} {unit} when it should be none", offset=-value)
-        for channel, value, largest, unit in listed
-        if np.isfinite(value) and abs(value) > largest
+        for channel, value, error, largest, unit in listed
+        if np.isfinite(value) and abs(value) > largest + SURE * error
     ]
 
 

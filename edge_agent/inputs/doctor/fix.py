@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from edge_agent.inputs.doctor.findings import Finding
+from edge_agent.inputs.doctor.findings import FILTER_BEARS_S, Diagnosis, Finding
 from edge_agent.inputs.profile import Channel, Profile
 from schemas.signals import per_wheel
 from schemas.vehicle import Vehicle
@@ -19,8 +19,25 @@ LEFT_RIGHT: Final = (("omega_fl", "omega_fr"), ("omega_rl", "omega_rr"))
 FRONT_REAR: Final = (("omega_fl", "omega_rl"), ("omega_fr", "omega_rr"))
 EXCHANGED: Final = {
     "exchanged with ay": (("ax", "ay"),), "exchanged with longitude": (("latitude", "longitude"),),
-    "left and right exchanged": LEFT_RIGHT, "front and rear exchanged": FRONT_REAR,
+    "left and right exchanged": LEFT_RIGHT, "front left and right exchanged": LEFT_RIGHT[:1],
+    "rear left and right exchanged": LEFT_RIGHT[1:], "front and rear exchanged": FRONT_REAR,
 }  # fmt: skip
+
+
+DEVICES: Final = {"wheel_lag": "wheels", "steer_lag": "steering"}
+
+
+def small_lags(diagnosis: Diagnosis) -> dict[str, float]:
+    """Return the lags [s] by device that are no fault, but more than the filter bears."""
+    if any(finding.kind == "clock" for finding in diagnosis.findings):
+        return {}
+    return {DEVICES[name]: lag for name, lag in diagnosis.lags.items() if abs(lag) > FILTER_BEARS_S}
+
+
+def corrections(diagnosis: Diagnosis) -> list[Finding]:
+    """Return the findings, and the small lags as if they were findings: what a corrected profile takes out."""
+    lags = small_lags(diagnosis)
+    return [*diagnosis.findings, *(Finding(name, "clock", "", delay_s=lag) for name, lag in lags.items())]
 
 
 def fixed(findings: Sequence[Finding], profile: Profile, vehicle: Vehicle) -> tuple[Profile, Vehicle, list[Finding]]:

@@ -18,12 +18,17 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, smooth
-from schemas.numeric import FloatArray
+from schemas.numeric import BoolArray, FloatArray
 
 LONGEST_LAG_S: Final = 1.0
 FEWEST_S: Final = 8.0  # of excitation, below which nothing is said
 SLOW_SHARE: Final = 0.3  # of the regressor's 95 % size, from which on a moment counts as excited
 LEAST_LIKE: Final = 0.5  # correlation from which on a lag is believed
+APART_S, RIVAL = 0.3, 0.85  # another peak of the correlation that far off, as high as that share, leaves no lag known
+PARTS: Final = 8  # of the excited time, each with a gain of its own: a fault of a sensor is in all, a slide is not
+USUAL_BEND, BEND_SPREAD = 0.3, 0.4  # understeer's share of the steering at the drive's fast speed: mean and std of cars
+BENDS: Final = np.linspace(-0.3, 1.8, 22)  # shares that are tried
+UNLIKE_RADII: Final = 0.004  # [1/m] yaw rate of the wheels per speed, by radii that differ: std of cars
 CORRELATED_S: Final = 1.0  # that far apart two moments tell different things
 
 
@@ -41,6 +46,8 @@ class Fit:
     left: FloatArray
     right: FloatArray
     beside: tuple[float, ...] = ()  # gains of what else the left holds
+    parts: tuple[float, ...] = ()  # gains of the parts of the excited time
+    offset_error: float = np.inf  # standard deviation of the offset
 
     @property
     def known(self) -> bool:
@@ -52,12 +59,20 @@ NOTHING: Final = Fit(np.nan, np.nan, 0.0, np.inf, 0.0, 0.0, np.inf, np.zeros(0),
 
 
 class Relation(NamedTuple):
-    """Left and right (n,), what else the left holds, and what the offset goes with, where it is not constant."""
+    """Left and right (n,), what else the left holds, and what the offset goes with, where it is not constant.
+
+    `bend` (n,) is given where the left may grow by a share of right · bend that a drive may not tell from the gain:
+    at one speed, understeer and a gain of the steering are the same. `loose` are standard deviations of the gains of
+    what else the left holds, for the same reason.
+    """
 
     left: FloatArray
     right: FloatArray
     beside: tuple[FloatArray, ...] = ()
     per: FloatArray | None = None
+    bend: FloatArray | None = None
+    loose: tuple[float, ...] = ()
+    length: float = 1.0  # [m] wheelbase in the right side, where there is one
 
 
 def _lateral(d: EvenDrive) -> Relation:
@@ -73,11 +88,13 @@ def _steering(d: EvenDrive) -> Relation:
     # times v: turns at walking speed, where the angle is large and its map bent, would else outweigh all others
     fast = np.nanpercentile(np.abs(d.v), 95) if np.isfinite(d.v).any() else 1.0
     v = np.where(np.abs(d.v) > 0.25 * fast, d.v, np.nan)
-    return Relation(d.delta * v, d.wheelbase * d.r, (v * v * d.r,), v)
+    return Relation(
+        d.delta * v, d.wheelbase * d.r, per=v, bend=np.square(v / max(float(fast), 1e-9)), length=d.wheelbase
+    )
 
 
 def _axle(d: EvenDrive) -> Relation:
-    return Relation(d.r_wheels, d.r, (d.v,))
+    return Relation(d.r_wheels, d.r, (d.v,), loose=(UNLIKE_RADII,))
 
 
 def _ground(d: EvenDrive) -> Relation:
@@ -101,28 +118,32 @@ IDENTITIES: Final[dict[str, Callable[[EvenDrive], Relation]]] = {
 
 def fits(drive: EvenDrive) -> dict[str, Fit]:
     """Every identity of a drive."""
-    return {name: fit(sides(drive), drive.moving, level=name == "ground") for name, sides in IDENTITIES.items()}
+    return {
+        name: fit(sides(drive), drive.moving, drive.grips, level=name == "ground") for name, sides in IDENTITIES.items()
+    }
 
 
-def fit(sides: Relation, moving: FloatArray, *, level: bool) -> Fit:
+def fit(sides: Relation, moving: FloatArray, grips: FloatArray, *, level: bool) -> Fit:
     """left = gain · right + offset + Σ k · beside, over the moving part, after the lag is taken out.
 
     The gain is the geometric mean of both regressions, so that noise on either side does not bend it.
 
     Args:
         sides: what is held against each other.
-        moving: (n,) bool.
+        moving: (n,) 1 where the car moves.
+        grips: (n,) 0 where the wheels' speed is not the car's; the lag is taken there as well.
         level: no offset, and every moving moment is excited: a quantity that is itself large.
     """
-    left, right, beside, per = sides
+    left = sides.left
+    right = sides.right
     if level:  # what is large all along has no edge of its own: its change has
         lag, lag_error = lag_of(np.gradient(smooth(left, 1.0)), np.gradient(smooth(right, 1.0)), moving)
     else:
         lag, lag_error = lag_of(left, right, moving)
     if np.isfinite(lag_error) and abs(lag) > 1.0 / RATE_HZ:
         left = shifted(left, -lag)
-    good = np.isfinite(left) & np.isfinite(right) & moving.astype(bool)
-    for other in beside:
+    good = np.isfinite(left) & np.isfinite(right) & (moving > 0) & (grips > 0)
+    for other in (*sides.beside, *(one for one in (sides.per, sides.bend) if one is not None)):
         good &= np.isfinite(other)
     if good.sum() < FEWEST_S * RATE_HZ:
         return NOTHING
@@ -130,23 +151,84 @@ def fit(sides: Relation, moving: FloatArray, *, level: bool) -> Fit:
     size = np.percentile(np.abs(x - (0.0 if level else np.median(x))), 95)
     excited = np.ones(len(x), bool) if level else np.abs(x - np.median(x)) > SLOW_SHARE * size
     excited_s = excited.sum() / RATE_HZ
-    others = [] if level else [np.ones(len(x)) if per is None else per[good]]
-    table = np.stack([x, *others, *(other[good] for other in beside)], axis=1)
-    solution = robust(table, y)
-    rest = y - table[:, 1:] @ solution[1:]
     if level:
         gain = _ratio(x, y)
         correlation = float(np.corrcoef(x, y)[0, 1]) if x.std() > 0 and y.std() > 0 else 0.0
         spread = float(np.std(y - gain * x)) / max(abs(gain) * float(np.sqrt(np.mean(x * x))), 1e-12)
         error = spread / np.sqrt(max(excited_s / CORRELATED_S, 1.0)) + 0.003
-        return Fit(gain, 0.0, max(correlation, 1.0 - spread), error, excited_s, lag, lag_error, y, x)
+        parts = _gains(x, y, excited)
+        return Fit(gain, 0.0, max(correlation, 1.0 - spread), error, excited_s, lag, lag_error, y, x, (), parts)
+    count = max(excited_s / CORRELATED_S, 1.0)
+    constant = np.ones(len(x)) if sides.per is None else sides.per[good]
+    besides = [other[good] for other in sides.beside]
+    bend, unsure = 0.0, 0.0
+    if sides.bend is not None:
+        bend, unsure = _bend_of(x, y, constant, sides.bend[good], count)
+        x = x * (1.0 + bend * sides.bend[good])
+    table = np.stack([x, constant, *besides], axis=1)
+    solution, errors = _loose(table, y, sides.loose, count)
+    rest = y - table[:, 1:] @ solution[1:]
     correlation = float(np.corrcoef(x, rest)[0, 1]) if x.std() > 0 and rest.std() > 0 else 0.0
     slope = float(np.sign(correlation)) * float(rest.std() / max(x.std(), 1e-12))
     gain = float(np.sign(solution[0])) * float(np.sqrt(abs(solution[0] * slope))) if correlation else 0.0
-    count = max(excited_s / CORRELATED_S, 1.0)
     error = float(np.sqrt(max(1.0 - correlation**2, 1e-6) / max(correlation**2, 1e-6) / count))
     found = tuple(float(k) for k in solution[2:])
-    return Fit(gain, float(solution[1]), correlation, error, excited_s, lag, lag_error, y, x, found)
+    if sides.bend is not None:
+        per_square = float(np.median(sides.bend[good] / np.maximum(np.square(constant), 1e-12)))
+        found = (gain * bend * per_square * sides.length,)
+    return Fit(
+        gain, float(solution[1]), correlation, float(np.hypot(error, unsure)), excited_s, lag, lag_error, y, x, found,
+        _gains(x, rest, excited), float(errors[1]),
+    )  # fmt: skip
+
+
+def _bend_of(x: FloatArray, y: FloatArray, constant: FloatArray, bend: FloatArray, count: float) -> tuple[float, float]:
+    """Share of `bend` in the right side, and the standard deviation of ln gain that its uncertainty makes.
+
+    Each share is tried: what it leaves of the left side, of `count` independent moments, against what cars have.
+    """
+    costs, gains = np.zeros(len(BENDS)), np.zeros(len(BENDS))
+    for k, share in enumerate(BENDS):
+        table = np.stack([x * (1.0 + share * bend), constant], axis=1)
+        solution = robust(table, y)
+        left = float(np.median(np.abs(y - table @ solution))) + 1e-3 * float(np.std(y)) + 1e-12
+        costs[k] = 2.0 * count * np.log(left) + ((share - USUAL_BEND) / BEND_SPREAD) ** 2
+        gains[k] = np.log(max(abs(solution[0]), 1e-12))
+    weights = np.exp(-0.5 * (costs - costs.min()))
+    weights /= weights.sum()
+    centre = float(weights @ gains)
+    return float(weights @ BENDS), float(np.sqrt(weights @ np.square(gains - centre)))
+
+
+def _loose(table: FloatArray, y: FloatArray, loose: tuple[float, ...], count: float) -> tuple[FloatArray, FloatArray]:
+    """Robust least squares with the last columns' gains drawn to zero, and standard deviations of all gains."""
+    solution = robust(table, y)
+    off = np.abs(y - table @ solution)
+    spread = max(1.4826 * float(np.median(off)), 1e-9)
+    near = off <= 3.0 * spread
+    weight = count / max(int(near.sum()), 1) / spread**2
+    normal = weight * (table[near].T @ table[near])
+    first = len(normal) - len(loose)
+    for k, std in enumerate(loose):
+        normal[first + k, first + k] += 1.0 / std**2
+    normal[np.diag_indices(len(normal))] += 1e-12 * np.trace(normal)
+    inverse = np.linalg.inv(normal)
+    if loose:
+        solution = inverse @ (weight * (table[near].T @ y[near]))
+    return solution, np.sqrt(np.diag(inverse))
+
+
+def _gains(x: FloatArray, y: FloatArray, excited: BoolArray) -> tuple[float, ...]:
+    """Gains of the parts of the excited time, in the order of time."""
+    rows = np.flatnonzero(excited)
+    found = []
+    for part in np.array_split(rows, PARTS):
+        if len(part) < 0.3 * RATE_HZ:
+            continue
+        across = float(np.sum(x[part] * y[part]))
+        size = float(np.sqrt(np.sum(y[part] ** 2) / max(float(np.sum(x[part] ** 2)), 1e-24)))
+        found.append(float(np.sign(across)) * size)
+    return tuple(found)
 
 
 def _ratio(x: FloatArray, y: FloatArray) -> float:
@@ -204,5 +286,10 @@ def _peak(left: FloatArray, right: FloatArray, moving: FloatArray) -> tuple[floa
     before, here, after = across[top - 1 : top + 2]
     bend = before - 2.0 * here + after
     lag = (top - most + (0.5 * (before - after) / bend if bend < 0.0 else 0.0)) / RATE_HZ
+    far = np.abs(np.arange(len(across)) - top) > round(APART_S * RATE_HZ)
+    inner = np.arange(1, len(across) - 1)
+    peaks = inner[(across[1:-1] >= across[:-2]) & (across[1:-1] > across[2:])]
+    if np.any(across[peaks[far[peaks]]] > RIVAL * here):  # periodic: lags by half a period fit as well
+        return 0.0, False
     sharp = across[max(top - 15, 0)] < 0.985 * here or across[min(top + 15, 2 * most)] < 0.985 * here
     return float(lag), bool(sharp)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from edge_agent.inputs.doctor.drive import EvenDrive, over_ground
+from edge_agent.inputs.doctor.drive import CREEP, EvenDrive, over_ground
 from schemas.numeric import FloatArray
 from schemas.signals import S
 
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 FEWEST: Final = 200  # moments, four seconds
 BETTER: Final = 0.25  # by which another reading of yaw must fit the course better (mean resultant length)
+SOUND: Final = 0.9  # agreement from which on another reading of yaw is the true one
+LEAST_TURN: Final = 0.5  # [rad] of yaw and of the course; a car that slides turns and its course does not
 STEADIER: Final = 0.5  # of the spread of ground speed over wheel speed, that exchanging must leave
 # what the log's yaw may be instead: how to make ours of it
 COMPASS: Final[dict[str, Callable[[FloatArray], FloatArray]]] = {
@@ -39,10 +41,17 @@ def yaw_findings(signals: FloatArray, drive: EvenDrive) -> list[Finding]:
         yaw, course = drive.course_yaw[good], drive.course[good]
         fits = {name: _agreement(made(yaw), course) for name, made in COMPASS.items()}
         best = max(fits, key=lambda name: fits[name])
-        if fits[best] > _agreement(yaw, course) + BETTER:
+        turns = min(_turned(COMPASS[best](yaw)), _turned(course))
+        if turns > LEAST_TURN and fits[best] > max(_agreement(yaw, course) + BETTER, SOUND):
             words = f"agrees with the course over ground only as {best} ({fits[best]:.2f} of 1)"
             findings.append(Finding("yaw", best, words))
     return findings
+
+
+def _turned(angle: FloatArray) -> float:
+    """Return how far an angle (n,) goes [rad], but for its ends."""
+    unwrapped = np.unwrap(angle)
+    return float(np.percentile(unwrapped, 95) - np.percentile(unwrapped, 5))
 
 
 def _agreement(yaw: FloatArray, course: FloatArray) -> float:
@@ -59,7 +68,8 @@ def exchanged(t: FloatArray, signals: FloatArray, drive: EvenDrive) -> bool:
         return True
     if np.nanmax(np.abs(longitude)) > 90.0:
         return False
-    good = (drive.moving > 0) & np.isfinite(drive.v_ground) & (drive.v != 0.0)
+    fast = np.nanpercentile(np.abs(drive.v), 95) if np.isfinite(drive.v).any() else 0.0
+    good = (np.abs(drive.v) > CREEP * fast) & np.isfinite(drive.v_ground) & (drive.v != 0.0)
     if good.sum() < FEWEST:
         return False
     other, course = over_ground(t, longitude, latitude, drive.t)

@@ -33,6 +33,7 @@ def lines(diagnosis: Diagnosis) -> list[str]:
     """What was found, a line each."""
     lines = [f"{'FAULT':<8} {f.channel:<10} {f.kind:<24} {f.words}" for f in diagnosis.findings]
     lines += [f"{'unknown':<8} {channel:<10} nothing in this drive tells" for channel in diagnosis.unknown]
+    lines += [f"{'lag':<8} {name:<10} {lag:+.3f} s behind the inertial unit" for name, lag in diagnosis.lags.items()]
     return [*lines, *(f"{'sound':<8} {channel}" for channel in diagnosis.sound)]
 
 
@@ -40,6 +41,7 @@ def document(diagnosis: Diagnosis) -> dict[str, object]:
     """What was found, for a program: scale, offset and delay mend a channel, in this order."""
     return {
         "passed": diagnosis.passed, "advice": advice(diagnosis), "sound": diagnosis.sound, "unknown": diagnosis.unknown,
+        "lags_s": {name: round(lag, 4) for name, lag in diagnosis.lags.items()},
         "findings": [
             {name: _finite(value) for name, value in asdict(finding).items()} for finding in diagnosis.findings
         ],

@@ -68,6 +68,7 @@ CLOCKS: Final = {"longitudinal": ("imu", "wheels"), "axle": ("wheels", "imu"), "
 CLOCK_SPREAD_S: Final = {"longitudinal": 0.06, "axle": 0.04, "steering": 0.06, "ground": 0.05, "turning": 0.12}
 CLOCK_CENTRE_S: Final = {"longitudinal": 0.03, "axle": 0.0, "steering": -0.05, "ground": 0.0, "turning": -0.06}
 LATE_S: Final = 0.15  # a clock this far off is a fault; sound logs lie within .1
+CLOCK_LIKE: Final = 0.8  # correlation from which on an identity's lag counts: slides move both sides apart
 CLOCK_COST: Final = 4.0  # lags have no table of faults that one could hit by chance
 
 
@@ -166,7 +167,9 @@ def _misfit(name: str, fit: Fit, guess: Mapping[str, Mistake]) -> float:
 def clocks(found: Mapping[str, Fit]) -> dict[str, tuple[float, float]]:
     """Device -> (seconds that its clock is late, the margin of that), for the fewest late devices; empty for none."""
     known = {
-        name: fit for name, fit in found.items() if name in CLOCKS and fit.known and math.isfinite(fit.lag_error_s)
+        name: fit
+        for name, fit in found.items()
+        if name in CLOCKS and fit.known and math.isfinite(fit.lag_error_s) and abs(fit.correlation) > CLOCK_LIKE
     }
     devices = sorted({device for name in known for device in CLOCKS[name]})
 

@@ -7,6 +7,7 @@ has most of what is asked for, unless it is named.
 
 from __future__ import annotations
 
+import logging
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -92,6 +93,7 @@ def log_frames(path: Path, wanted: set[int]) -> tuple[Log, float]:
     """Frames of the wanted identifiers by python-can, and the time of the log's first frame [s]."""
     log: Log = defaultdict(Frames)
     first = np.inf
+    logging.getLogger("can").setLevel(logging.ERROR)  # it reports versions of traces at INFO and WARNING
     with library("can").LogReader(path) as reader:
         for message in reader:
             time = message.timestamp

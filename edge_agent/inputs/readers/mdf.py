@@ -39,7 +39,7 @@ def check_blocks(path: Path) -> None:
     """
     size = path.stat().st_size
     with path.open("rb") as file:
-        if file.read(3) != b"MDF":
+        if file.read(3) not in (b"MDF", b"UnF"):  # a logger that lost its power left "UnFinMF"; asammdf reads that
             raise InputError("source", f"{path} is not an MDF file", "give a measurement of version 4")
         file.seek(28)
         version = struct.unpack("<H", file.read(2).ljust(2, b"\0"))[0]

@@ -15,6 +15,7 @@ import pyarrow.compute as pc
 import pyarrow.csv as pc_csv
 import pyarrow.parquet as pq
 
+from edge_agent.inputs.readers.racelogic import convert_vbo, has_vbo_columns
 from edge_agent.inputs.recording import Recording, Series, foreign
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
@@ -23,6 +24,10 @@ from schemas.thresholds import NS
 SUFFIXES: Final = (".csv", ".tsv", ".txt", ".parquet")
 TIMES: Final = ("t", "timestamp", "time", "time_s", "time_ms", "t_ms", "timestamp_ns", "zeit", "sec", "seconds")
 TIME_UNITS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+MOST_NAMES: Final = 20  # in an error
+RACECHRONO: Final = "racechrono"
+LONGEST_PREAMBLE: Final = 50  # lines
+_WORD: Final = re.compile(r"[a-z]+")
 _UNIT: Final = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*$")
 
 
@@ -46,6 +51,9 @@ def _recording(path: Path, kind: str, time: str | None, time_unit: str | None) -
     table = pq.ParquetFile(path).read() if kind == "Parquet" else _csv(path)
     if not table.num_rows:
         raise InputError("source", f"{path} has no rows", "give a recording with at least one sample")
+    if has_vbo_columns(table.column_names):
+        found = {name: _numbers(table[name]) for name in table.column_names}
+        return convert_vbo(path, {name: values for name, values in found.items() if values is not None}, {})
     named = {_UNIT.sub(r"\g<name>", name).strip() or name: name for name in table.column_names}
     column = _time_column(path, named, time)
     unit = _UNIT.match(named[column])
@@ -64,8 +72,10 @@ def _recording(path: Path, kind: str, time: str | None, time_unit: str | None) -
 
 def _csv(path: Path) -> pa.Table:
     with path.open("rb") as file:
-        head = file.readline(65_536).decode("utf-8", errors="replace")
-    mark = max(",;\t", key=head.count)
+        lines = [file.readline(65_536).decode("utf-8", errors="replace") for _ in range(LONGEST_PREAMBLE)]
+    if RACECHRONO in lines[0].lower():
+        return _racechrono(path, lines)
+    mark = max(",;\t", key=lines[0].count)
     table = pc_csv.read_csv(path, parse_options=pc_csv.ParseOptions(delimiter=mark))
     if mark == ";":  # decimal commas go with semicolons
         for index, name in enumerate(table.column_names):
@@ -78,8 +88,51 @@ def _csv(path: Path) -> pa.Table:
     return table
 
 
+def _racechrono(path: Path, lines: list[str]) -> pa.Table:
+    """Return the table of RaceChrono's CSV version 3: a preamble, then names, units and sources, a row each.
+
+    Raises:
+        InputError: there is no row of names.
+    """
+    place = next((k for k, line in enumerate(lines) if line.lower().startswith("timestamp,")), None)
+    if place is None or place + 2 >= len(lines):
+        raise InputError("source", f"{path} is RaceChrono's, but not of CSV version 3", "export it as CSV v3")
+    rows = [line.rstrip("\r\n").split(",") for line in lines[place : place + 3]]
+    names = rows[0]
+    units = rows[1]
+    sources = rows[2]
+    skipped = place + (3 if "unix time" in units or not _is_number(units[0]) else 1)
+    whole: list[str] = []
+    for k, name in enumerate(names):
+        unit = units[k].strip() if k < len(units) else ""
+        title = name if all(_plain(other) != name for other in whole) else f"{name} {sources[k].strip()}"
+        whole.append(f"{title} [{unit}]" if unit and unit != "unix time" else title)
+    options = pc_csv.ReadOptions(skip_rows=skipped, column_names=_distinct(whole))
+    return pc_csv.read_csv(path, read_options=options)
+
+
+def _distinct(names: list[str]) -> list[str]:
+    """Return names of which no two are alike."""
+    return [name if name not in names[:k] else f"{name} {k}" for k, name in enumerate(names)]
+
+
+def _plain(title: str) -> str:
+    return _UNIT.sub(r"\g<name>", title).strip()
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
 def _time_column(path: Path, named: dict[str, str], given: str | None) -> str:
     if given is not None:
+        whole = next((name for name, full in named.items() if given in (name, full)), None)
+        if whole is not None:
+            return whole
         if given not in named:
             raise InputError("time", f"{path} has no column {given}", f"choose of {', '.join(list(named)[:20])}")
         return given
@@ -87,7 +140,11 @@ def _time_column(path: Path, named: dict[str, str], given: str | None) -> str:
     for name in TIMES:
         if name in lower:
             return lower[name]
-    raise InputError("time", f"{path} has no column that is called t or time", 'name it in the profile as "time"')
+    for name in named:  # "# time", "INS_time_sec": the first that has the word in it
+        if "time" in _WORD.findall(name.lower()):
+            return name
+    seen = ", ".join(list(named)[:MOST_NAMES])
+    raise InputError("time", f"{path} has no column of time among {seen}", 'name it in the profile as "time"')
 
 
 def _seconds(column: Any, name: str, unit: str | None) -> tuple[FloatArray, int | None]:  # noqa: ANN401 Arrow columns are not generic

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -15,6 +16,8 @@ import numpy as np
 from edge_agent.inputs.doctor.findings import Diagnosis, diagnose
 from edge_agent.inputs.units import DEG, SPEED
 from edge_agent.lab.simulation import SimulatedFleet
+from edge_agent.lab.simulation.friction import ICE, SNOW, WET
+from edge_agent.lab.simulation.scenarios import scenario_named
 from schemas.numeric import FloatArray
 from schemas.runtime.figures import Figure
 from schemas.signals import S
@@ -153,6 +156,10 @@ PLANTED: Final = {
     "wheels late": Planted(late(OMEGA), "wheels", "clock"),
     "status bits": Planted(status_bits, "omega_fl", "status bits"),
     "left and right": Planted(exchanged(OMEGA[::2], OMEGA[1::2]), "omega", "left and right exchanged"),
+    "front left and right": Planted(
+        exchanged(OMEGA[:1], OMEGA[1:2]), "omega", "front left and right exchanged"
+    ),
+    "rear left and right": Planted(exchanged(OMEGA[2:3], OMEGA[3:]), "omega", "rear left and right exchanged"),
     "front and rear": Planted(exchanged(OMEGA[:2], OMEGA[2:]), "omega", "front and rear exchanged"),
     "latitude and longitude": Planted(exchanged([S.LATITUDE], [S.LONGITUDE]), "latitude", "exchanged with longitude"),
     "compass for yaw": Planted(compass, "yaw", "compass"),
@@ -168,6 +175,18 @@ def drives(count: int, seed: int, *, rough: bool, winter: bool = False, seconds:
     """
     scenario = f"winter-{seed}" if winter else "hills" if rough else "demo"
     fleet = SimulatedFleet(scenario, count, seed, RATE_HZ, rough=float(rough), winter=float(winter))
+    parts = [fleet.step(round(RATE_HZ)) for _ in range(seconds)]
+    t, signals = (np.concatenate([part[k] for part in parts]) for k in range(2))
+    return [Recorded(t[:, n], signals[:, n], fleet.vehicles[n]) for n in range(count)]
+
+
+def icy(count: int, seed: int, *, seconds: int = DRIVE_S) -> list[Recorded]:
+    """Return drives through the town in winter: ice where it was wet or snow, snow elsewhere but in one quarter."""
+    usual = scenario_named("hills")
+    worse = {WET: SNOW, SNOW: ICE}
+    patches = tuple(replace(patch, mu=worse.get(patch.mu, patch.mu)) for patch in usual.patches)
+    town = replace(usual, name="winter", background=WET, patches=patches)
+    fleet = SimulatedFleet(town, count, seed, RATE_HZ, rough=0.5)
     parts = [fleet.step(round(RATE_HZ)) for _ in range(seconds)]
     t, signals = (np.concatenate([part[k] for part in parts]) for k in range(2))
     return [Recorded(t[:, n], signals[:, n], fleet.vehicles[n]) for n in range(count)]

@@ -12,7 +12,8 @@ import pytest
 
 from edge_agent.cli import main
 from edge_agent.inputs.doctor.findings import diagnose
-from edge_agent.lab.evaluation.planted import PLANTED, Recorded, drives, named
+from edge_agent.lab.evaluation.planted import PLANTED, Recorded, drives, icy, named
+from edge_agent.lab.simulation import simulate_manoeuvre
 from schemas.signals import CHANNELS, S
 from tests.edge_agent.inputs.formats import BLF, NMEA, VEHICLE
 from tests.edge_agent.service import Router, Service
@@ -81,6 +82,33 @@ def test_what_the_doctor_found_is_json_for_a_program(rough: Recorded, tmp_path: 
     (found,) = said["findings"]
     assert (found["channel"], found["scale"]) == ("ay", -1.0)
     assert "ay" not in said["sound"]
+
+
+@pytest.mark.parametrize("manoeuvre", ["slalom", "sine", "straight", "constant-radius", "acceleration", "braking"])
+@pytest.mark.parametrize("mu", [None, 0.15])
+def test_slides_and_constant_speed_accuse_no_sensor(manoeuvre: str, mu: float | None) -> None:
+    log, vehicle = simulate_manoeuvre(manoeuvre, mu=mu, seed=3, duration_s=25.0)
+    signals = np.stack([log[name].to_numpy(zero_copy_only=False) for name in CHANNELS], axis=1)
+    assert not diagnose(log["t"].to_numpy(), signals, vehicle).findings
+
+
+@pytest.fixture(scope="module")
+def winter() -> Recorded:
+    """Two minutes and a half on ice and snow."""
+    return icy(1, 23)[0]
+
+
+def test_a_drive_on_ice_and_snow_accuses_no_sensor(winter: Recorded) -> None:
+    assert not diagnose(*winter).findings
+
+
+@pytest.mark.parametrize(
+    "name", ["yaw rate in deg/s", "a_y flipped", "steering in deg", "status bits", "wheels in mph"]
+)
+def test_a_mistake_is_named_on_ice_too(winter: Recorded, name: str) -> None:
+    found, passed = named(PLANTED[name], winter)
+    assert found
+    assert not passed
 
 
 @pytest.mark.timeout(600)  # the kernels of the default estimator may have to be compiled

@@ -1,0 +1,126 @@
+"""Evidence of slip and of constancy: what tells a wheel that slides from a sensor that is wrong."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from edge_agent.inputs.doctor.drive import RATE_HZ, EvenDrive, smooth
+from edge_agent.inputs.doctor.identities import Fit
+from edge_agent.inputs.doctor.lags import lags
+from schemas.numeric import BoolArray, FloatArray
+from schemas.vehicle import Vehicle
+
+FEWEST_STEPS: Final = 5  # of a wheel away from the others, below which they are no bits
+FOREIGN_ROWS: Final = 3000  # of a moving car in which a wheel must have nothing to do with the others
+FOLLOWED: Final = 0.25  # share by which the way taken may be off the way steered
+RADIUS_PARTS: Final = 4
+STEADY: Final = 0.4
+STEADY_SHARE: Final = 0.75
+
+LAGS_APART_S: Final = 0.05  # by which the halves of a drive may differ
+TURNS_LIKE: Final = 0.8  # correlation of the yaw rate with steering or course, below which the car may spin
+
+
+def has_equal_steps(above: FloatArray, off: BoolArray) -> bool:
+    """Return True if a wheel leaves the others (n,) by sudden steps of a few sizes, FEWEST_STEPS at least."""
+    enters = np.flatnonzero(~off[:-1] & off[1:])
+    if len(enters) < FEWEST_STEPS:
+        return False
+    steps = above[enters + 1] - above[enters]
+    whole = np.abs(above[np.minimum(enters + 2, len(above) - 1)] - above[enters + 1]) < 0.1 * np.abs(steps)
+    sudden = np.abs(steps) > 0.9 * np.abs(above[enters + 1])
+    usual = float(np.median(np.abs(steps)))
+    alike = np.abs(np.abs(steps) / usual - np.maximum(np.round(np.abs(steps) / usual), 1.0)) < 0.1
+    return bool(np.mean(sudden & alike) > 0.8 and (np.mean(whole) > 0.3 or off.mean() > 0.1))
+
+
+def is_foreign(rest: FloatArray, others: FloatArray, off: BoolArray, fast: float) -> bool:
+    """Return True if a wheel has nothing to do with the other three (n, 3), which agree: nobody spins for that long."""
+    agree = np.ptp(rest, axis=1) < 0.1 * np.abs(others) + 0.02 * fast
+    moves = np.abs(others) > 0.3 * fast
+    return bool(moves.sum() > FOREIGN_ROWS and np.mean(off[moves & agree]) > 0.6 and agree[moves].mean() > 0.6)
+
+
+def find_exchanged_axles(drive: EvenDrive) -> list[tuple[str, tuple[int, int]]]:
+    """Return the axles whose left and right wheels are exchanged, though the other axle's are not: name and wheels.
+
+    With both exchanged the axles agree, and the identity of the axles tells it.
+    """
+
+    def likeness(yaw: FloatArray) -> float:
+        good = np.isfinite(yaw) & np.isfinite(drive.r) & (drive.moving > 0)
+        if good.sum() < 10 * RATE_HZ or yaw[good].std() == 0.0 or drive.r[good].std() == 0.0:
+            return 0.0
+        return float(np.corrcoef(yaw[good], drive.r[good])[0, 1])
+
+    front = likeness(drive.yaw_front)
+    rear = likeness(drive.yaw_rear)
+    if min(abs(front), abs(rear)) < 0.7 or front * rear > 0.0:
+        return []
+    good = np.isfinite(drive.ay) & np.isfinite(drive.r) & (drive.moving > 0)
+    steered = np.isfinite(drive.delta) & good
+    sign = 0.0
+    if steered.sum() > 10 * RATE_HZ:
+        sign = float(np.sign(np.sum(drive.ay[good] * drive.r[good]) * np.sum(drive.delta[steered] * drive.r[steered])))
+    if sign < 0.0:  # one of a_y, yaw rate and steering is flipped: nobody knows which axle is right
+        return []
+    return [("front", (0, 1))] if front < 0.0 else [("rear", (2, 3))]
+
+
+def find_followed(drive: EvenDrive) -> BoolArray:
+    """Return where the car goes as it is steered, (n,): it does not slide there, whatever the road."""
+    fast = np.maximum(np.abs(drive.v), 1.0)
+    wanted = drive.wheelbase * drive.r / fast
+    steered = np.isfinite(drive.delta) & np.isfinite(wanted)
+    return steered & (np.abs(np.tan(np.clip(drive.delta, -1.0, 1.0)) - wanted) < FOLLOWED * np.abs(wanted) + 0.01)
+
+
+def is_same_when_coasting(drive: EvenDrive, gain: float) -> bool:
+    """Return True if speed over ground over the wheels' is the same while the car gains and loses speed.
+
+    Wheels that spin turn too fast while they are driven, wheels under brakes too slowly; a wrong radius always is.
+    """
+    ratio = smooth(drive.v_ground, 1.0) / np.where(drive.v == 0.0, np.nan, smooth(drive.v, 1.0))
+    known = np.isfinite(ratio) & (drive.moving > 0)
+    for rows in (known & (drive.v_dot > 0.1), known & (drive.v_dot < -0.1)):
+        if rows.sum() < 2 * RATE_HZ or abs(float(np.median(ratio[rows])) / gain - 1.0) > 0.04:
+            return False
+    return True
+
+
+def spread_of_parts(beside: FloatArray) -> float:
+    """Return by how much the parts of a drive differ in what should be constant: a tilt is in all, a slide is not."""
+    parts = [float(np.nanmedian(part)) for part in np.array_split(beside, RADIUS_PARTS) if np.isfinite(part).any()]
+    return float(np.std(parts))
+
+
+def is_steady(fit: Fit) -> bool:
+    """Return True if the parts of the drive have the gain that all have together."""
+    return share_of_parts(fit, fit.gain) >= STEADY_SHARE
+
+
+def share_of_parts(fit: Fit, gain: float, within: float = STEADY) -> float:
+    """Return the share of a drive's parts whose gain is the given one, within `within` in logarithms."""
+    if not fit.parts:
+        return 0.0
+    near = [g * gain > 0.0 and abs(np.log(abs(g / gain))) < within for g in fit.parts if g]
+    return float(np.mean(near)) if near else 0.0
+
+
+def measure_lags_twice(t: FloatArray, signals: FloatArray, vehicle: Vehicle, found: dict[str, Fit]) -> dict[str, float]:
+    """Return the lags [s] that both halves of a drive agree on, of devices whose identity holds all along.
+
+    A car that slides answers to its steering later or sooner than its model, and not by the same time again.
+    """
+    half = len(t) // 2
+    parts = [lags(t[rows], signals[rows], vehicle) for rows in (slice(None), slice(None, half), slice(half, None))]
+    told = {}
+    for name, identity in (("wheel_lag", "axle"), ("steer_lag", "steering")):
+        fit = found[identity]
+        sound = fit.known and fit.correlation > TURNS_LIKE and abs(np.log(abs(fit.gain))) < 0.35 and is_steady(fit)
+        values = [part[name] for part in parts if name in part]
+        if sound and len(values) == len(parts) and np.ptp(values) < LAGS_APART_S:
+            told[name] = float(np.median(values))
+    return told

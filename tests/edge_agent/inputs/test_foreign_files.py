@@ -1,0 +1,143 @@
+"""Files of other programs: each is read with the right units, or refused with the right reason."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from edge_agent.cli import main
+from edge_agent.inputs.bring_in import read_source
+from edge_agent.inputs.readers.dbc import parse_dbc
+from schemas.errors import InputError
+
+VBO = """File created on 01/09/2020 at 10:15:00
+
+[header]
+satellites
+time
+latitude
+longitude
+velocity kmh
+heading
+Indicated_Longitudinal_Acceleration
+Wheel_Speed_FL
+
+[channel units]
+g
+km/h
+
+[comments]
+Log rate 100 Hz
+
+[column names]
+sats time lat long velocity heading LongAcc Wheel_Speed_FL
+
+[data]
+010 101559.98 +03610.50000 -01080.30000 036.0 090.0 +1.0E-01 +3.6E+01
+010 101559.99 +03610.50000 -01080.30000 036.0 090.0 +1.0E-01 +3.6E+01
+010 101600.00 +03610.50000 -01080.30000 036.0 090.0 +1.0E-01 +3.6E+01
+"""
+CSV_OF_VBO = """sats,time,lat,long,velocity,heading,LongAcc
+10,101559.98,3610.5,-1080.3,36.0,90.0,0.1
+10,101600.00,3610.5,-1080.3,36.0,90.0,0.1
+"""
+GVRET = """Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8
+1000000,000000AA,false,Rx,0,2,10,27,
+1010000,000000AA,false,Rx,0,2,11,27,
+"""
+TRACE = """  Number  Time  ID  Size  Data
+     1)      10.0  00AA  2  10 27
+     2)      20.0  00AA  2  11 27
+"""
+RACECHRONO = """This file is created using RaceChrono v7.0.6 ( http://racechrono.com/ ).
+Format,3
+Session title,"Track"
+
+timestamp,fragment_id,elapsed_time,speed,speed,lateral_acc
+unix time,,s,m/s,m/s,G
+,,,100: gps,calc,
+1600000000.00,0,0.0,10.0,10.1,0.1
+1600000000.10,0,0.1,10.2,10.3,0.2
+"""
+DATABASE = parse_dbc('BO_ 170 Wheels: 2 X\n SG_ Speed : 0|16@1+ (0.01,0) [0|0] "km/h" X\n')
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(("name", "text"), [("a.vbo", VBO), ("a.txt", VBO), ("a.csv", VBO), ("b.csv", CSV_OF_VBO)])
+def test_vbo_is_recognised_with_its_own_units(tmp_path: Path, name: str, text: str) -> None:
+    recording = read_source(write(tmp_path / name, text), None, None)
+    assert recording.signals["latitude"].values[0] == pytest.approx(60.175)
+    assert recording.signals["longitude"].values[0] == pytest.approx(18.005)
+    assert recording.signals["speed"].unit == "km/h"
+    assert recording.signals["LongAcc"].unit == "g"
+    assert recording.signals["LongAcc"].t[-1] == pytest.approx(0.02), "hhmmss, over the full minute"
+    assert recording.notes
+
+
+@pytest.mark.parametrize(("name", "text"), [("a.csv", GVRET), ("a.trc", TRACE)])
+def test_can_frames_in_text_are_decoded(tmp_path: Path, name: str, text: str) -> None:
+    recording = read_source(write(tmp_path / name, text), None, DATABASE)
+    speed = recording.signals["Wheels.Speed"]
+    assert np.allclose(speed.values, [100.0, 100.01])
+    assert np.allclose(speed.t, [0.0, 0.01])
+
+
+def test_can_frames_in_text_need_a_database(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="dbc"):
+        read_source(write(tmp_path / "a.csv", GVRET), None, None)
+
+
+def test_racechrono_keeps_units_and_sources(tmp_path: Path) -> None:
+    recording = read_source(write(tmp_path / "a.csv", RACECHRONO), None, None)
+    assert recording.start_ns == 1_600_000_000_000_000_000
+    assert recording.signals["lateral_acc"].unit == "G"
+    assert np.allclose(recording.signals["speed"].values, [10.0, 10.2])
+    assert np.allclose(recording.signals["speed calc"].values, [10.1, 10.3])
+
+
+@pytest.mark.parametrize("title", ["# time(s)", "INS_time_sec", "Time [s]"])
+def test_a_column_of_time_is_found_by_its_word(tmp_path: Path, title: str) -> None:
+    recording = read_source(write(tmp_path / "a.csv", f"{title},ax\n0.0,1.0\n0.1,2.0\n"), None, None)
+    assert np.allclose(recording.signals["ax"].t, [0.0, 0.1])
+
+
+def test_an_openpilot_log_is_refused_with_a_way_out(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="openpilot"):
+        read_source(write(tmp_path / "rlog.zst", "x"), None, None)
+
+
+def test_a_draft_without_known_signals_is_an_error_that_lists_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = write(tmp_path / "a.csv", "time,foo,bar\n0.0,1.0,2.0\n0.1,2.0,3.0\n")
+    assert main(["import", str(source), "--out", str(tmp_path / "o.parquet")]) == 2
+    said = capsys.readouterr().err
+    assert "bar, foo" in said
+    assert not list(tmp_path.glob("*.profile.json"))
+
+
+def test_an_unfinished_measurement_is_read(tmp_path: Path) -> None:
+    asammdf = pytest.importorskip("asammdf")
+    whole = tmp_path / "whole.mf4"
+    with asammdf.MDF(version="4.10") as file:
+        t = np.arange(5) * 0.1
+        file.append([asammdf.Signal(np.arange(5.0), t, name="ax", unit="m/s^2")])
+        file.save(whole)
+    data = bytearray(whole.read_bytes())
+    data[:8] = b"UnFinMF "
+    (tmp_path / "cut.mf4").write_bytes(data)
+    recording = read_source(tmp_path / "cut.mf4", None, None)
+    assert np.allclose(recording.signals["ax"].values, np.arange(5.0))
+
+
+def test_libraries_do_not_report_what_nobody_asked(tmp_path: Path) -> None:
+    read_source(write(tmp_path / "a.trc", ";$FILEVERSION=1.1\n1)  10.0  Rx  00AA  2  10 27\n"), None, DATABASE)
+    assert not logging.getLogger("can").isEnabledFor(logging.INFO)
+    assert not logging.getLogger("numexpr").isEnabledFor(logging.INFO)
