@@ -29,10 +29,13 @@ TWICE_SHARE: Final = 0.03
 CELL: Final = cell_numbers()
 
 
-def rows_of(v: Visits) -> dict[str, Any]:
-    """Visits as columns of the archive, as far as the fusion reads them; every row is a batch of its own."""
+def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
+    """Visits as columns of the archive, as far as the fusion reads them; every row is a batch of its own.
+
+    `cells` are the grid's numbers of the visits' places.
+    """
     n, nan = len(v), np.full(len(v), np.nan, np.float32)
-    cell, used = CELL[v.place], v.reports.used.astype(np.float32)
+    cell, used = cells[v.place], v.reports.used.astype(np.float32)
     along, across = (used * np.array(part, np.float32)[v.reports.manoeuvre] for part in ((1, -1, 0, 0), (0, 0, 1, -1)))
     order = np.lexsort((v.seconds, v.vehicle))
     seq = np.empty(n, np.int64)
