@@ -47,7 +47,6 @@ def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
         "yaw": np.zeros(n, np.float32), "position_std": np.full(n, 1.5, np.float32), "boot": v.vehicle + 1,
         "region": grid.region_of(cell), "seq": seq, "row": np.zeros(n, np.int32), "with_likelihood": np.ones(n, bool),
         "log_likelihood": mugrid.encode_log_likelihood(v.reports.log_likelihood),
-        "tyre_season": np.zeros(n, np.int8),
         "used_longitudinal": along, "used_lateral": across, "mu": nan, "mu_lower": nan, "mu_upper": nan,
         "mu_utilised": used,
     }  # fmt: skip

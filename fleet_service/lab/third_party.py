@@ -97,9 +97,9 @@ def observe(drive: Drive) -> Observations:
 
 
 def place_fixes(rng: Generator, place: IntArray) -> IntArray:
-    """Return the cells in which visits to cells (n,) are reported: fixes err by FIX_STD_M along the road."""
-    offset = rng.uniform(0.0, CELL_M, len(place)) + FIX_STD_M * rng.normal(size=len(place))
-    found = place + np.clip(np.floor(offset / CELL_M).astype(np.int64), -1, 1)
+    """Return the cells in which visits to the middles of cells (n,) are reported: fixes err by FIX_STD_M."""
+    offset = 0.5 * CELL_M + FIX_STD_M * rng.normal(size=len(place))
+    found = place + np.floor(offset / CELL_M).astype(np.int64)
     return np.where(found // LENGTH == place // LENGTH, found, place)
 
 
@@ -250,7 +250,7 @@ def count_cold(rng: Generator) -> int:
     manoeuvre = rng.integers(0, MANOEUVRES, n)
     passes = agent.Passes(who, mu, agent.COMMON * rng.normal() + 0.0 * mu, share, rng.normal(size=n), manoeuvre, sure)
     reports = agent.report(rng, agent.Errors.draw(rng, n), passes)
-    seconds: FloatArray = COLD_GAP_S * who
+    seconds = np.asarray(COLD_GAP_S * who, np.float64)
     o = observations_of(rows_of(Visits(seconds, who, along, mu, sure, reports)), who)
     fusion = Fusion(LATENESS_S)
     alerts = Alerts(fusion)
