@@ -211,7 +211,7 @@ def ice_evidence(entries: RecordArray, entry: int) -> float:
     max over μ ≥ SLIPPERY, r ≤ μ of L(r)·exp(-½·((μ - r)/d(μ))²), where L has the maximum one.
     """
     evidence, used = entries[entry].evidence, entries[entry].used / USED
-    least = 1e9
+    least = math.inf
     for i in range(_GRIP_BIN, mugrid.BINS):
         road = mugrid.CENTRES[i]
         doubt = min(max(c.ALERT_SLOPE * (c.SHARED_SHARE - used / road), 0.0), c.ALERT_MOST) * road

@@ -45,7 +45,7 @@ FRICTIONS: Final = (0.1, 0.2, 0.35, 0.5, 0.7, 0.9, 1.0)
 ICE: Final = 0.25  # truths below it count as ice
 MINUTES: Final = 40
 VISITS: Final = 15  # per cell
-EXCITED: Final = 0.5  # share of the visits
+HARD_VISITS: Final = 0.5  # share of the visits
 SHARE: Final = (0.75, 0.97)  # of the grip, used in an excited visit
 GENTLE: Final = (0.03, 0.12)  # ... and in any other
 NOISE: Final = 0.08
@@ -63,7 +63,7 @@ COLD_SEEDS: Final = 30  # fleets that a service of two minutes does not know
 COLD_GAP_S: Final = 5.0
 
 
-class Drive(NamedTuple):
+class ForeignDrive(NamedTuple):
     """Visits, the friction of each cell at each visit's road, and the cells' numbers on the grid."""
 
     visits: Visits
@@ -89,7 +89,7 @@ def report(rng: Generator, gain: FloatArray, vehicle: IntArray, mu: FloatArray, 
     )
 
 
-def observe(drive: Drive) -> Observations:
+def observe(drive: ForeignDrive) -> Observations:
     """Return the drive's visits as the service takes them: without a single optional column."""
     rows = rows_of(drive.visits, drive.cells)
     rows["used_longitudinal"] = rows["used_lateral"] = np.full(len(drive.visits), np.nan, np.float32)
@@ -103,18 +103,18 @@ def place_fixes(rng: Generator, place: IntArray) -> IntArray:
     return np.where(found // LENGTH == place // LENGTH, found, place)
 
 
-def drive_honest(rng: Generator, gain_std: float) -> tuple[Drive, FloatArray]:
+def drive_honest(rng: Generator, gain_std: float) -> tuple[ForeignDrive, FloatArray]:
     """Return an honest fleet's drive, and the friction of each cell (CELLS,)."""
     mu = np.repeat(rng.choice(FRICTIONS, CELLS // STRETCH), STRETCH)
     n = CELLS * VISITS
     place = np.repeat(np.arange(CELLS), VISITS)
     seconds = rng.uniform(0.0, 60.0 * MINUTES, n)
     vehicle = rng.integers(0, VEHICLES, n)
-    excited = rng.random(n) < EXCITED
+    excited = rng.random(n) < HARD_VISITS
     reports = report(rng, gain_std * rng.normal(size=VEHICLES), vehicle, mu[place], excited)
     order = np.argsort(seconds, kind="stable")
     visits = Visits(seconds, vehicle, place_fixes(rng, place), mu[place], excited, reports)
-    return Drive(take(visits, order), cell_numbers(CELLS)), mu
+    return ForeignDrive(take(visits, order), cell_numbers(CELLS)), mu
 
 
 def take(v: Visits, rows: IntArray) -> Visits:
@@ -168,7 +168,7 @@ def share_of(cells: BoolArray) -> float:
     return float(cells.mean()) if len(cells) else float("nan")
 
 
-def drive_change(rng: Generator, excitement: float) -> Drive:
+def drive_change(rng: Generator, excitement: float) -> ForeignDrive:
     """Return a drive over cells that are DRY, then WHITE, then DRY again, in a town where the same fleet drives.
 
     The changing cells come first; the honest fleet's cells, with its visits for as long, come after them.
@@ -188,7 +188,7 @@ def drive_change(rng: Generator, excitement: float) -> Drive:
     cells = np.concatenate(
         [roads[: CHANGE_CELLS * CHANGE_STRETCH : CHANGE_STRETCH], roads[CHANGE_CELLS * CHANGE_STRETCH :]]
     )
-    return Drive(Visits(seconds, vehicle, place, mu, excited, reports), cells)
+    return ForeignDrive(Visits(seconds, vehicle, place, mu, excited, reports), cells)
 
 
 def count_passes(rng: Generator, excitement: float) -> tuple[IntArray, IntArray]:
