@@ -31,7 +31,7 @@ from fleet_service.archive.pseudonyms import Pseudonyms
 from fleet_service.archive.segments import Rows
 from fleet_service.archive.witnesses import mend
 from fleet_service.fusion import observations_of
-from fleet_service.fusion.standing import ERRORS, unknown
+from fleet_service.fusion.standing import UNCORRECTED
 from fleet_service.fusion.weather import Reports
 from fleet_service.ingest.acks import Acks
 from fleet_service.ingest.budgets import NewCells, Tracks
@@ -257,10 +257,10 @@ class Engine:
                 self._tiles.acknowledge()
         n = len(rows["row"])
         rows["late"], rows["late_by"] = np.ones(n, bool), np.zeros(n, np.int64)
-        rows["weight"], error = np.zeros(n, np.float32), unknown(n)
+        rows["weight"] = np.zeros(n, np.float32)
         rows["late"][heard], rows["late_by"][heard] = updated.late, updated.late_by
-        rows["weight"][heard], error[heard] = updated.weight, updated.error
-        rows |= dict(zip(ERRORS, error.T, strict=True))
+        rows["weight"][heard] = updated.weight
+        rows |= {name: np.full(n, value, np.float32) for name, value in UNCORRECTED.items()}
         self.counts["late"] += int(updated.late.sum())
         if updated.late.any():
             missed = np.zeros(n, bool)

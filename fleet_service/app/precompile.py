@@ -65,6 +65,6 @@ def _visits(time: int, cells: int) -> Observations:
     return Observations(
         time=time * one, cell=number, sector=sector, second=(sector - 1).astype(np.int8),
         vehicle=number % 2, boot=one, region=one, sequence=number, evidence=flat.steps, reported=flat.reported,
-        used=np.full(cells, 0.9, np.float32), manoeuvre=np.full(cells, -1, np.int8), tyre=np.zeros(cells, np.int8),
+        used=np.full(cells, 0.9, np.float32), manoeuvre=np.full(cells, -1, np.int8),
         other=np.full((cells, 1), -1), other_share=np.zeros((cells, 1), np.float32),
     )  # fmt: skip

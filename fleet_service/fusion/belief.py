@@ -4,8 +4,8 @@ Legend
     p    belief about what the fleet takes the road for: probability of each bin (32,)
     q    a belief at rest: its bins in 16 bits, the largest 65 535               (32,)
     L    likelihood of one visit, from its bytes                                (32,)
-    B    bias kernel: B[i, j] = P(the vehicle takes μ_i·(1 + b) for μ_j)        (32, 32), rows sum to 1
-    L̃    B·L over its mean: the vote of a vehicle whose bias is known so well    (32,)
+    B    bias kernel: B[i, j] = P(the vehicle takes μ_i for μ_j)                (32, 32), rows sum to 1
+    L̃    B·L over its mean: the vote of a vehicle with an error of its own       (32,)
     s    strength of a vote: what part of it is new, trusted and surely here    [-]
     h    P(the road changed since), 1 - exp(-Δt / CHANGE_S)                     [-]
 
@@ -15,13 +15,12 @@ Arithmetic is in single precision, half as long as double: a belief is a guess o
 from __future__ import annotations
 
 import math
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.standing import BIAS_STDS, SPREADS
 from schemas import mugrid
 from schemas.numeric import ByteArray, Float32Array, FloatArray
 from schemas.runtime.jit import compiled, refcount_free_inlined
@@ -34,11 +33,7 @@ _BINS: Final = mugrid.BINS
 _DIFFUSION: Final = 0.5 * (c.DRIFT_PER_ROOT_HOUR / c.BIN_WIDTH) ** 2 / 3600.0  # bins² per second, half the variance
 _STEP: Final = 0.25  # largest share that leaves a bin to each side in one diffusion step: stable and without ripple
 _STEPS: Final = 64  # one day; by then the change hazard has levelled everything
-# exp(-steps) of senders whose values scatter by another factor than they state: the likelihood's power 1/κ².
-_LIKELIHOOD: Final = np.stack(
-    [np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT / spread**2) for spread in SPREADS]
-).astype(np.float32)  # fmt: skip
-_AS_STATED: Final = SPREADS.index(1.0)
+_LIKELIHOOD: Final = np.exp(-np.arange(256) / mugrid.STEPS_PER_NAT).astype(np.float32)  # of steps
 _CENTRES: Final = mugrid.CENTRES
 _PLACES: Final[Float32Array] = mugrid.CENTRES.astype(np.float32)
 _EDGE: Final = (c.SLIPPERY - mugrid.LOWER) / c.BIN_WIDTH
@@ -50,17 +45,17 @@ _LEAST_TAP: Final = 1e-9  # single precision has numbers below 1e-38 that cost a
 PADDED: Final = _BINS + 2 * REACH
 
 
-def bias_kernel(std: float = c.BIAS_RELATIVE) -> FloatArray:
-    """B of one vehicle's own error about its bias: a normal of hypot(std·μ, BIAS_ABSOLUTE), cut at REACH."""
-    spread = np.hypot(std * _CENTRES, c.BIAS_ABSOLUTE)[:, None]
+def bias_kernel() -> FloatArray:
+    """Return B of one vehicle's own error: a normal of hypot(BIAS_RELATIVE·μ, BIAS_ABSOLUTE), cut at REACH."""
+    spread = np.hypot(c.BIAS_RELATIVE * _CENTRES, c.BIAS_ABSOLUTE)[:, None]
     kernel = np.exp(-0.5 * np.square((_CENTRES[None, :] - _CENTRES[:, None]) / spread))
     kernel[np.abs(np.subtract.outer(np.arange(_BINS), np.arange(_BINS))) > REACH] = 0.0
     return np.asarray(kernel / kernel.sum(axis=1, keepdims=True))
 
 
-def _taps(std: float) -> Float32Array:
+def _taps() -> Float32Array:
     """B by diagonals: (2·REACH + 1, 32), so that bins stand beside each other."""
-    kernel, taps = bias_kernel(std), np.zeros((2 * REACH + 1, _BINS), np.float32)
+    kernel, taps = bias_kernel(), np.zeros((2 * REACH + 1, _BINS), np.float32)
     for i in range(_BINS):
         for j in range(max(i - REACH, 0), min(i + REACH + 1, _BINS)):
             taps[j - i + REACH, i] = kernel[i, j]
@@ -68,7 +63,7 @@ def _taps(std: float) -> Float32Array:
     return taps
 
 
-_TAPS: Final = np.stack([_taps(std) for std in BIAS_STDS])
+_TAPS: Final = _taps()
 
 
 @compiled
@@ -187,50 +182,26 @@ def kind_of(evidence: ByteArray) -> int:
     return VALUE if evidence[_BINS - 1] >= int(least) + c.VALUE_DROP_STEPS else BOUND
 
 
-class OwnError(NamedTuple):
-    """What is known of the error of a vote's vehicle: relative bias, place in BIAS_STDS and in SPREADS, slope, and the
-    grip it used."""
-
-    bias: float
-    bias_class: int
-    spread_class: int
-    slope: float
-    used: float
-
-
 @refcount_free_inlined
-def convolve_bias(evidence: ByteArray, kind: int, own: OwnError, padded: Bins, out: Bins) -> None:
+def convolve_bias(evidence: ByteArray, kind: int, padded: Bins, out: Bins) -> None:
     """L̃ of a visit into `out` (32), mean 1. The fall of a BOUND above its maximum is noise and is levelled.
 
-    On a road μ of which it used less than all, a vehicle reads (1 + b)·(μ - slope·(μ - used)). A bound has no error:
-    whatever smoothed its step would let many of them climb above what anybody used. `padded` (PADDED) must hold zeros
-    in its first and last REACH places.
+    A bound has no error: whatever smoothed its step would let many of them climb above what anybody used. `padded`
+    (PADDED) must hold zeros in its first and last REACH places.
     """
     if kind == VALUE:
-        table = _LIKELIHOOD[own.spread_class]
-        if own.bias == 0.0 and own.slope == 0.0:
-            for j in range(_BINS):
-                padded[REACH + j] = table[evidence[j]]
-        else:  # L of what is read there, between the bins
-            for j in range(_BINS):
-                road = _CENTRES[j]
-                reading = (1.0 + own.bias) * (road - own.slope * max(road - own.used, 0.0))
-                place = (reading - mugrid.LOWER) / c.BIN_WIDTH - 0.5
-                place = min(max(place, 0.0), _BINS - 1.0)
-                left = min(int(place), _BINS - 2)
-                part = np.float32(place - left)
-                padded[REACH + j] = table[evidence[left]] + part * (table[evidence[left + 1]] - table[evidence[left]])
-        taps = _TAPS[own.bias_class]
+        for j in range(_BINS):
+            padded[REACH + j] = _LIKELIHOOD[evidence[j]]
         for i in range(_BINS):
-            here = np.float32(0.0)
+            whole = np.float32(0.0)
             for k in range(2 * REACH + 1):
-                here += taps[k, i] * padded[i + k]
-            out[i] = here
+                whole += _TAPS[k, i] * padded[i + k]
+            out[i] = whole
     else:
         steps = np.uint8(255)
         for j in range(_BINS):
             steps = min(steps, evidence[j])
-            out[j] = _LIKELIHOOD[_AS_STATED, steps]
+            out[j] = _LIKELIHOOD[steps]
     scale = np.float32(_BINS) / np.float32(total(out))
     for i in range(_BINS):
         out[i] *= scale

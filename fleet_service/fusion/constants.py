@@ -14,20 +14,14 @@ BIN_WIDTH: Final = (mugrid.UPPER - mugrid.LOWER) / mugrid.BINS
 CONTAMINATION: Final = 0.15
 
 # A vehicle's own error: tyres, mass and stiffness off by a few per cent move all its values the same way. It does not
-# average out over its visits, so it widens every vote; only other vehicles narrow it.
+# average out over its visits, so it widens every vote; only other vehicles narrow it. It is not learned per vehicle: on
+# three tuning towns a fleet and three tuning ways that changed interval scores by 3 % (half biased fleet: 7 %).
 BIAS_RELATIVE: Final = 0.05
 BIAS_ABSOLUTE: Final = 0.01  # .015 of a vehicle, less what half a bin adds by itself
 
 # A vehicle that agreed with many others is wrong as seldom as it was found wrong, but never less than this: fixes in
 # the wrong cell, and what a sensor does that never failed before.
 CONTAMINATION_LEAST: Final = 0.04
-# No bias is believed beyond this, about three standard deviations of tyres, mass and radius together.
-BIAS_MOST: Final = 0.15
-BIAS_KNOWN_LEAST: Final = 0.03  # ... nor to be known better: tyres warm up and wear, loads change
-FLEET_BIAS: Final = 0.06  # standard deviation of the fleet's biases, before anybody was met
-# ... of those of one kind of tyres against others: on wet and cold road summer and winter tyres differ by a tenth.
-TYRE_BIAS: Final = 0.05
-TYRE_SLOPE_STD: Final = 0.15  # ... and of its slope about the fleet's: blocks and sipes make a tread softer
 
 # An error that all vehicles of a place share (the same manoeuvre, the same tyre model, the same ruts) does not average
 # out however many they are; see `shared`. Without a value:
@@ -44,36 +38,26 @@ COMMON_ALWAYS: Final = 0.02
 COMMON_MANOEUVRE: Final = 0.05
 # ... and with the shape of the tyre, where less than SHARED_SHARE of a road's grip was used: relative, downward.
 SHARED_SHARE: Final = 0.8
-# More for it costs: with a slope of .5 the interval score of three rough ways after twenty minutes was .63 and not .55.
-SHARED_SLOPE: Final = 0.25
-SHARED_MOST: Final = 0.2
-# ... and where the slope of the fleet's values has been found (SLOPE_KNOWN), what is left of the doubt: one slope
-# is not right for every tyre and surface.
-SHARED_KNOWN_SLOPE: Final = 0.1
-# ... but who raises an alarm bears more doubt: with the map's own slope 3 fleets of 12 that took a wet curve gently, on
-# winter tyres, made a false alert, with this none. The most of it decides how much ice stays without an alert in a
-# clean fleet (of cell-minutes, three towns): none with .23, where 1 fleet of 12 was false; .02 with .26; .06 with .35.
+# It is as much as vehicles differ from themselves with the grip that they use, and SHAPE_DOUBT for tyres and
+# surfaces of other shapes. It widens intervals upwards and corrects no value.
+SHARED_MOST: Final = 0.25
+SHAPE_DOUBT: Final = 0.1
+SHAPE_PRIOR: Final = 0.15
+SHAPE_STD: Final = 0.15  # so sure is that: as some twenty comparisons
+SHAPE_MEMORY: Final = 300.0  # squares by weight beyond which old ones count half: some two hundred comparisons
+# An alarm bears more doubt. Of 60 tuning fleets that took a wet curve gently, on winter tyres, 8 made a false alert
+# with .25, 3 with .275 and 2 with .3 as the most of it; ice without an alert in a clean fleet: .010, .037, .070.
 ALERT_SLOPE: Final = 0.5
-ALERT_MOST: Final = 0.25
-# ... but not where so many vehicles with a record told of the ice and the slope of the fleet's values is known so well:
-# with the doubt for all, ice stayed without an alert in 1.1 % of a clean fleet's cell-minutes, and so in .2 %. A record
-# alone is not enough: sixty who do the same agree among each other, and 5 of 20 such fleets made a false alert.
-KNOWN_SOURCES: Final = 2
-SLOPE_KNOWN: Final = 0.05
+ALERT_MOST: Final = 0.275
 SHARED_LEAST: Final = 0.25  # share of a full weight, by its root, that a gentle value has at least
 SHARED_WIDE: Final = 0.1  # relative standard deviation at which a value has half the weight of a sharp one
-SHARED_PART: Final = 0.2  # of the stated variance that does not show between who did the same
+SHARED_PART: Final = 0.1  # of the stated variance: errors that vehicles of a place have in common
 SHARED_ALWAYS: Final = 0.5  # part of what is shared that other manoeuvres do not average out: correlations .6 and .4
 
-# What slippery neighbours tell, see `neighbours`: P(the next cell has the same surface). A stretch is then five cells
-# long on average: patches of ice are some 40 m, drawn towns' surfaces five to ten cells. The interval score of five
-# tuning ways was .59, .59, .58 with .75, .8, .85; the next surface begins within four cells in the campaign's towns.
-SAME_SURFACE: Final = 0.8
-NEIGHBOURS: Final = 4  # cells before and behind that may tell: .4 of a message is left
-# ... and it tells in the measure in which it is slippery with more than this, the prior's and a little. Counting what
-# lies up to .5 as half slippery told more of snow of .39, but winter tyres that read wet road a little low told each
-# other of ice: the worst bin of P(slippery) of that fleet was .25, and so it is .05.
-NEIGHBOUR_SURE: Final = 0.35
+# What slippery neighbours tell, see `neighbours`: P(the next cell has the same surface). Of three tuning ways the Brier
+# score of P(slippery) was .0526 with .8, .0471 with .9.
+SAME_SURFACE: Final = 0.9
+NEIGHBOURS: Final = 4  # cells before and behind that may tell
 NEIGHBOUR_GRIP: Final = 0.1  # a neighbour that is slippery with less than this ends the stretch
 DECIDED: Final = 0.001  # a cell with so little doubt is not asked again: three messages are worth some thousand
 
@@ -157,28 +141,6 @@ TRUST_PRIOR: Final = 0.85
 TRUST_PRIOR_PEERS: Final = 8.0
 TRUST_NONE: Final = 0.7
 TRUST_FULL: Final = 0.9
-# How much too low a value is for each μ that was left, before the fleet told. Only values that state less than this
-# relative variance (a standard deviation of 17 %) tell: others have the tyre's shape in what they state.
-SHAPED_VARIANCE: Final = 0.03
-USED_NOISE: Final = 0.04  # of the grip used, relative: as much less of its differences' squares is real
-USED_NOISE_ABSOLUTE: Final = 0.02  # ... and what an accelerometer adds on any road: .2 m/s²
-SLOPE_MEMORY: Final = 300.0  # squares by weight beyond which old ones count half: some two hundred comparisons
-SLOPE_PRIOR: Final = 0.0
-SLOPE_STD: Final = 0.15  # so sure is that: as some twenty comparisons
-SLOPE_MOST: Final = 0.85  # then a value tells of little more than what was used
-BIAS_PAIR: Final = 0.04  # of a pair's mean difference: what its few meetings had in common
-BIAS_MEMORY: Final = 4000.0  # inverse variance of a pair's difference beyond which old meetings count half: some thirty
-# Only who is trusted more than anybody is at first tells of others' errors: no liar in a service's first minutes.
-TELLING_TRUST: Final = 0.85
-# Who does the same as another, with a difference of the grip used of less than so much of μ.
-ALIKE_USED: Final = 0.15
-# On three rough drives the values of who did the same scattered by .2 to .4 of the variance that they state, and erred
-# by all of it: 60 % of it was shared. So a fleet that nobody knows is taken to share half.
-SPREAD_FIRST: Final = 0.7
-SPREAD_FLOOR: Final = 0.5
-SPREAD_CEILING: Final = 3.2
-SPREAD_PRIOR: Final = 0.05  # sum of stated relative variances that is imagined as right: some five comparisons
-SPREAD_MEMORY: Final = 1.0  # ... beyond which old ones count half: some hundred
 TRUST_HEARD_LEAST: Final = 0.2  # how much a vehicle's word about others counts at least: all distrusted is no end
 # Once so many vehicles are known (met so many others, and are trusted), one that is not is a newcomer: it votes with
 # this weight, is no corroborating source, and shares one vote per cell with all others that are not trusted.
@@ -187,10 +149,10 @@ ESTABLISHED_VEHICLES: Final = 10
 NEWCOMER: Final = 0.4
 SOURCE_TRUST: Final = 0.5  # less trusted vehicles vote, but are no corroborating sources for an alert
 SOURCE_SHARE: Final = 0.6  # P(slippery) from the vote alone, against the uniform prior, that makes a source of ice
-# A vehicle without a record is a source of ice only if it used this share of what it says: sixty cars on winter tyres
-# who all took a wet curve with a third of its grip said ice, having used six tenths of that. (.75 for all, record or
-# not: 9 false alerts of 20 fleets, and ice without an alert in 5 % of cell-minutes instead of .2 %.)
-WITNESS_SHARE: Final = 0.8
+# ... and its evidence for ice against grip, in nats, with the doubt about the shape of its tyres. Of the visits to ice
+# (< .25) of two tuning ways 20 % have 1.5 nats and 12 % three; of those to wet road .6 % and .2 %, to dry road .08 %
+# and .04 %. With two instead of one, alerts of three ways found .13 of the snow instead of .17, and as much ice (.80).
+WITNESS_NATS: Final = 1.0
 # A bound is a source of grip from this much grip used on: only a dry road gives it. On the best roads values lie at
 # the grid's end and are bounds, and without them nobody would clear an alert there.
 SOURCE_USED: Final = EXCITED_SHARE

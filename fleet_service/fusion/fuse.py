@@ -16,12 +16,12 @@ from fleet_service.fusion.belief import SLIPPERY_SHARE, unpack
 from fleet_service.fusion.late import LATE_MOST_NS, delayed, fused_at
 from fleet_service.fusion.neighbours import beliefs
 from fleet_service.fusion.observations import Observations, SmallArray
-from fleet_service.fusion.shared import ALARM_KERNELS, KERNELS, KNOWN_KERNELS, kernel_of, shared_parts
-from fleet_service.fusion.standing import ERRORS, UNKNOWN, Standing, classes, first_standing, unknown
+from fleet_service.fusion.shared import ALARM_KERNELS, KERNELS, kernel_of, shape_class, shared_parts
+from fleet_service.fusion.standing import Standing, first_standing
 from fleet_service.fusion.store.cells import Cells
-from fleet_service.fusion.store.records import ICE, LATE, NOBODY, NONE, USED, Rows
+from fleet_service.fusion.store.records import NOBODY, NONE, USED, Rows
 from fleet_service.fusion.store.store import Store, distinct
-from fleet_service.fusion.trust import initial_trust, judged, slope_std
+from fleet_service.fusion.trust import initial_trust, judged, shape_of
 from fleet_service.fusion.weather import Reports, Weather, no_reports, weather_of
 from fleet_service.fusion.window import Arrivals, Votes, absorb, commit
 from schemas import grid
@@ -30,8 +30,8 @@ from schemas.runtime.jit import compiled
 from schemas.thresholds import NS
 
 _ANY: Final = 1 << 62
-# What each bin of a belief adds to P(slippery) of the road, and to all of the road: (kernels, 2, 32).
-SLIPPERY_WEIGHTS: Final = np.stack([KERNELS @ SLIPPERY_SHARE, KERNELS.sum(axis=2, dtype=float)], axis=1)
+# What each bin of a belief adds to P(slippery) of the road, and to all of it, by the fleet's shape: (kernels, 2, 32).
+SLIPPERY_WEIGHTS: Final = tuple(np.stack([k @ SLIPPERY_SHARE, k.sum(axis=2, dtype=float)], axis=1) for k in KERNELS)
 
 
 class Updated(NamedTuple):
@@ -41,14 +41,12 @@ class Updated(NamedTuple):
         late: whether each came after the checkpoint, or was one too many and so not fused.
         late_by: how much later than its own a late one was fused [ns]; 0 for one in time or not fused.
         weight: that was used; 0 where nothing was fused.
-        error: own error of its vehicle that was used, (n, 4), see `standing`.
         slots: that changed, (k,).
     """
 
     late: BoolArray
     late_by: IntArray
     weight: Float32Array
-    error: Float32Array
     slots: IntArray
 
 
@@ -58,7 +56,6 @@ class Before(NamedTuple):
     late: BoolArray
     late_by: IntArray
     weight: Float32Array
-    error: Float32Array
 
 
 class Fusion:
@@ -81,13 +78,13 @@ class Fusion:
         self.standings: list[Standing] = [first_standing(initial_trust(False))]
         self.reports: Reports = no_reports()
         self._weather: Weather = weather_of(self.reports)
-        self._shape_known = False
+        self._shape = shape_class(c.SHAPE_PRIOR)
 
     def resume(self, epoch: int | None, standings: list[Standing], reports: Reports) -> None:
         """Go on from an epoch, the standings since, and the weather; the store is set before."""
         self._epoch, self.standings, self.reports = epoch, standings, reports
         self._weather = weather_of(reports)
-        self._shape_known = self._knows_shape()
+        self._find_shape()
 
     @property
     def epoch(self) -> int:
@@ -139,7 +136,7 @@ class Fusion:
             before: what `Updated` held the first time, when an archive is replayed.
         """
         n = len(o.time)
-        used, error = np.zeros(n, np.float32), unknown(n)
+        used = np.zeros(n, np.float32)
         if before is None:
             checkpoint = np.iinfo(np.int64).min if self.checkpoint is None else self.checkpoint
             late = o.time < checkpoint
@@ -156,16 +153,16 @@ class Fusion:
             self._advance(e)
             rows = np.flatnonzero((epoch == e) & ~left)
             if before is None:
-                standing = self._standing(e)
-                used[rows], error[rows] = standing.weights(vehicle[rows]), standing.errors(vehicle[rows], o.tyre[rows])
+                used[rows] = self._standing(e).weights(vehicle[rows])
             else:
-                used[rows], error[rows] = before.weight[rows], before.error[rows]
-            arrivals = _arrivals(o, vehicle, used, error, old)
+                used[rows] = before.weight[rows]
+            arrivals = _arrivals(o, vehicle, used, old)
             slots, left_out = self._absorb(o, rows, arrivals, c.WAITING_MOST if before is None else _ANY)
             touched.append(slots)
             late, left = late | left_out, left | left_out
-        used[left], error[left], late_by = 0.0, np.array(UNKNOWN, np.float32), np.where(left, 0, late_by)
-        return Updated(late, late_by, used, error, distinct(np.concatenate(touched)))
+        used[left] = 0.0
+        late_by = np.where(left, 0, late_by)
+        return Updated(late, late_by, used, distinct(np.concatenate(touched)))
 
     def untouched(self, before: int) -> BoolArray:
         """Slots (size,) of which nobody told anything since `before` [ns]; see `drop`."""
@@ -188,35 +185,19 @@ class Fusion:
     def beliefs(self, slots: IntArray, now: int) -> FloatArray:
         """Belief of each slot about its road, (k, 32), with what time did to it until `now` [ns], and with what
         slippery neighbours tell of it."""
-        return self._read(self._kernels(), slots, np.full(len(slots), now))
+        return self._read(KERNELS[self._shape], slots, np.full(len(slots), now))
 
     def believed(self, slots: IntArray) -> FloatArray:
         """Belief of each slot about its road, (k, 32), at its last observation."""
-        return self._read(self._kernels(), slots, self.live.time[slots])
+        return self._read(KERNELS[self._shape], slots, self.live.time[slots])
 
     def slippery(self, slots: IntArray) -> FloatArray:
         """P(slippery) of each slot's road at its last observation by its own reports alone, (k,)."""
-        return _slippery(self.store.state.live, SLIPPERY_WEIGHTS, slots)
+        return _slippery(self.store.state.live, SLIPPERY_WEIGHTS[self._shape], slots)
 
     def alarming(self, slots: IntArray) -> FloatArray:
-        """As `believed`, with the doubt about gentle values that an alarm has to bear, see `shared`.
-
-        Where the slope of the fleet's values is known, and KNOWN_SOURCES vehicles with a record told of ice within the
-        hour, there is no more doubt than the map has.
-        """
-        if not len(slots) or not self._shape_known:
-            return self._read(ALARM_KERNELS, slots, self.live.time[slots])
-        hour = self.live.time[slots] - int(c.VOTE_RENEWAL_S * NS)
-        known = self.sources(slots, ICE, hour, least=c.TELLING_TRUST)[0] >= c.KNOWN_SOURCES
-        doubtful = self._read(ALARM_KERNELS, slots, self.live.time[slots])
-        return np.where(known[:, None], self.believed(slots), doubtful)
-
-    def _knows_shape(self) -> bool:
-        """Whether the slope of the fleet's values has been found; it moves with the standing."""
-        return slope_std(self.store.peers, self.standings[-1]) <= c.SLOPE_KNOWN
-
-    def _kernels(self) -> Float32Array:
-        return KNOWN_KERNELS if self._shape_known else KERNELS
+        """As `believed`, with the doubt about gentle values that an alarm has to bear, see `shared`."""
+        return self._read(ALARM_KERNELS, slots, self.live.time[slots])
 
     def _read(self, kernels: Float32Array, slots: IntArray, now: IntArray) -> FloatArray:
         return beliefs(self.store.state.live, self.store.table, self._weather, kernels, slots, now)
@@ -229,30 +210,22 @@ class Fusion:
         """Weight of a vehicle's next vote."""
         return float(self.standings[-1].weights(self._index(vehicle))[0])
 
-    def error(self, vehicle: int) -> dict[str, float]:
-        """What is known of a vehicle's own error, see `standing`."""
-        index = self._index(vehicle)
-        tyre = np.append(self.store.peers["tyre"][: self.store.vehicles], 0)[index]
-        return dict(zip(ERRORS, self.standings[-1].errors(index, tyre)[0].tolist(), strict=True))
-
     def _index(self, vehicle: int) -> IntArray:
         index = self.store.known(np.array([vehicle]))
         return np.where(index < 0, self.store.vehicles, index)
 
-    def sources(
-        self, slots: IntArray, side: int, since: IntArray | int, least: float = c.SOURCE_TRUST
-    ) -> tuple[IntArray, IntArray]:  # fmt: skip
-        """Corroborating sources: vehicles that reported GRIP or ICE of slots (k,) after `since` [ns] and are still
-        trusted, `least` at least; how many, and when the last did.
+    def sources(self, slots: IntArray, side: int, since: IntArray | int) -> IntArray:
+        """Return when corroborating sources of slots (k,) reported, the newest first, (k, SOURCES) [ns].
 
-        At most SOURCES are remembered; the last time [ns] is 0 where there is none.
+        A source is a vehicle, still trusted, that reported GRIP or ICE there after `since` [ns]. At most SOURCES are
+        remembered; 0 stands for none.
         """
         row, reporters = self.live.reporters[slots], self.store.state.live.reporters
         who = np.where(row[:, None] == NONE, NOBODY, reporters["source"][row, side])
         when = reporters["source_time"][row, side].astype(np.int64) * NS
-        trust = self.standings[-1].weights(np.maximum(who, 0)) >= least
-        counted = (who != NOBODY) & trust & (when > np.reshape(since, (-1, 1)))
-        return counted.sum(axis=1), np.where(counted, when, 0).max(axis=1)
+        trusted = self.standings[-1].weights(np.maximum(who, 0)) >= c.SOURCE_TRUST
+        counted = (who != NOBODY) & trusted & (when > np.reshape(since, (-1, 1)))
+        return -np.sort(-np.where(counted, when, 0), axis=1)
 
     def _standing(self, epoch: int) -> Standing:
         return next(found for found in reversed(self.standings) if found.epoch <= epoch or found.epoch < 0)
@@ -271,10 +244,12 @@ class Fusion:
             last = self.standings[-1]
             joined = store.vehicles - len(last.weight)
             weight = np.append(last.weight, np.full(joined, initial_trust(False), np.float32))
-            error = last.errors(np.arange(store.vehicles), store.peers["tyre"][: store.vehicles])
-            standing = judged(store.peers, last._replace(weight=weight, error=error), self._epoch)
+            standing = judged(store.peers, last._replace(weight=weight), self._epoch)
             self.standings = [self.standings[0], *self.standings[1:][-self._kept_epochs :], standing]
-            self._shape_known = self._knows_shape()
+            self._find_shape()
+
+    def _find_shape(self) -> None:
+        self._shape = shape_class(shape_of(self.store.peers, self.standings[-1].weight))
 
     def _absorb(
         self, o: Observations, rows: IntArray, arrivals: Arrivals, most: int
@@ -290,14 +265,11 @@ class Fusion:
         return int(times.min(initial=np.iinfo(np.int64).max, where=times > 0))
 
 
-def _arrivals(
-    o: Observations, vehicle: IntArray, weight: Float32Array, error: Float32Array, old: BoolArray
-) -> Arrivals:  # fmt: skip
+def _arrivals(o: Observations, vehicle: IntArray, weight: Float32Array, old: BoolArray) -> Arrivals:
     return Arrivals(
         time=o.time, number=o.vehicle, boot=o.boot, sequence=o.sequence, vehicle=vehicle, weight=weight,
         evidence=o.evidence, reported=o.reported, used=(np.clip(o.used, 0.0, 2.5) * USED).astype(np.uint8),
-        shared=shared_parts(o.reported, error), manoeuvre=o.manoeuvre,
-        tyre=np.where(old, LATE, o.tyre).astype(np.int8), error=classes(error),
+        shared=shared_parts(o.reported), manoeuvre=o.manoeuvre, late=old,
     )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fleet_service.fusion.belief import PackedArray
 from fleet_service.fusion.fuse import Fusion
-from fleet_service.fusion.standing import ERRORS, TYRES, Standing
+from fleet_service.fusion.standing import Standing
 from fleet_service.fusion.store.cells import no_beliefs, rows_of_lines
 from fleet_service.fusion.store.records import (
     CELL,
@@ -65,18 +65,12 @@ def image_of(fusion: Fusion) -> Image:
     image["trust"] = {
         "epoch": np.concatenate([np.full(len(standing.weight), standing.epoch) for standing in fusion.standings]),
         "weight": np.concatenate([standing.weight for standing in fusion.standings]),
-    } | {
-        name: np.concatenate([standing.error[:, k] for standing in fusion.standings])
-        for k, name in enumerate(ERRORS)
-    }  # fmt: skip
+    }
     image["trusts"] = {
         "epoch": np.array([standing.epoch for standing in fusion.standings]),
         "vehicles": np.array([len(standing.weight) for standing in fusion.standings]),
         "newcomer": np.array([standing.initial for standing in fusion.standings]),
-    } | {
-        f"{name}_{tyre}": np.array([standing.initial_error[tyre, k] for standing in fusion.standings])
-        for k, name in enumerate(ERRORS) for tyre in range(TYRES)
-    }  # fmt: skip
+    }
     reports = fusion.reports
     image["weather"] = {f.name: getattr(reports, f.name).reshape(-1) for f in fields(Reports)}
     return {name: {key: column.copy() for key, column in table.items()} for name, table in image.items()}
@@ -97,10 +91,8 @@ def fusion_of(image: Image, lateness_s: float) -> Fusion:
     fusion.store = Store.of(state, records["peers"], records["names"], size, vehicles, hour)
     ends = np.cumsum(image["trusts"]["vehicles"])[:-1]
     weights = np.split(image["trust"]["weight"], ends)
-    errors = np.split(np.stack([image["trust"][name] for name in ERRORS], axis=1), ends)
     epochs, newcomers = image["trusts"]["epoch"].tolist(), image["trusts"]["newcomer"].tolist()
-    first = np.stack([[image["trusts"][f"{name}_{tyre}"] for name in ERRORS] for tyre in range(TYRES)])
-    standings = [Standing(*of) for of in zip(epochs, weights, errors, newcomers, np.moveaxis(first, 2, 0), strict=True)]
+    standings = [Standing(*of) for of in zip(epochs, weights, newcomers, strict=True)]
     columns = {f.name: image["weather"][f.name] for f in fields(Reports)}
     columns["prior"] = columns["prior"].reshape(-1, mugrid.BINS)
     fusion.resume(None if epoch < 0 else epoch, standings, Reports(**columns))

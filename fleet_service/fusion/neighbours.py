@@ -4,15 +4,15 @@ A surface rarely ends with a cell: snow and ice lie in stretches. So a cell near
 more probably slippery than one of which nobody knows anything. Each side of a cell, before, behind, and the other
 direction of the road, sends it one message, of the neighbour there that tells most:
 
-    m_i = 1 - w + w·n_i/p₀_i,    w = SAME_SURFACE^d·max(s - s₀, 0)/(1 - s₀),    s₀ = max(NEIGHBOUR_SURE, s of p₀)
+    m_i = 1 - w + w·n_i/p₀_i,    w = SAME_SURFACE^d·max(s - s₀, 0)/(1 - s₀),    s₀ = s of p₀
 
 and the cell is read as K·(b·m·m·m) over its sum. Messages come from what a neighbour's own visitors told, never from
 what it was told, so that nothing goes round; and they are made when the map is read, so that no cell's own belief
 depends on another's. What all values share is shared with the neighbours' too: K comes last, once. Only slippery
 neighbours tell: a cell that nobody tested is not dry because others are (a message of grip would say so), and cells
-that know nothing, or read wet road a little low all together, send nothing (s < s₀). The least of m is 1 - w, .2 beside
-ice: a cell whose own visitors found grip keeps it. A neighbour with grip lets nothing past it: there the stretch has
-ended. Where nobody was but perhaps (see `space`), nothing is told.
+that know nothing send nothing (s < s₀). The least of m is 1 - w, .1 beside ice: a cell whose own visitors found grip
+keeps it. A neighbour with grip lets nothing past it: there the stretch has ended. Where nobody was but perhaps (see
+`space`), nothing is told.
 
 Source of messages: Pearl, Probabilistic Reasoning in Intelligent Systems (1988), ch. 4; here of one step.
 
@@ -46,7 +46,7 @@ from schemas.thresholds import NS
 _BINS: Final = mugrid.BINS
 _KEPT: Final[FloatArray] = np.power(c.SAME_SURFACE, np.arange(c.NEIGHBOURS + 1))
 # A belief at rest that is slippery with less tells nothing, however it is read: time takes it to the prior.
-_ASKED: Final = c.NEIGHBOUR_SURE - 0.1
+_ASKED: Final = 0.2  # the prior's .3 and what K adds to it
 _WHOLE: Final = (1 << 2 * grid.CELL_ZOOM) - 1  # all bits of a cell
 _X: Final = 0x5555555555555555 & _WHOLE  # those of its column
 _Y: Final = _WHOLE - _X
@@ -82,7 +82,7 @@ def beliefs(
         slippery = _slippery(out[k])
         if slippery < c.DECIDED or slippery > 1.0 - c.DECIDED:
             continue
-        informative, unknown = False, max(_slippery(weather.prior[prior]), c.NEIGHBOUR_SURE)
+        informative, unknown = False, _slippery(weather.prior[prior])
         key = live.cells[slots[k]].key
         cell, sector = key // grid.SECTORS, key % grid.SECTORS
         back = (sector + 2) % grid.SECTORS

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from fleet_service.fusion.likelihoods import evidence
 from fleet_service.fusion.shared import manoeuvre_of
 from fleet_service.fusion.space import other_cells
-from fleet_service.fusion.standing import TYRES
 from schemas import grid
 from schemas.numeric import BoolArray, ByteArray, Float32Array, IntArray
 
@@ -37,7 +36,6 @@ class Observations:
             `evidence`.
         used: (n,) grip used; below EXCITED_SHARE of a value where the sender does not tell.
         manoeuvre: (n,) how it was used, see `shared.manoeuvre_of`.
-        tyre: (n,) kind of the vehicle's tyres, 0 where it is not told; see `standing.TYRES`.
         other: (n, k) other cells in which the vehicle may have been instead, -1 where there is none.
         other_share: (n, k) probability that it was there; what is left belongs to `cell`.
     """
@@ -54,7 +52,6 @@ class Observations:
     reported: Float32Array
     used: Float32Array
     manoeuvre: SmallArray
-    tyre: SmallArray
     other: IntArray
     other_share: Float32Array
 
@@ -90,7 +87,6 @@ def observations_of(columns: Mapping[str, NDArray[Any]], vehicle: IntArray) -> O
         reported=reported,
         used=np.clip(np.nan_to_num(used), 0.0, USED_MOST).astype(np.float32),
         manoeuvre=manoeuvre_of(columns["used_longitudinal"], columns["used_lateral"]),
-        tyre=np.clip(columns["tyre_season"], 0, TYRES - 1).astype(np.int8),
         other=other,
         other_share=share,
     )

@@ -10,11 +10,10 @@ who uses more. So a belief is about what the *fleet* takes a road for, and whoev
     σ_c² = COMMON_ALWAYS² + COMMON_MANOEUVRE²/n_eff + σ_s²·(a + (1 - a)/n_eff),    n_eff = (Σ w_k)²/Σ w_k²
 
 The error of the shape is one-sided, since only what reads low falls enough towards the upper end to be a value. Its
-slope is SHARED_SLOPE; where the slope of the fleet's own values has been found (`standing`), SHARED_KNOWN_SLOPE.
+slope is what `trust.shape_of` finds, and SHAPE_DOUBT; for an alarm it is ALERT_SLOPE, with ALERT_MOST.
 
 A sender states all of its error, and what of that does not show between senders that do the same is what they share:
-σ_s² = SHARED_PART·(1 - κ²)·stated², relative, of the cell's values by weight; a = SHARED_ALWAYS. Where values are
-known to lie too low by a slope λ, a reading is stretched by 1/(1 - λ), and what it shares with it.
+σ_s² = SHARED_PART·stated², relative, of the cell's values by weight; a = SHARED_ALWAYS.
 
 Legend
     ū     grip used by who gave values, mean by weight
@@ -30,7 +29,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_service.fusion import constants as c
-from fleet_service.fusion.standing import SLOPE_STEP
 from fleet_service.fusion.store.records import MANOEUVRES, SHARED, USED, WEIGHT
 from schemas import mugrid
 from schemas.numeric import ByteArray, Float32Array, FloatArray
@@ -57,13 +55,12 @@ def manoeuvre_of(longitudinal: FloatArray, lateral: FloatArray) -> NDArray[np.in
     return np.where(np.isfinite(longitudinal) & np.isfinite(lateral), kind, UNKNOWN).astype(np.int8)
 
 
-def shared_parts(reported: Float32Array, error: Float32Array) -> ByteArray:
-    """σ_s of values (n, 3) of vehicles with errors (n, 4), in parts of 1/SHARED; 0 of bounds."""
+def shared_parts(reported: Float32Array) -> ByteArray:
+    """Return σ_s of values (n, 3) in parts of 1/SHARED; 0 of bounds."""
     mean, std = np.nan_to_num(reported[:, 0], nan=1.0), np.nan_to_num(reported[:, 1])
     stated = np.square(std / np.maximum(mean, mugrid.LOWER)) - c.BIAS_RELATIVE**2
-    hidden = c.SHARED_PART * np.clip(1.0 - np.square(error[:, 2]), 0.0, None) * np.clip(stated, 0.0, 0.25)
-    stretched = (c.COMMON_ALWAYS**2 + c.COMMON_MANOEUVRE**2) * (np.square(1.0 / (1.0 - error[:, 3])) - 1.0)
-    return np.asarray((np.clip(np.sqrt(hidden + stretched), 0.0, STATED[-1]) * SHARED).astype(np.uint8))
+    hidden = c.SHARED_PART * np.clip(stated, 0.0, 0.25)
+    return np.asarray((np.clip(np.sqrt(hidden), 0.0, STATED[-1]) * SHARED).astype(np.uint8))
 
 
 class Doubt(NamedTuple):
@@ -73,8 +70,8 @@ class Doubt(NamedTuple):
     most: float
 
 
-UNKNOWN_SHAPE: Final = Doubt(c.SHARED_SLOPE, c.SHARED_MOST)
-KNOWN_SHAPE: Final = Doubt(c.SHARED_KNOWN_SLOPE, c.SHARED_MOST)  # where the fleet's own slope has been found
+SHAPES: Final = (0.1, 0.2, 0.35, 0.5, 0.7)  # doubt for each share that was left; the nearest one is taken
+UNKNOWN_SHAPE: Final = Doubt(0.25, c.SHARED_MOST)
 ALARM_SHAPE: Final = Doubt(c.ALERT_SLOPE, c.ALERT_MOST)  # whoever raises an alarm bears more
 
 
@@ -113,9 +110,15 @@ def _table(doubt: Doubt) -> Float32Array:
     return np.stack([base_kernel().T, *rows]).astype(np.float32)
 
 
-KERNELS: Final = _table(UNKNOWN_SHAPE)  # handed to kernels: a global of this size is not kept in their cache
-KNOWN_KERNELS: Final = _table(KNOWN_SHAPE)
+# By the fleet's shape; handed to kernels, since a global of this size is not kept in their cache.
+KERNELS: Final = tuple(_table(Doubt(slope, c.SHARED_MOST)) for slope in SHAPES)
 ALARM_KERNELS: Final = _table(ALARM_SHAPE)
+
+
+def shape_class(slope: float) -> int:
+    """Return which of SHAPES is nearest to the doubt about a fleet whose values are too low by `slope`."""
+    away = [abs(shape - slope - c.SHAPE_DOUBT) for shape in SHAPES]
+    return away.index(min(away))
 
 
 @refcount_free_inlined
@@ -160,8 +163,6 @@ def note_value(cells: RecordArray, row: int, entries: RecordArray, entry: int, s
     """Note an entry's value in its cell: manoeuvre, grip used, and what it shares with others; the gentler or wider it
     is, the less it counts."""
     used, shared = entries[entry].used / USED, entries[entry].shared / SHARED
-    # a slope that is known makes up for its part of what was left: the error that remains is of who used more
-    used += entries[entry].slope * SLOPE_STEP * max(float(entries[entry].mean) - used, 0.0)
     gentle = used / (max(float(entries[entry].mean), mugrid.LOWER) * c.SHARED_SHARE)
     weight = strength * min(max(gentle, c.SHARED_LEAST), 1.0) ** 2 / (1.0 + (shared / c.SHARED_WIDE) ** 2)
     before, largest = 0.0, 0

@@ -11,10 +11,8 @@ from fleet_service.fusion import constants as c
 from fleet_service.fusion.belief import (
     BOUND,
     REACH,
-    SLIPPERY_SHARE,
     VALUE,
     Bins,
-    OwnError,
     convolve_bias,
     describe,
     ensure_change,
@@ -27,7 +25,6 @@ from fleet_service.fusion.belief import (
     vote,
 )  # fmt: skip
 from fleet_service.fusion.shared import fade, note_value
-from fleet_service.fusion.standing import BIAS_STEP, SLOPE_STEP
 from fleet_service.fusion.store.pairs import returning
 from fleet_service.fusion.store.records import AGED, FINE, GRIP, ICE, NONE, SOURCES, UNTRUSTED, USED, Rows
 from fleet_service.fusion.weather import Weather, aged
@@ -42,6 +39,7 @@ P, PADDED, LIKELIHOOD = 0, 1, 2
 SCRATCH: Final = mugrid.BINS + 2 * REACH
 _HOUR: Final = 3600
 _GRIP_MEAN: Final = 0.5 * (c.SOURCE_USED + mugrid.UPPER)  # of "at least u" against the uniform prior
+_GRIP_BIN: Final = int(np.searchsorted(mugrid.CENTRES, c.SLIPPERY))  # first that is no ice
 _NEITHER: Final = 0.5  # P(slippery) that is neither ice nor grip
 _FORGOTTEN: Final = int(c.FORGOTTEN_S)
 
@@ -76,10 +74,7 @@ def load_likelihood(entries: RecordArray, entry: int, scratch: Bins) -> None:
     """The likelihood of an entry into the scratch again."""
     _clear(scratch)
     this = entries[entry]
-    own = OwnError(
-        this.bias * BIAS_STEP, int(this.bias_class), int(this.spread_class), this.slope * SLOPE_STEP, this.used / USED
-    )  # fmt: skip
-    convolve_bias(this.evidence, int(this.kind), own, scratch[PADDED], scratch[LIKELIHOOD])
+    convolve_bias(this.evidence, int(this.kind), scratch[PADDED], scratch[LIKELIHOOD])
 
 
 @refcount_free_inlined
@@ -195,7 +190,7 @@ def update(
         if strength > 0.0:
             note_value(cells, row, entries, entry, strength)
     if weight * entries[entry].share >= c.SOURCE_TRUST:
-        if entries[entry].slippery >= c.SOURCE_SHARE and _witnesses(entries, entry, scratch[LIKELIHOOD]):
+        if entries[entry].slippery >= c.SOURCE_SHARE and ice_evidence(entries, entry) >= c.WITNESS_NATS:
             _note_source(rows.reporters, sources, ICE, entries[entry].vehicle, time)
         elif entries[entry].slippery <= 1.0 - c.SOURCE_SHARE:
             _note_source(rows.reporters, sources, GRIP, entries[entry].vehicle, time)
@@ -208,16 +203,25 @@ def _aged(seconds: float) -> np.uint16:
 
 
 @refcount_free_inlined
-def _witnesses(entries: RecordArray, entry: int, likelihood: Bins) -> bool:
-    """Whether a value of ice counts for an alert: from a vehicle with a record, or near the limit of the ice it tells
-    of. A real likelihood of ice has a tail up to dry road, which is no part of what was near its limit."""
-    ice, moment = 0.0, 0.0
-    for i in range(mugrid.BINS):
-        part = likelihood[i] * SLIPPERY_SHARE[i]
-        ice += part
-        moment += part * mugrid.CENTRES[i]
-    near = entries[entry].used * ice >= c.WITNESS_SHARE * USED * moment
-    return bool(near or entries[entry].weight >= c.TELLING_TRUST)
+def ice_evidence(entries: RecordArray, entry: int) -> float:
+    """Return the evidence of a value for ice against grip: the log-likelihood ratio with the doubt about tyres [nat].
+
+    A vehicle that used u of a road μ may read it too low by d(μ) = μ·clip(ALERT_SLOPE·(SHARED_SHARE - u/μ), 0,
+    ALERT_MOST), one standard deviation. So grip explains the value as well as
+    max over μ ≥ SLIPPERY, r ≤ μ of L(r)·exp(-½·((μ - r)/d(μ))²), where L has the maximum one.
+    """
+    evidence, used = entries[entry].evidence, entries[entry].used / USED
+    least = math.inf
+    for i in range(_GRIP_BIN, mugrid.BINS):
+        road = mugrid.CENTRES[i]
+        doubt = min(max(c.ALERT_SLOPE * (c.SHARED_SHARE - used / road), 0.0), c.ALERT_MOST) * road
+        for j in range(i, -1, -1):
+            away = road - mugrid.CENTRES[j]
+            if away > 3.0 * doubt:
+                break
+            nats = evidence[j] / mugrid.STEPS_PER_NAT + (0.5 * (away / doubt) ** 2 if away > 0.0 else 0.0)
+            least = min(least, nats)
+    return float(least)
 
 
 @refcount_free_inlined

@@ -38,8 +38,8 @@ from schemas.runtime.records import RecordArray
 class Arrivals(NamedTuple):
     """A batch of observations, arrays of shape (n,): see `Observations`.
 
-    `vehicle` is the index of the vehicle, `number` its number; `weight` is the trust in it, `error` (n, 4) what is
-    known of its own error (`standing.classes`), `used`, `shared` and `tyre` as an entry has them.
+    `vehicle` is the index of the vehicle, `number` its number; `weight` is the trust in it, `used`, `shared` and `late`
+    are as an entry has them.
     """
 
     time: IntArray
@@ -53,8 +53,7 @@ class Arrivals(NamedTuple):
     used: ByteArray
     shared: ByteArray
     manoeuvre: NDArray[np.int8]
-    tyre: NDArray[np.int8]
-    error: NDArray[np.int8]
+    late: BoolArray
 
 
 class Votes(NamedTuple):
@@ -142,9 +141,7 @@ def _enter(state: State, arrivals: Arrivals, row: int) -> int:
     for i in range(arrivals.evidence.shape[1]):
         new.evidence[i] = arrivals.evidence[row, i]
     new.used, new.shared = arrivals.used[row], arrivals.shared[row]
-    new.manoeuvre, new.tyre = arrivals.manoeuvre[row], arrivals.tyre[row]
-    new.bias, new.bias_class, new.spread_class = arrivals.error[row, 0], arrivals.error[row, 1], arrivals.error[row, 2]
-    new.slope = arrivals.error[row, 3]
+    new.manoeuvre, new.late = arrivals.manoeuvre[row], arrivals.late[row]
     return entry
 
 

@@ -21,6 +21,8 @@ class MapBar(NamedTuple):
 
 COUNTS: Final = (1, 2, 3, 5, 10, 30)  # excited vehicles per cell; each class reaches to the next
 ATTACKS: Final = ("replayed", "random", "shifted_pose", "flood_one_cell", "newcomers")
+EXCITED: Final = (10, 30, 100)  # percent of the visits of a third party's changing road
+_ICE: Final = "excited passes over new ice"
 _SHARE: Final = "of cells and snapshots"
 _MINUTES: Final = "of cell-minutes"
 
@@ -37,7 +39,19 @@ BARS: Final[dict[str, MapBar]] = {
     "fusion.shared10.coverage90.n30": MapBar(0.85, "more", _SHARE),
     "fusion.moderate.coverage90.n30": MapBar(0.85, "more", _SHARE),
     "fusion.winter.coverage90.n10": MapBar(0.85, "more", _SHARE),
-    "fusion.reliability.worst_bin": MapBar(0.1, "less", "P(slippery) given less true, bins with 100 answers"),
+    "fusion.reliability.ece": MapBar(0.045, "less", "P(slippery) given less true, worst fleet"),
+    "fusion.third_party.coverage90": MapBar(0.90, "more", "of cells, a fleet that is not ours"),
+    "fusion.third_party.false_grip": MapBar(0.03, "less", "of cells: truth below the interval"),
+    "fusion.third_party.rmse": MapBar(0.05, "less", "all cells"),
+    "fusion.third_party.missed_ice": MapBar(0.03, "less", "of icy cells: no alert"),
+    "fusion.third_party.false_ice": MapBar(0.002, "less", "of cells above .45: an alert"),
+    "fusion.third_party.gain_common.coverage90": MapBar(0.88, "more", "of cells, gain errors of 10 %"),
+    "fusion.third_party.gain_common.false_grip": MapBar(0.05, "less", "of cells, gain errors of 10 %"),
+    **{f"fusion.third_party.raise.excited_passes.median.e{e}": MapBar(4, "less", _ICE) for e in EXCITED},
+    **{f"fusion.third_party.raise.excited_passes.p95.e{e}": MapBar(8, "less", _ICE) for e in EXCITED},
+    **{f"fusion.third_party.raise.never.e{e}": MapBar(0, "less", "cells without an alert") for e in EXCITED},
+    "fusion.cold.ice_passes.median": MapBar(2, "less", "passes, a service that knows nobody"),
+    "fusion.cold.ice_passes.p90": MapBar(4, "less", "passes, a service that knows nobody"),
     "fusion.same_manoeuvre.false_alerts": MapBar(0, "less", "fleets on a wet curve"),
     "fusion.bounds.lower_excess": MapBar(0.05, "less", "lower end over what was used"),
     "fusion.backlog.fused": MapBar(0.95, "more", "of an hour's rows"),
@@ -57,10 +71,19 @@ BARS: Final[dict[str, MapBar]] = {
     "fusion.unexcited.upper_shift": MapBar(0.02, "less", ""),
     "fusion.order.max_difference": MapBar(1e-6, "less", "probability"),
     "fusion.replay.max_difference": MapBar(1e-6, "less", "probability"),
-    "fusion.whole_way.coverage90": MapBar(
-        (0.87, 0.95), "within", "of cells, worst of five rough ways and three moments"
-    ),
-    "fusion.whole_way.rmse": MapBar(0.07, "less", "measured cells, worst of five rough ways and three moments"),
+    "fusion.whole_way.ways": MapBar(10, "more", "independent ways"),
+    **{f"fusion.whole_way.rmse.after{m}": MapBar(0.085, "less", "measured cells, mean of ways") for m in (6, 30)},
+    **{f"fusion.whole_way.rmse.after{m}.worst": MapBar(0.095, "less", "measured cells, worst way") for m in (6, 30)},
+    **{
+        f"fusion.whole_way.coverage90.measured.after{m}": MapBar((0.88, 0.95), "within", "measured cells, mean")
+        for m in (1, 6, 30)
+    },
+    "fusion.whole_way.crps": MapBar(0.058, "less", "all cells, 30 minutes"),
+    "fusion.whole_way.slippery.brier": MapBar(0.047, "less", "P(slippery), all cells, 30 minutes"),
+    "fusion.whole_way.slippery.ece": MapBar(0.045, "less", "P(slippery), ten bins, all ways"),
+    "fusion.whole_way.slippery.missed": MapBar(0.08, "less", "of slippery cells: P(slippery) < .3"),
+    "fusion.whole_way.slippery.grip_raised": MapBar(0.05, "less", "of cells with grip: P(slippery) > .5"),
+    "fusion.resampled.coverage90.ice": MapBar(0.82, "more", _SHARE),
     "fusion.whole_way.level.coverage90": MapBar((0.85, 0.97), "within", _SHARE),
     "fusion.whole_way.level.rmse": MapBar(0.08, "less", "measured cells"),
     "fusion.whole_way.hills.coverage90": MapBar((0.85, 0.97), "within", _SHARE),

@@ -23,6 +23,7 @@ from fleet_service.lab import (
     plots,
     resampled,
     situations,
+    third_party,
 )
 from schemas.runtime import figures
 from schemas.runtime.figures import Figure
@@ -119,6 +120,7 @@ def _parts(seeds: range, log_line: LogLine) -> list[tuple[str, Part]]:
         ("attacks", lambda: attacks.measure(seeds)),
         ("fleets that err otherwise", lambda: models.measure(seeds, log_line)),
         ("how long a dry road stays dry", lambda: fading.measure(seeds)),
+        ("a third party's fleet", lambda: third_party.measure(seeds, log_line)),
         ("bounds, a backlog, gentle drivers, a wet curve", lambda: situations.measure(seeds)),
     ]
 

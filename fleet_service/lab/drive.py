@@ -29,10 +29,13 @@ TWICE_SHARE: Final = 0.03
 CELL: Final = cell_numbers()
 
 
-def rows_of(v: Visits) -> dict[str, Any]:
-    """Visits as columns of the archive, as far as the fusion reads them; every row is a batch of its own."""
+def rows_of(v: Visits, cells: IntArray = CELL) -> dict[str, Any]:
+    """Visits as columns of the archive, as far as the fusion reads them; every row is a batch of its own.
+
+    `cells` are the grid's numbers of the visits' places.
+    """
     n, nan = len(v), np.full(len(v), np.nan, np.float32)
-    cell, used = CELL[v.place], v.reports.used.astype(np.float32)
+    cell, used = cells[v.place], v.reports.used.astype(np.float32)
     along, across = (used * np.array(part, np.float32)[v.reports.manoeuvre] for part in ((1, -1, 0, 0), (0, 0, 1, -1)))
     order = np.lexsort((v.seconds, v.vehicle))
     seq = np.empty(n, np.int64)
@@ -44,7 +47,6 @@ def rows_of(v: Visits) -> dict[str, Any]:
         "yaw": np.zeros(n, np.float32), "position_std": np.full(n, 1.5, np.float32), "boot": v.vehicle + 1,
         "region": grid.region_of(cell), "seq": seq, "row": np.zeros(n, np.int32), "with_likelihood": np.ones(n, bool),
         "log_likelihood": mugrid.encode_log_likelihood(v.reports.log_likelihood),
-        "tyre_season": np.zeros(n, np.int8),
         "used_longitudinal": along, "used_lateral": across, "mu": nan, "mu_lower": nan, "mu_upper": nan,
         "mu_utilised": used,
     }  # fmt: skip

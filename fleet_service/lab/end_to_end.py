@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from fleet_service.fusion import Fusion, Observations, observations_of
 from fleet_service.lab.drive import LATENESS_S
 from fleet_service.lab.resampled import DrivenVisits, TrueVisits, driven
-from fleet_service.lab.score import Scores, of_beliefs, safe
+from fleet_service.lab.score import SURE_GRIP, Scores, of_beliefs, safe
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.view import LOWER, UPPER, measured
 from schemas import grid, mugrid, wire
@@ -30,7 +30,6 @@ from schemas.wire import Alert
 OBSERVATIONS, TRUTH = "observations.parquet", "truth.parquet"
 SEVERAL: Final = 2  # vehicles of a cell that counts: the bar is the map's, and one vehicle is no map
 SAME: Final = 0.02  # of friction within a cell of one surface
-SURE_GRIP: Final = 0.45  # snow and ice lie below, wet and dry road above
 
 Drive = Callable[[Path], None]  # drives and writes both files into a folder
 
@@ -47,9 +46,9 @@ class World(NamedTuple):
 WHOLE_WAY: Final = "fusion.whole_way"  # prefix of the figures
 LEVEL: Final = World("demo", 0.0, f"{WHOLE_WAY}.level")
 HILLS: Final = World("hills-20000", 0.5, f"{WHOLE_WAY}.hills")  # frictions and hills that nobody tuned on
-# Half of the vehicles as real cars are, on five towns' own frictions and hills: what the figures without a further name
-# are of, see `moments`.
-WAYS: Final = tuple(World(f"hills-{seed}", 0.5, f"{WHOLE_WAY}.{seed}", seed) for seed in range(20_001, 20_006))
+# Half of the vehicles as real cars are, on ten towns' own frictions and hills: the figures without a further name, see
+# `moments`. All cells of a way share one snow, so that fewer ways say little about P(slippery).
+WAYS: Final = tuple(World(f"hills-{seed}", 0.5, f"{WHOLE_WAY}.{seed}", seed) for seed in range(20_001, 20_011))
 
 
 def command(vehicles: int, seconds: float, world: World) -> Drive:

@@ -17,7 +17,17 @@ from fleet_service.lab.agent import CLEAN, ErrorModel, Errors
 from fleet_service.lab.bars import COUNTS
 from fleet_service.lab.drive import watch
 from fleet_service.lab.resampled import DrivenVisits
-from fleet_service.lab.score import Scores, by_surface, calibration, coverage, joined, of_class, snapshots, worst_bin
+from fleet_service.lab.score import (
+    Scores,
+    by_surface,
+    coverage,
+    false_grip,
+    false_ice,
+    joined,
+    of_class,
+    slippery_scores,
+    snapshots,
+)
 from schemas.numeric import FloatArray
 
 VEHICLES: Final = 60
@@ -60,7 +70,7 @@ def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
     for name, model in MODELS.items():
         out |= _figures(f"fusion.{name}", [one(model, seed) for seed in seeds])
         log_line(f"{name}: {len(seeds)} towns")
-    return out | {"fusion.reliability.worst_bin": max(out[f"fusion.{name}.worst_bin"] for name in MODELS)}
+    return out | {"fusion.reliability.ece": max(out[f"fusion.{name}.slippery.ece"] for name in MODELS)}
 
 
 def measure_real(ways: DrivenVisits, seeds: range) -> dict[str, float]:
@@ -73,7 +83,9 @@ def measure_real(ways: DrivenVisits, seeds: range) -> dict[str, float]:
 def _figures(prefix: str, towns: Sequence[tuple[Scores, list[Scores]]]) -> dict[str, float]:
     ours, theirs = zip(*towns, strict=True)
     whole, others = joined(list(ours)), [joined(list(of)) for of in zip(*theirs, strict=True)]
-    out = {f"{prefix}.coverage90": coverage(whole), f"{prefix}.worst_bin": worst_bin(calibration([whole]))}
+    out = {f"{prefix}.coverage90": coverage(whole), f"{prefix}.interval_score": _mean(whole.interval)}
+    out |= {f"{prefix}.false_grip": false_grip(whole), f"{prefix}.false_ice": false_ice(whole)}
+    out |= {f"{prefix}.slippery.{name}": value for name, value in slippery_scores([whole]).items()}
     out[f"{prefix}.coverage90.spread"] = float(np.std([coverage(s) for s in ours]))
     out |= {f"{prefix}.coverage90.{surface}": share for surface, share in by_surface(whole).items()}
     for n in COUNTS:

@@ -19,7 +19,15 @@ from fleet_service.fusion import Fusion
 from fleet_service.lab import end_to_end
 from fleet_service.lab.drive import LATENESS_S
 from fleet_service.lab.end_to_end import OBSERVATIONS, SEVERAL, TRUTH
-from fleet_service.lab.score import Scores, by_surface, calibration, joined, of_beliefs, worst_bin
+from fleet_service.lab.score import (
+    Scores,
+    by_surface,
+    false_grip,
+    false_ice,
+    joined,
+    of_beliefs,
+    slippery_scores,
+)
 from fleet_service.serve.view import LOWER, UPPER, measured
 from schemas import mugrid
 from schemas.numeric import BoolArray, FloatArray
@@ -60,37 +68,30 @@ def moments(folder: Path) -> list[AskedWay]:
 
 
 def figures(ways: Sequence[Sequence[AskedWay]], prefix: str) -> dict[str, float]:
-    """The worst of all ways and moments; of each moment the worst, the mean and the spread over the ways."""
-    out: dict[str, float] = {}
-    rmse, cover, score = (
-        np.array([[of(moment) for moment in way] for way in ways]) for of in (_rmse, _coverage, _interval)
-    )
-    for k, seconds in enumerate(MOMENTS[: rmse.shape[1]]):
+    """Return the figures of ways (≥ 10 for a judgement): of each moment the mean, the worst and the spread over them.
+
+    Error and coverage are of measured cells: a cell that nobody tested reaches to the grid's end, so that it covers.
+    """
+    out: dict[str, float] = {f"{prefix}.ways": float(len(ways))}
+    for k, seconds in enumerate(MOMENTS[: min(map(len, ways))]):
         name = f"after{seconds / 60.0:.0f}"
-        out |= {f"{prefix}.rmse.{name}": rmse[:, k].max(), f"{prefix}.rmse.{name}.mean": rmse[:, k].mean()}
-        out |= {f"{prefix}.rmse.{name}.spread": rmse[:, k].std(), f"{prefix}.coverage90.{name}": _farthest(cover[:, k])}
-        out |= {
-            f"{prefix}.coverage90.{name}.mean": cover[:, k].mean(),
-            f"{prefix}.interval_score.{name}": score[:, k].max(),
-        }
+        now = [way[k] for way in ways]
+        known = [moment.scores.taken(moment.measured) for moment in now]
+        rmse = np.array([float(end_to_end.mean(s.error**2) ** 0.5) for s in known])
+        cover = np.array([end_to_end.mean(s.covered) for s in known])
+        every = joined([moment.scores for moment in now])
+        out |= {f"{prefix}.rmse.{name}": rmse.mean(), f"{prefix}.rmse.{name}.worst": rmse.max()}
+        out |= {f"{prefix}.rmse.{name}.spread": rmse.std(), f"{prefix}.coverage90.measured.{name}": cover.mean()}
+        out |= {f"{prefix}.coverage90.measured.{name}.worst": _farthest(cover)}
+        out |= {f"{prefix}.false_grip.{name}": false_grip(joined(known))}
+        out |= {f"{prefix}.false_ice.{name}": false_ice(joined(known))}
+        out |= {f"{prefix}.crps.{name}": end_to_end.mean(every.crps)}
+        out |= {f"{prefix}.interval_score.{name}": end_to_end.mean(every.interval)}
+        out |= {f"{prefix}.slippery.{of}.{name}": value for of, value in slippery_scores([every]).items()}
     last = [way[-1].scores for way in ways]
     out |= {f"{prefix}.coverage90.{surface}": share for surface, share in by_surface(joined(last)).items()}
-    return out | {
-        f"{prefix}.rmse": rmse.max(), f"{prefix}.coverage90": _farthest(cover.ravel()),
-        f"{prefix}.worst_bin": worst_bin(calibration(last)), f"{prefix}.ways": float(len(ways)),
-    }  # fmt: skip
-
-
-def _rmse(moment: AskedWay) -> float:
-    return float(end_to_end.mean(moment.scores.error[moment.measured] ** 2) ** 0.5)
-
-
-def _coverage(moment: AskedWay) -> float:
-    return end_to_end.mean(moment.scores.covered)
-
-
-def _interval(moment: AskedWay) -> float:
-    return end_to_end.mean(moment.scores.interval)
+    out |= {f"{prefix}.slippery.{of}": value for of, value in slippery_scores(last).items()}
+    return out | {f"{prefix}.crps": end_to_end.mean(joined(last).crps)}
 
 
 def _farthest(cover: FloatArray) -> float:

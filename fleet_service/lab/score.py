@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -17,14 +17,19 @@ from schemas.thresholds import SLIPPERY_MU, SURFACES
 
 ALPHA: Final = 0.10
 ENOUGH: Final = 3  # excited vehicles, for an error to count
-BINS, BIN_ENOUGH = 10, 100  # of P(slippery); answers in a bin that counts
+MISSED, RAISED = 0.3, 0.5  # of P(slippery): slippery road below it is missed, grip above it is called slippery
+SURE_GRIP: Final = 0.45  # snow and ice lie below, wet and dry road above
+BINS: Final = 10  # of P(slippery)
 LEVELS: Final = np.linspace(0.05, 0.95, 19)
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Answers beside the truth, (k,): `vehicles` are the distinct excited ones that had been there, `slippery` is what
-    the answer gives for P(slippery), NaN where it gives none."""
+    """Answers next to the truth, (k,).
+
+    `vehicles` are the distinct excited ones that had been there. `slippery` is the answer's P(slippery), and `crps` its
+    continuous ranked probability score; both NaN where an answer is an interval and no distribution.
+    """
 
     vehicles: IntArray
     error: FloatArray
@@ -34,6 +39,7 @@ class Scores:
     truth: FloatArray
     width: FloatArray
     slippery: FloatArray
+    crps: FloatArray
 
     def taken(self, rows: BoolArray) -> Scores:
         """Some of the answers."""
@@ -66,7 +72,8 @@ def of_intervals(
     """Scores of 90 % intervals, all (k,). Interval score: width, and 2/α for each unit by which the truth is missed."""
     missed = np.maximum(lower - truth, 0.0) + np.maximum(truth - upper, 0.0)
     interval = upper - lower + 2.0 / ALPHA * missed
-    return Scores(vehicles, mid - truth, missed == 0.0, interval, rank, truth, upper - lower, slippery)
+    nothing: FloatArray = np.full(len(truth), np.nan)
+    return Scores(vehicles, mid - truth, missed == 0.0, interval, rank, truth, upper - lower, slippery, nothing)
 
 
 def of_beliefs(belief: FloatArray, truth: FloatArray, vehicles: IntArray) -> Scores:
@@ -77,7 +84,23 @@ def of_beliefs(belief: FloatArray, truth: FloatArray, vehicles: IntArray) -> Sco
     bin_ = place.astype(np.int64)
     mass = np.take_along_axis(belief, bin_[:, None], axis=1)[:, 0]
     rank = np.take_along_axis(cdf, bin_[:, None], axis=1)[:, 0] - mass * (1.0 - (place - bin_))
-    return of_intervals(lower, mid, upper, truth, vehicles, rank, belief @ SLIPPERY_SHARE)
+    scores = of_intervals(lower, mid, upper, truth, vehicles, rank, belief @ SLIPPERY_SHARE)
+    return replace(scores, crps=crps_of(belief, truth))
+
+
+def crps_of(belief: FloatArray, truth: FloatArray) -> FloatArray:
+    """Return the continuous ranked probability score of beliefs (k, 32) that are flat within each bin, (k,).
+
+    CRPS = ∫ (F(x) - 1[x ≥ truth])² dx; Gneiting and Raftery (2007), eq. 21. The integral is by the trapezoidal rule on
+    a grid of eight points per bin.
+    """
+    fine = np.linspace(mugrid.LOWER, mugrid.UPPER, 8 * mugrid.BINS + 1)
+    cdf = np.concatenate([np.zeros((len(belief), 1)), np.cumsum(belief, axis=1)], axis=1)
+    part = np.arange(8) / 8.0
+    inside = cdf[:, :-1, None] + belief[:, :, None] * part
+    below = np.concatenate([inside.reshape(len(belief), -1), cdf[:, -1:]], axis=1)
+    gap = np.square(below - (fine[None, :] >= truth[:, None]))
+    return np.asarray(np.trapezoid(gap, fine, axis=1))
 
 
 def snapshots(
@@ -130,9 +153,40 @@ def calibration(scores: Sequence[Scores]) -> FloatArray:
     return np.stack([count, *(total / np.maximum(count, 1) for total in sums)], axis=1)
 
 
-def worst_bin(found: FloatArray) -> float:
-    """Largest difference of what is given and what is true in a bin with BIN_ENOUGH answers; 0 without one."""
-    return float(np.abs(found[:, 1] - found[:, 2])[found[:, 0] >= BIN_ENOUGH].max(initial=0.0))
+def slippery_scores(scores: Sequence[Scores]) -> dict[str, float]:
+    """Return how good P(slippery) is over all answers: `brier`, `log`, `ece`, `missed` and `grip_raised`.
+
+    `ece` is the expected calibration error over BINS bins, weighted by answers (Naeini et al., 2015). `missed` is the
+    share of truly slippery cells given less than MISSED, `grip_raised` that of cells with grip (μ > SURE_GRIP) given
+    more than RAISED. The worst bin of a few ways is no criterion: all cells of a way share one snow, and a map that is
+    calibrated passes it in a third of the campaigns.
+    """
+    given = np.concatenate([s.slippery for s in scores])
+    truth = np.concatenate([s.truth for s in scores])
+    slippery = truth < SLIPPERY_MU
+    certain = np.clip(np.where(slippery, given, 1.0 - given), 1e-6, 1.0)
+    found = calibration(scores)
+    return {
+        "brier": _mean(np.square(given - slippery)),
+        "log": _mean(-np.log(certain)),
+        "ece": float(np.sum(found[:, 0] * np.abs(found[:, 1] - found[:, 2])) / max(len(given), 1)),
+        "missed": _mean(given[slippery] < MISSED),
+        "grip_raised": _mean(given[truth > SURE_GRIP] > RAISED),
+    }
+
+
+def false_grip(s: Scores) -> float:
+    """Return the share of truths below the interval: road that is more slippery than the map vouches for."""
+    return _mean(s.rank < ALPHA / 2.0)
+
+
+def false_ice(s: Scores) -> float:
+    """Return the share of truths above the interval: road with more grip than the map thinks possible."""
+    return _mean(s.rank > 1.0 - ALPHA / 2.0)
+
+
+def _mean(values: FloatArray | BoolArray) -> float:
+    return float(values.mean()) if len(values) else float("nan")
 
 
 def reliability(s: Scores) -> FloatArray:

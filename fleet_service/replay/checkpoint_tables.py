@@ -16,7 +16,7 @@ from fleet_service.fusion import Fusion
 from fleet_service.fusion.image import LAYOUT, fusion_of, image_of
 from schemas.errors import InputError
 
-VERSION: Final = f"4-{LAYOUT}"  # what is not this is not read: the archive is replayed
+VERSION: Final = f"5-{LAYOUT}"  # what is not this is not read: the archive is replayed
 _KEY: Final = b"gripmap.checkpoint"
 
 

@@ -20,7 +20,6 @@ from fleet_service.archive.pseudonyms import number
 from fleet_service.fusion import Fusion, Observations, Updated, observations_of
 from fleet_service.fusion.constants import EPOCH_NS
 from fleet_service.fusion.fuse import Before
-from fleet_service.fusion.standing import ERRORS, UNKNOWN
 from fleet_service.ingest.dedup import SequenceTrackers
 from fleet_service.ingest.weather import archived
 from schemas import grid
@@ -34,7 +33,7 @@ IDENTITY: Final = ["vehicle", "boot", "region", "seq"]
 COLUMNS: Final = [
     *("leave_time", "cell", "sector", "latitude", "position_std", "yaw", "mu", "mu_lower", "mu_upper"),
     *("mu_utilised", "log_likelihood", *IDENTITY, "row", "late", "weight"),
-    *("used_longitudinal", "used_lateral", "tyre_season", "late_by", *ERRORS),
+    *("used_longitudinal", "used_lateral", "late_by"),
 ]  # of what the fusion takes
 FILTERED: Final = ("longitude", "received_at")  # beside them, where not all rows are wanted
 Box = tuple[float, float, float, float]  # west, south, east, north [deg]
@@ -208,10 +207,8 @@ def replay(
 
 
 def _before(rows: segments.Rows) -> Before:
-    """What was used of rows; of an older version nothing is known of the vehicles' errors."""
-    error = np.stack([rows[name] for name in ERRORS], axis=1)
-    error = np.where(np.isnan(error), np.array(UNKNOWN, np.float32), error)
-    return Before(rows["late"].astype(bool), rows["late_by"], rows["weight"], error)
+    """Return what was used of rows when they were fused first."""
+    return Before(rows["late"].astype(bool), rows["late_by"], rows["weight"])
 
 
 def _joined(parts: list[tuple[Observations, Before]]) -> tuple[Observations, Before]:
@@ -222,13 +219,13 @@ def _joined(parts: list[tuple[Observations, Before]]) -> tuple[Observations, Bef
     befores = [before for _, before in parts]
     return of, Before(
         late=np.concatenate([b.late for b in befores]), late_by=np.concatenate([b.late_by for b in befores]),
-        weight=np.concatenate([b.weight for b in befores]), error=np.concatenate([b.error for b in befores]),
+        weight=np.concatenate([b.weight for b in befores]),
     )  # fmt: skip
 
 
 def _taken(o: Observations, before: Before, rows: BoolArray | IntArray | slice) -> tuple[Observations, Before]:
     """Some of the rows."""
-    return o.take(rows), Before(before.late[rows], before.late_by[rows], before.weight[rows], before.error[rows])
+    return o.take(rows), Before(before.late[rows], before.late_by[rows], before.weight[rows])
 
 
 def _fused(fusion: Fusion, o: Observations, before: Before, heard: Heard) -> Iterator[Updated]:

@@ -9,25 +9,27 @@ import numpy as np
 
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.belief import PRIOR, SLIPPERY_SHARE, quantiles
-from fleet_service.fusion.store.records import GRIP, ICE, SOURCES
+from fleet_service.fusion.store.records import GRIP, ICE
 from fleet_service.serve.view import LOWER, UPPER
 from schemas import grid
-from schemas.numeric import IntArray
+from schemas.numeric import BoolArray, IntArray
 from schemas.thresholds import NS, SLIPPERY_MU
 from schemas.wire import Alert
 
 RAISE_ABOVE: Final = 0.9  # P(slippery)
-# ... and by its own reports alone no less than without any: neighbours confirm, they do not accuse. On a road that was
-# firmly dry each cell bears the doubt about a change by itself (CHANGE_LEAST), so that ice takes three passes to a half
-# where the reports of all neighbours are sure. Nor do they confirm where as many found grip as ice: there the stretch
-# may end, and fixes err by metres.
+# ... and by its own reports alone no less than without any: neighbours confirm, they do not accuse.
 LIKELY: Final = float(SLIPPERY_SHARE @ PRIOR)
-# Grip must be as sure as ice was: clearing too early is the dearer error, and a few liars can lower P for a while.
-CLEAR_BELOW: Final = 0.05
-FADE_BELOW: Final = 0.5  # ... but when nobody confirms it, it ends as soon as it is less likely than not
+CLEAR_BELOW: Final = 0.05  # grip must be as sure as ice was: clearing too early is the dearer error
+FADE_BELOW: Final = 0.5  # an alert without confirmation ends as soon as ice is less likely than grip
 LEAST_SOURCES: Final = 2  # distinct vehicles that reported it themselves: one liar, or one bad sensor, moves nothing
-MOST_ICE: Final = 4  # that ice ever needs: three insiders who flood a cell are too few
-SOURCE_NS: Final = 3600 * NS  # ... within the hour; older ice belongs to an older road
+# ... and one more for each opposite source that is not older than they are by this: a road changes, so that earlier
+# visits do not contradict it. With one minute instead of ten, three trusted vehicles that flood a dry cell raised an
+# alert in two of six tuning towns; with ten in none.
+FRESH_NS: Final = 600 * NS
+MOST_SOURCES: Final = 4
+CLEAR_SOURCES: Final = (4, 5)  # ... that grip needs to end an alert: at least and at most
+SOURCE_NS: Final = 3600 * NS  # sources count for an hour; older ice belongs to an older road
+QUIET_NS: Final = 1800 * NS  # an alert whose ice nobody confirmed for so long may fade
 
 
 class Alerts:
@@ -66,40 +68,39 @@ class Alerts:
         """Alerts that the cells just updated raise or clear."""
         time, slippery = self._fusion.live.time[slots], self._fusion.slippery(slots)
         standing = np.isin(slots, np.fromiter(self._standing, np.int64, len(self._standing)))
-        out, likely = [], np.flatnonzero((slippery > LIKELY) & ~standing)
-        ice, grip = (self._fusion.sources(slots[likely], side, time[likely] - SOURCE_NS)[0] for side in (ICE, GRIP))
-        likely = likely[(ice >= LEAST_SOURCES) & ((ice > grip) | (slippery[likely] > RAISE_ABOVE))]
-        alarming = self._fusion.alarming(slots[likely]) @ SLIPPERY_SHARE > RAISE_ABOVE
-        likely = likely[alarming]
+        likely = np.flatnonzero((slippery > LIKELY) & ~standing)
+        likely = likely[self._corroborated(slots[likely], ICE, time[likely])]
+        likely = likely[self._fusion.alarming(slots[likely]) @ SLIPPERY_SHARE > RAISE_ABOVE]
         believed = self._fusion.believed(slots[likely]) @ SLIPPERY_SHARE
+        out = []
         for k, probability in zip(likely.tolist(), believed.tolist(), strict=True):
-            slot, when = int(slots[k]), int(time[k])
-            if probability > RAISE_ABOVE and self._corroborated(slot, ICE, when):
-                self._standing[slot] = self._alert(
-                    slot, when, True, f"P(mu < {SLIPPERY_MU}) = {probability:.2f} > {RAISE_ABOVE}"
-                )
+            if probability > RAISE_ABOVE:
+                slot, when = int(slots[k]), int(time[k])
+                reason = f"P(mu < {SLIPPERY_MU}) = {probability:.2f} > {RAISE_ABOVE}"
+                self._standing[slot] = self._alert(slot, when, True, reason)
                 out.append(self._standing[slot])
-        gripping = np.flatnonzero((slippery < CLEAR_BELOW) & standing).tolist()
-        return out + [
-            self._clear(int(slots[k]), int(time[k]), "later visits found grip")
-            for k in gripping
-            if self._corroborated(int(slots[k]), GRIP, int(time[k]))
-        ]
+        gripping = np.flatnonzero((slippery < CLEAR_BELOW) & standing)
+        gripping = gripping[self._corroborated(slots[gripping], GRIP, time[gripping])]
+        reason = "later visits found grip"
+        return out + [self._clear(int(slots[k]), int(time[k]), reason) for k in gripping.tolist()]
 
-    def _corroborated(self, slot: int, side: int, time: int) -> bool:
-        """Whether one side has enough corroborating sources: as many as the other within the hour, within limits.
+    def _corroborated(self, slots: IntArray, side: int, time: IntArray) -> BoolArray:
+        """Return whether slots (k,) have enough corroborating sources of a side at `time` (k,) [ns].
 
-        Grip must have been found after the last ice.
+        The least number of them, and one more for each opposite source that is newer than the second newest of them
+        less FRESH_NS, up to the most.
         """
-        slots, hour = np.array([slot]), time - SOURCE_NS
-        against, last = self._fusion.sources(slots, GRIP if side == ICE else ICE, hour)
-        found, _ = self._fusion.sources(slots, side, np.maximum(last, hour) if side == GRIP else hour)
-        return bool(found[0] >= np.clip(against[0], LEAST_SOURCES, MOST_ICE if side == ICE else SOURCES))
+        found = self._fusion.sources(slots, side, time - SOURCE_NS)
+        against = self._fusion.sources(slots, GRIP if side == ICE else ICE, time - SOURCE_NS)
+        opposed = (against > found[:, 1:2] - FRESH_NS).sum(axis=1)
+        least, most = (LEAST_SOURCES, MOST_SOURCES) if side == ICE else CLEAR_SOURCES
+        needed = np.minimum(least + opposed, most)
+        return np.asarray((found > 0).sum(axis=1) >= needed)
 
     def faded(self, now: int) -> list[Alert]:
-        """Alerts that time alone cleared until `now` [ns]: less likely than not, and no source within the hour."""
+        """Alerts that time alone cleared until `now` [ns]: less likely than not, and not confirmed for QUIET_NS."""
         slots = np.array(sorted(self._standing), np.int64)
-        forgotten = self._fusion.sources(slots, ICE, now - SOURCE_NS)[0] == 0
+        forgotten = self._fusion.sources(slots, ICE, now - QUIET_NS)[:, 0] == 0
         faded = (self._fusion.beliefs(slots, now) @ SLIPPERY_SHARE < FADE_BELOW) & forgotten
         reason = "no visit has confirmed it for too long"
         return [self._clear(int(slot), now, reason) for slot in slots[faded]]

@@ -51,7 +51,7 @@ def visits(rng: np.random.Generator, rows: int, cells: int, begin_s: float, seco
         time=time_ns, cell=cell, sector=np.zeros(rows, np.int8), second=np.full(rows, -1, np.int8),
         vehicle=vehicle, boot=vehicle + 1, region=grid.region_of(cell), sequence=np.arange(rows),
         evidence=evidence, reported=np.full((rows, 3), np.nan, np.float32),
-        used=np.full(rows, 0.9, np.float32), manoeuvre=np.full(rows, -1, np.int8), tyre=np.zeros(rows, np.int8),
+        used=np.full(rows, 0.9, np.float32), manoeuvre=np.full(rows, -1, np.int8),
         other=np.full((rows, 1), -1), other_share=np.zeros((rows, 1), np.float32),
     )  # fmt: skip
 

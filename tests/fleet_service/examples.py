@@ -53,7 +53,7 @@ def observations(
         sector=np.zeros(n, np.int8), second=np.full(n, second, np.int8),
         vehicle=vehicle, boot=vehicle * 7 + 1, region=whole + REGION, sequence=np.arange(n),
         evidence=mugrid.encode_log_likelihood(log_likelihood), reported=np.full((n, 3), np.nan, np.float32),
-        used=np.full(n, 0.9, np.float32), manoeuvre=np.full(n, -1, np.int8), tyre=np.zeros(n, np.int8),
+        used=np.full(n, 0.9, np.float32), manoeuvre=np.full(n, -1, np.int8),
         other=np.full((n, 4), -1), other_share=np.zeros((n, 4), np.float32),
     )  # fmt: skip
 

@@ -19,7 +19,6 @@ from schemas.runtime.records import RecordArray, record_type
 
 NONE: Final = -1  # no row
 NOBODY: Final = -1  # no vehicle
-LATE: Final = -1  # in place of a kind of tyres
 GRIP, ICE = 0, 1  # sides: what a corroborating source reported
 SOURCES: Final = 5  # remembered per slot of each side: as many as an alert ever needs
 # What a vehicle reported last, its mean, standard deviation and votes spent, is remembered in 16 bits: parts of 1/FINE,
@@ -93,9 +92,8 @@ class EntryRecord:
         number, boot, sequence: order entries of equal times: the vehicle's number, its start, the row in its stream.
         evidence: likelihood in steps, see `likelihoods.evidence`.
         used, shared: grip used, and what its value shares with others, in parts of 1/USED and 1/SHARED.
-        bias, bias_class, spread_class, slope: what is known of the vehicle's own error, see `standing.classes`.
         manoeuvre: see `shared`.
-        tyre: kind of the vehicle's tyres; LATE of what came late, and is compared with nobody.
+        late: whether it came after the checkpoint, and is compared with nobody.
     """
 
     previous: np.int32
@@ -122,12 +120,8 @@ class EntryRecord:
     evidence: Annotated[ByteArray, mugrid.BINS]
     used: np.uint8
     shared: np.uint8
-    bias: np.int8
-    bias_class: np.int8
-    spread_class: np.int8
     manoeuvre: np.int8
-    tyre: np.int8
-    slope: np.int8
+    late: np.int8
 
 
 class WindowRecord:
@@ -173,36 +167,28 @@ class SourcesRecord:
 
 class ReportersRecord:
     """The recent reporters of a slot: the last REPORTERS vehicles that gave a value before the checkpoint, when [s] and
-    what, the relative variance of its own part, the grip used and the manoeuvre; and the corroborating sources."""
+    what, and the grip used; and the corroborating sources."""
 
     reporter: Annotated[Int32Array, c.REPORTERS]
     time: Annotated[UIntArray, c.REPORTERS]
     mean: Annotated[Float32Array, c.REPORTERS]
     std: Annotated[Float32Array, c.REPORTERS]
-    own: Annotated[Float32Array, c.REPORTERS]
     used: Annotated[Float32Array, c.REPORTERS]
-    manoeuvre: Annotated[Int32Array, c.REPORTERS]
     source: Annotated[Int32Array, 2, SOURCES]
     source_time: Annotated[UIntArray, 2, SOURCES]
 
 
 class PeersRecord:
-    """Whom a vehicle was compared with: the other, the rank of their pair, agreement and comparisons, summed; weight of
-    the relative differences of their values, and the differences by weight; squared differences beyond what both say of
-    themselves, and what they say; squares of the differences of their use, and their products with those of the values,
-    by weight; kind of its tyres, as told last."""
+    """Vehicles with which a vehicle was compared: the other, the rank of their pair, agreement and comparisons, summed;
+    squares of the differences of its own use between two visits to one cell, and their products with those of its
+    values, by weight."""
 
     other: Annotated[Int32Array, c.PEERS]
     rank: Annotated[Int32Array, c.PEERS]
     agreed: Annotated[Float32Array, c.PEERS]
     met: Annotated[Float32Array, c.PEERS]
-    weight: Annotated[Float32Array, c.PEERS]
-    difference: Annotated[Float32Array, c.PEERS]
-    stated: np.float32
-    found: np.float32
     used_squares: np.float32
     used_products: np.float32
-    tyre: np.int32
 
 
 class VehicleRecord:

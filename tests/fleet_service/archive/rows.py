@@ -8,7 +8,7 @@ import numpy as np
 
 from fleet_service.archive import reading
 from fleet_service.archive.segments import SCHEMAS, Rows, Writer, stepped
-from fleet_service.fusion.standing import ERRORS, unknown
+from fleet_service.fusion.standing import UNCORRECTED
 from schemas import grid, mugrid, tables
 from schemas.wire import Kind
 
@@ -46,7 +46,7 @@ def rows_of(kind: Kind, count: int, seed: int = 0, vehicles: int = 5) -> Rows:
         rows["mu"], rows["mu_utilised"] = rng.uniform(0.1, 1.0, (2, count)).astype(np.float32)
         rows["weight"] = np.full(count, 0.75, np.float32)
         rows["late_by"] = np.zeros(count, np.int64)
-        rows |= dict(zip(ERRORS, unknown(count).T, strict=True))
+        rows |= {name: np.full(count, value, np.float32) for name, value in UNCORRECTED.items()}
     return stepped(rows)
 
 

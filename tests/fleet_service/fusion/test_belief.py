@@ -17,7 +17,7 @@ def forget(p: np.ndarray, seconds: float) -> None:
 
 
 def convolve_bias(evidence: np.ndarray, kind: int, vote: np.ndarray) -> None:
-    b.convolve_bias(evidence, kind, b.OwnError(0.0, 2, 0, 0.0, 1.0), np.zeros(b.PADDED), vote)
+    b.convolve_bias(evidence, kind, np.zeros(b.PADDED), vote)
 
 
 def vote_for(p: np.ndarray, vote: np.ndarray, strength: float) -> None:

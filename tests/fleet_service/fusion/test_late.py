@@ -53,10 +53,10 @@ def test_what_is_older_than_the_forgetting_time_is_archived_and_not_fused() -> N
 def test_a_replay_fuses_what_was_late_where_it_was_fused() -> None:
     fusion, told = late(np.random.default_rng(2).permutation(400), 5)
     o, n = drive(7, 400, 3000.0), 400
-    found = Before(np.zeros(n, bool), np.zeros(n, np.int64), np.zeros(n, np.float32), np.zeros((n, 4), np.float32))
+    found = Before(np.zeros(n, bool), np.zeros(n, np.int64), np.zeros(n, np.float32))
     for rows, updated in told:
         found.late[rows], found.late_by[rows] = updated.late, updated.late_by
-        found.weight[rows], found.error[rows] = updated.weight, updated.error
+        found.weight[rows] = updated.weight
     again = Fusion(120.0)
     first = again.update(LIVE)
     assert not first.late.any()

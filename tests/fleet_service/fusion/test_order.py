@@ -67,14 +67,14 @@ def test_a_replay_with_the_weights_that_were_used_gives_the_same_map() -> None:
     order = delayed(o, 300.0, 4)
     fusion, told = fold_in(o, order, 300)
     late, weight = np.zeros(3000, bool), np.zeros(3000, np.float32)
-    late_by, error = np.zeros(3000, np.int64), np.zeros((3000, 4), np.float32)
+    late_by = np.zeros(3000, np.int64)
     for rows, updated in told:
         late[rows], weight[rows] = updated.late, updated.weight
-        late_by[rows], error[rows] = updated.late_by, updated.error
+        late_by[rows] = updated.late_by
     assert 0 < late.sum() < 2000
     assert len(np.unique(weight)) > 5
     again = Fusion(LATENESS_S)
-    again.update(o, Before(late, late_by, weight, error))
+    again.update(o, Before(late, late_by, weight))
     assert difference(fusion, again) <= 1e-6
     assert [again.trust(v) for v in range(12)] == pytest.approx([fusion.trust(v) for v in range(12)], abs=1e-6)
 

@@ -160,7 +160,7 @@ def test_a_flood_of_one_vehicle_is_bounded_in_the_window_and_told_as_not_fused()
     fusion.update(observations([70.0], [8], value([0.5])))
     assert fusion.waiting == c.WAITING_MOST + 1
     again = Fusion(120.0)
-    told = (np.concatenate(of) for of in zip(*((f.late, f.late_by, f.weight, f.error) for f in updated), strict=True))
+    told = (np.concatenate(of) for of in zip(*((f.late, f.late_by, f.weight) for f in updated), strict=True))
     again.update(o, Before(*told))
     again.update(observations([70.0], [8], value([0.5])))
     np.testing.assert_array_equal(belief(again), belief(fusion))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fleet_service.cli import main
-from fleet_service.lab import agent, attacks, bars, campaign, changes, exact, fleets, rules, town
+from fleet_service.lab import agent, attacks, bars, campaign, changes, exact, fleets, rules, third_party, town
 from fleet_service.lab.drive import arrivals, novel, rows_of
 from fleet_service.lab.score import coverage, of_beliefs, safe
 from schemas import mugrid
@@ -23,7 +23,8 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     for module, name, value in (
         (fleets, "FLEETS", brief), (fleets, "AT", (6,)), (changes, "MINUTES", 5), (changes, "CHANGE", 3),
         (attacks, "BEGIN", 4), (attacks, "MINUTES", 6), (exact, "MINUTES", 5), (exact, "UNEXCITED", (3,)),
-        (attacks, "ENOUGH", 0),
+        (attacks, "ENOUGH", 0), (third_party, "MINUTES", 5), (third_party, "CHANGE_VISITS", 30),
+        (third_party, "COLD_SEEDS", 2), (third_party, "VISITS", 5),
     ):  # fmt: skip
         monkeypatch.setattr(module, name, value)
 
@@ -37,7 +38,7 @@ def test_a_quick_campaign_writes_every_figure_with_its_bar_the_table_and_the_plo
     found = {row["name"]: row for row in rows}
     assert set(bars.BARS) <= set(found)
     missing = {name for name in bars.BARS if found[name]["value"] is None}
-    assert missing >= {"fusion.whole_way.coverage90", "fusion.whole_way.rmse", "fusion.whole_way.level.rmse"}
+    assert missing >= {"fusion.whole_way.crps", "fusion.whole_way.rmse.after6", "fusion.whole_way.level.rmse"}
     assert all(
         name.startswith(("fusion.whole_way", "fusion.resampled", "fusion.false", "fusion.missed", "fusion.clean"))
         for name in missing
@@ -56,7 +57,7 @@ def test_end_to_end_alone_lists_its_figures_and_no_others(tmp_path: Path) -> Non
     assert names == {name for name in bars.BARS if name.startswith(campaign.END_TO_END)}
     assert "fusion.whole_way.hills.coverage90" in names
     assert not any(figure.holds for figure in found)
-    assert [world.rough for world in campaign.drives_end_to_end(quick=True)] == [0.0, 0.5, *[0.5] * 5]
+    assert [world.rough for world in campaign.drives_end_to_end(quick=True)] == [0.0, 0.5, *[0.5] * 10]
 
 
 def test_a_missing_figure_fails_the_campaign() -> None:

@@ -43,7 +43,9 @@ def test_an_alert_is_judged_by_what_is_believed_of_the_road() -> None:
     believed = fusion.believed(slots) @ SLIPPERY_SHARE
     assert fusion.slippery(slots) == pytest.approx(believed, abs=1e-9)
     told = {alert.cell: float(alert.reason.split()[4]) for alert in alerts.updated(slots)}
-    assert told == {int(c): round(float(p), 2) for c, p in zip(fusion.cell, believed, strict=True) if p > RAISE_ABOVE}
+    known = {int(c): round(float(p), 2) for c, p in zip(fusion.cell, believed, strict=True) if p > RAISE_ABOVE}
+    assert told.items() <= known.items()
+    assert {cell for cell, p in known.items() if p > 0.95} <= set(told)  # evidence below 1 nat is no witness
     assert 0 < len(told) < fusion.size
 
 
@@ -77,21 +79,28 @@ def test_old_ice_does_not_corroborate_new_ice() -> None:
     assert not alerts.updated(updated.slots)
 
 
-def called(mu: float, vehicles: range, then: float, others: range) -> tuple[Fusion, list[bool]]:
-    """A cell that `vehicles` called `mu` and afterwards each of `others` `then`; whether it was under an alert."""
+def called(
+    mu: float, vehicles: range, then: float, others: range, wait: float = 400.0
+) -> tuple[Fusion, list[bool]]:  # fmt: skip
+    """A cell that `vehicles` called `mu` and `wait` s later each of `others` `then`; whether it was under an alert."""
     fusion = Fusion(120.0)
     alerts = Alerts(fusion)
     under = []
     for k, vehicle in enumerate([*vehicles, *others]):
         later = k >= len(vehicles)  # by then the first ones are known
-        updated = fusion.update(observations([20.0 * k + 400.0 * later], [vehicle], value([then if later else mu])))
+        updated = fusion.update(observations([20.0 * k + wait * later], [vehicle], value([then if later else mu])))
         alerts.updated(updated.slots)
         under.append(bool(alerts.raised))
     return fusion, under[len(vehicles) :]
 
 
-def test_what_many_called_dry_takes_four_sources_however_sure_the_belief_is() -> None:
-    fusion, under = called(0.85, range(20), 0.2, range(5, 11))
+def test_two_witnesses_of_new_ice_raise_an_alert_on_a_road_that_was_dry_before() -> None:
+    _, under = called(0.85, range(20), 0.2, range(5, 11), wait=700.0)
+    assert under == [False, True, True, True, True, True]
+
+
+def test_dry_witnesses_of_the_last_minutes_ask_for_four_witnesses_of_ice() -> None:
+    fusion, under = called(0.85, range(20), 0.2, range(5, 11), wait=200.0)
     assert slippery(belief(fusion)) > 0.9
     assert under == [False, False, False, True, True, True]
 
@@ -124,23 +133,24 @@ def test_bounds_clear_an_alert_when_only_a_dry_road_gives_so_much_grip() -> None
         assert bool(alerts.raised) is stands
 
 
-def test_what_many_called_ice_takes_five_vehicles_to_clear() -> None:
-    fusion, under = called(0.2, range(20), 0.85, range(5, 11))
+@pytest.mark.parametrize(("wait", "needed"), [(400.0, 5), (700.0, 4)])
+def test_ice_takes_four_vehicles_to_clear_and_five_where_it_is_fresh(wait: float, needed: int) -> None:
+    fusion, under = called(0.2, range(20), 0.85, range(5, 11), wait)
     assert slippery(belief(fusion)) < 0.05
-    assert under == [True, True, True, True, False, False]
+    assert under == [True] * (needed - 1) + [False] * (7 - needed)
 
 
 def test_who_lost_its_trust_corroborates_nothing_of_what_it_reported_before() -> None:
     fusion, _ = called(0.2, range(4), 0.2, range(0))
     slot = np.zeros(1, np.int64)
-    assert fusion.sources(slot, ICE, 0)[0] == [4]
+    assert (fusion.sources(slot, ICE, 0) > 0).sum() == 4
     rng = np.random.default_rng(3)
     for cell in range(40):  # elsewhere the first two say dry things of ice
         who = rng.permutation(12)
         mu = np.where(who < 2, 0.9, 0.2 + 0.02 * rng.normal(size=12))
         fusion.update(observations(200.0 + 20.0 * cell + np.arange(12), who, value(mu), cell=cell))
     assert fusion.trust(0) < 0.5 < fusion.trust(2)
-    assert fusion.sources(slot, ICE, 0)[0] == [2]
+    assert (fusion.sources(slot, ICE, 0) > 0).sum() == 2
 
 
 def test_an_alert_ends_only_when_grip_is_sure() -> None:

@@ -1,0 +1,279 @@
+"""Fleets that are not ours: vehicles of another make, with their own error model, that know only the public contract.
+
+Each vehicle has a gain error that is common to its value and to the grip that it reports as used. A scheme that learns
+a correction from both at once sees a relation that is no property of the road. Values have noise that their senders
+state. They send full log-likelihoods and none of the optional columns. Pure.
+
+Two drives:
+
+    honest fleet   300 cells in stretches of three; 15 visits per cell in 40 minutes, half of them excited
+    change         30 cells of .85 turn to .15 and back, each for 40 minutes, in a town as above
+
+Legend
+    g    gain error of a vehicle, relative, the same in value and use        (V,)
+    s    share of the grip used in a visit                                   (n,)
+    z    value, mu·(1 + g)·(1 + NOISE·e), e standard normal                  (n,)
+    u    grip reported as used, s·mu·(1 + g)                                 (n,)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.random import Generator
+from scipy.special import log_ndtr
+
+from fleet_service.fusion import Fusion, Observations, observations_of
+from fleet_service.fusion.store.records import MANOEUVRES
+from fleet_service.lab import agent
+from fleet_service.lab.agent import SimulatedReports
+from fleet_service.lab.bars import EXCITED as CHANGE_EXCITED
+from fleet_service.lab.drive import LATENESS_S, rows_of
+from fleet_service.lab.score import Scores, coverage, joined, of_beliefs
+from fleet_service.lab.town import CELL_M, FIX_STD_M, LENGTH, START, Visits, cell_numbers
+from fleet_service.serve.alerts import Alerts
+from schemas import mugrid
+from schemas.numeric import BoolArray, FloatArray, IntArray
+from schemas.thresholds import NS
+
+VEHICLES: Final = 60
+CELLS: Final = 300
+STRETCH: Final = 3
+FRICTIONS: Final = (0.1, 0.2, 0.35, 0.5, 0.7, 0.9, 1.0)
+ICE: Final = 0.25  # truths below it count as ice
+MINUTES: Final = 40
+VISITS: Final = 15  # per cell
+HARD_VISITS: Final = 0.5  # share of the visits
+SHARE: Final = (0.75, 0.97)  # of the grip, used in an excited visit
+GENTLE: Final = (0.03, 0.12)  # ... and in any other
+NOISE: Final = 0.08
+GAINS: Final = {"third_party": 0.05, "third_party.gain_common": 0.10}  # standard deviations of g
+
+CHANGE_CELLS: Final = 30
+CHANGE_STRETCH: Final = 6  # no cell has a neighbour of another road
+DRY, WHITE = 0.85, 0.15
+CHANGE_VISITS: Final = 240  # per cell and road
+STEP_S: Final = 10.0  # the alerts are read so often
+NEVER: Final = 999
+CHANGE_SEEDS: Final = 3
+
+COLD_SEEDS: Final = 30  # fleets that a service of two minutes does not know
+COLD_GAP_S: Final = 5.0
+
+
+class ForeignDrive(NamedTuple):
+    """Visits, the friction of each cell at each visit's road, and the cells' numbers on the grid."""
+
+    visits: Visits
+    cells: IntArray
+
+
+def report(rng: Generator, gain: FloatArray, vehicle: IntArray, mu: FloatArray, excited: BoolArray) -> SimulatedReports:
+    """Return the reports of visits (n,) by vehicles with gain errors `gain` (V,)."""
+    n = len(mu)
+    share = np.where(excited, rng.uniform(*SHARE, n), rng.uniform(*GENTLE, n))
+    seen = mu * (1.0 + gain[vehicle])
+    reading = seen * (1.0 + NOISE * rng.normal(size=n))
+    used = share * seen
+    bound = log_ndtr((mugrid.CENTRES - used[:, None]) / agent.BOUND_STD)
+    value = agent.likelihood(np.maximum(reading, mugrid.LOWER), np.full(n, NOISE), 0.0)
+    std = np.where(excited, NOISE * reading, np.nan)
+    return SimulatedReports(
+        np.where(excited, reading, np.nan),
+        std,
+        used,
+        np.zeros(n, np.int64),
+        np.where(excited[:, None], value, bound),
+    )
+
+
+def observe(drive: ForeignDrive) -> Observations:
+    """Return the drive's visits as the service takes them: without a single optional column."""
+    rows = rows_of(drive.visits, drive.cells)
+    rows["used_longitudinal"] = rows["used_lateral"] = np.full(len(drive.visits), np.nan, np.float32)
+    return observations_of(rows, drive.visits.vehicle)
+
+
+def place_fixes(rng: Generator, place: IntArray) -> IntArray:
+    """Return the cells in which visits to the middles of cells (n,) are reported: fixes err by FIX_STD_M."""
+    offset = 0.5 * CELL_M + FIX_STD_M * rng.normal(size=len(place))
+    found = place + np.floor(offset / CELL_M).astype(np.int64)
+    return np.where(found // LENGTH == place // LENGTH, found, place)
+
+
+def drive_honest(rng: Generator, gain_std: float) -> tuple[ForeignDrive, FloatArray]:
+    """Return an honest fleet's drive, and the friction of each cell (CELLS,)."""
+    mu = np.repeat(rng.choice(FRICTIONS, CELLS // STRETCH), STRETCH)
+    n = CELLS * VISITS
+    place = np.repeat(np.arange(CELLS), VISITS)
+    seconds = rng.uniform(0.0, 60.0 * MINUTES, n)
+    vehicle = rng.integers(0, VEHICLES, n)
+    excited = rng.random(n) < HARD_VISITS
+    reports = report(rng, gain_std * rng.normal(size=VEHICLES), vehicle, mu[place], excited)
+    order = np.argsort(seconds, kind="stable")
+    visits = Visits(seconds, vehicle, place_fixes(rng, place), mu[place], excited, reports)
+    return ForeignDrive(take(visits, order), cell_numbers(CELLS)), mu
+
+
+def take(v: Visits, rows: IntArray) -> Visits:
+    """Return some of the visits."""
+    reports = SimulatedReports(*(column[rows] for column in vars(v.reports).values()))
+    return Visits(v.seconds[rows], v.vehicle[rows], v.place[rows], v.mu[rows], v.excited[rows], reports)
+
+
+def score_honest(rng: Generator, gain_std: float) -> tuple[Scores, BoolArray, IntArray]:
+    """Return the map's scores at the end of an honest drive, whether each cell has an alert, and excited visits."""
+    drive, mu = drive_honest(rng, gain_std)
+    fusion = Fusion(LATENESS_S)
+    alerts = Alerts(fusion)
+    o = observe(drive)
+    for rows in split_by(drive.visits.seconds, STEP_S):
+        alerts.updated(fusion.update(o.take(rows)).slots)
+    now = START + 60 * MINUTES * NS
+    alerts.faded(now)
+    slots = fusion.slots_of(drive.cells, np.zeros(CELLS, np.int64))
+    belief = fusion.beliefs(slots, now)
+    heard = np.bincount(drive.visits.place[drive.visits.excited], minlength=CELLS)
+    return of_beliefs(belief, mu, heard), np.isin(slots, list(alerts.raised)), heard
+
+
+def split_by(seconds: FloatArray, step: float) -> list[IntArray]:
+    """Return the rows of visits, which are in order of time, in portions of `step` seconds."""
+    borders = np.flatnonzero(np.diff(seconds // step)) + 1
+    return np.split(np.arange(len(seconds)), borders)
+
+
+def measure_honest(name: str, gain_std: float, seeds: range) -> dict[str, float]:
+    """Return coverage, false grip, false ice, error and alerts of an honest fleet over `seeds`."""
+    found = [score_honest(np.random.default_rng([seed, 23]), gain_std) for seed in seeds]
+    scores = joined([one[0] for one in found])
+    alerted = np.concatenate([one[1] for one in found])
+    icy = scores.truth < ICE
+    dry = scores.truth > 0.45
+    return {
+        f"{name}.coverage90": coverage(scores),
+        f"{name}.false_grip": share_of(scores.rank < 0.05),
+        f"{name}.rmse": float(np.sqrt(np.mean(scores.error**2))),
+        f"{name}.width": float(scores.width.mean()),
+        f"{name}.missed_ice": share_of(~alerted[icy]),
+        f"{name}.false_ice": share_of(alerted[dry]),
+        f"{name}.slippery.missed": share_of(scores.slippery[icy] < 0.3),
+    }
+
+
+def share_of(cells: BoolArray) -> float:
+    """Return the share of cells that are true; NaN without cells."""
+    return float(cells.mean()) if len(cells) else float("nan")
+
+
+def drive_change(rng: Generator, excitement: float) -> ForeignDrive:
+    """Return a drive over cells that are DRY, then WHITE, then DRY again, in a town where the same fleet drives.
+
+    The changing cells come first; the honest fleet's cells, with its visits for as long, come after them.
+    """
+    town_mu = np.repeat(rng.choice(FRICTIONS, CELLS // STRETCH), STRETCH)
+    changing = CHANGE_CELLS * CHANGE_VISITS * 3
+    n = changing + CELLS * VISITS * 3
+    seconds = np.sort(rng.uniform(0.0, 3 * 60.0 * MINUTES, n))
+    road = (seconds // (60.0 * MINUTES)).astype(np.int64)
+    here = rng.random(n) < changing / n
+    place = np.where(here, rng.integers(0, CHANGE_CELLS, n), CHANGE_CELLS + rng.integers(0, CELLS, n))
+    mu = np.where(here, np.where(road == 1, WHITE, DRY), town_mu[np.maximum(place - CHANGE_CELLS, 0)])
+    vehicle = rng.integers(0, VEHICLES, n)
+    excited = rng.random(n) < excitement
+    reports = report(rng, GAINS["third_party"] * rng.normal(size=VEHICLES), vehicle, mu, excited)
+    roads = cell_numbers(CHANGE_CELLS * CHANGE_STRETCH + CELLS)
+    cells = np.concatenate(
+        [roads[: CHANGE_CELLS * CHANGE_STRETCH : CHANGE_STRETCH], roads[CHANGE_CELLS * CHANGE_STRETCH :]]
+    )
+    return ForeignDrive(Visits(seconds, vehicle, place, mu, excited, reports), cells)
+
+
+def count_passes(rng: Generator, excitement: float) -> tuple[IntArray, IntArray]:
+    """Return the excited passes of the white road before the alert, and of the dry one after it before its end.
+
+    Both (CHANGE_CELLS,); NEVER where it did not come.
+    """
+    drive = drive_change(rng, excitement)
+    v = drive.visits
+    o = observe(drive)
+    fusion = Fusion(LATENESS_S)
+    alerts = Alerts(fusion)
+    raised = np.full(CHANGE_CELLS, NEVER)
+    cleared = np.full(CHANGE_CELLS, NEVER)
+    passes = np.zeros(CHANGE_CELLS, np.int64)
+    phase = 0.0
+    turned = 60.0 * MINUTES
+    back = 2.0 * turned
+    for rows in split_by(v.seconds, STEP_S):
+        alerts.updated(fusion.update(o.take(rows)).slots)
+        last = v.seconds[rows[-1]]
+        if last // turned != phase:
+            phase = last // turned
+            passes[:] = 0
+        excited = rows[v.excited[rows] & (v.place[rows] < CHANGE_CELLS)]
+        passes += np.bincount(v.place[excited], minlength=CHANGE_CELLS)
+        slots = fusion.slots_of(drive.cells[:CHANGE_CELLS], np.zeros(CHANGE_CELLS, np.int64))
+        under = np.isin(slots, list(alerts.raised))
+        if turned <= last < back:
+            raised[under & (raised == NEVER)] = passes[under & (raised == NEVER)]
+        elif last >= back:
+            ended = ~under & (raised != NEVER) & (cleared == NEVER)
+            cleared[ended] = passes[ended]
+    return raised, cleared
+
+
+def measure_change(seeds: range) -> dict[str, float]:
+    """Return medians and 95 % quantiles of the passes by share of excited visits, and how many cells had no alert."""
+    out: dict[str, float] = {}
+    for percent in CHANGE_EXCITED:
+        found = [count_passes(np.random.default_rng([seed, 29]), percent / 100.0) for seed in seeds[:CHANGE_SEEDS]]
+        for name, which in (("raise", 0), ("clear", 1)):
+            passes = np.concatenate([one[which] for one in found])
+            label = f"third_party.{name}.excited_passes"
+            out[f"{label}.median.e{percent}"] = float(np.median(passes))
+            out[f"{label}.p95.e{percent}"] = float(np.quantile(passes, 0.95, method="higher"))
+            out[f"third_party.{name}.never.e{percent}"] = float(np.sum(passes == NEVER))
+    return out
+
+
+def count_cold(rng: Generator) -> int:
+    """Return how many passes over ice a service that knows nobody needs, by a fleet of the lab's own vehicles."""
+    n = VEHICLES
+    who = np.arange(n)
+    mu: FloatArray = np.full(n, WHITE)
+    sure = np.ones(n, bool)
+    along = np.zeros(n, np.int64)
+    share = agent.shares(rng, sure)
+    manoeuvre = rng.integers(0, MANOEUVRES, n)
+    passes = agent.Passes(who, mu, agent.COMMON * rng.normal() + 0.0 * mu, share, rng.normal(size=n), manoeuvre, sure)
+    reports = agent.report(rng, agent.Errors.draw(rng, n), passes)
+    seconds = np.asarray(COLD_GAP_S * who, np.float64)
+    o = observations_of(rows_of(Visits(seconds, who, along, mu, sure, reports)), who)
+    fusion = Fusion(LATENESS_S)
+    alerts = Alerts(fusion)
+    for k in range(n):
+        if any(alert.raised for alert in alerts.updated(fusion.update(o.take(np.array([k]))).slots)):
+            return k + 1
+    return NEVER
+
+
+def measure_cold(seed: int) -> dict[str, float]:
+    """Return the passes that ice needs in a service that knows nobody, over COLD_SEEDS fleets."""
+    found = np.array([count_cold(np.random.default_rng([seed, 31, k])) for k in range(COLD_SEEDS)])
+    return {
+        "cold.ice_passes.median": float(np.median(found)),
+        "cold.ice_passes.p90": float(np.quantile(found, 0.9, method="higher")),
+    }
+
+
+def measure(seeds: range, log_line: Callable[[str], None]) -> dict[str, float]:
+    """Return all figures of this module; `log_line` gets the progress."""
+    out: dict[str, float] = {}
+    for name, gain_std in GAINS.items():
+        out |= measure_honest(name, gain_std, seeds)
+        log_line(f"{name}: {len(seeds)} fleets")
+    out |= measure_change(seeds)
+    return {f"fusion.{name}": value for name, value in (out | measure_cold(seeds[0])).items()}
