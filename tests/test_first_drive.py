@@ -1,4 +1,4 @@
-"""README's first drive: few commands, and what they put onto the map raises no alert and reads as slippery nowhere."""
+"""The tutorial's first drive has few commands, raises no alert, and is slippery nowhere on the map."""
 
 from __future__ import annotations
 

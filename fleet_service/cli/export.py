@@ -47,7 +47,12 @@ _NEEDS: Final = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_archive(parser, required=False)
-    parser.add_argument("what", choices=(*WHAT, DATEX, ICEBERG), metavar="|".join((*WHAT, DATEX, ICEBERG)))
+    parser.add_argument(
+        "what",
+        choices=(*WHAT, DATEX, ICEBERG),
+        metavar="|".join((*WHAT, DATEX, ICEBERG)),
+        help="the part of the archive, or of the live map",
+    )
     parser.add_argument("--out", metavar="FILE", type=Path, help=f"ends in {', '.join(ENDINGS)}; datex: in .xml")
     add_part(parser)
     parser.add_argument(

@@ -25,6 +25,7 @@ from schemas.config import ZenohSettings
 from schemas.runtime.commandline import Command
 from schemas.runtime.zenoh_session import open_session
 from schemas.wire import Kind
+from tests import reference_pages
 from tests.buckets import BucketServer
 from tests.faults.processes import Part
 from tests.fleet_service.app.test_service import Fleet
@@ -35,20 +36,17 @@ from tests.waiting import until
 COMMAND = [sys.executable, "-m", "fleet_service.cli"]
 
 
-README = Path(cli.__file__).parents[1] / "README.md"
-
-
 @pytest.mark.parametrize("command", cli.COMMANDS, ids=lambda command: str(command.name))
-def test_every_command_has_help_and_stands_in_the_readme_with_all_its_options(
+def test_every_command_has_help_and_every_option_is_in_the_reference(
     command: Command, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit, match="0"):
         main([command.name, "--help"])
     options = re.findall(r"^  (--[a-z-]+)", capsys.readouterr().out, re.MULTILINE)
-    written = "".join(re.findall(rf"^fleet-service {command.name} .*(?:\n  .*)*", README.read_text(), re.MULTILINE))
-    assert written
+    page = reference_pages.command_page("fleet-service")
+    assert f"## `{command.name}`" in page
     assert options or command.name == "completion"
-    assert not [option for option in options if option not in written]
+    assert not [option for option in options if option not in page]
 
 
 def test_the_help_of_analyze_names_every_question() -> None:
