@@ -63,7 +63,7 @@ IRREGULAR: Final = (
     "spent split spoken spread stood stuck swept sworn taken taught thought thrown told torn understood woken won worn "
     "written"
 )
-PARTICIPLES: Final = set(IRREGULAR.split()) - {"bound", "fit", "let", "put", "read", "run", "set", "split"}
+PARTICIPLES: Final = set(IRREGULAR.split()) - {"bound", "fit", "let", "put", "read", "run", "set", "split", "spread"}
 DUNDER: Final = re.compile(r"__\w+__")
 
 
@@ -156,7 +156,8 @@ def prose(text: str) -> str:
 
 def sentences(text: str) -> list[str]:
     """Return the sentences of a page's prose; a list item or paragraph ends a sentence."""
-    blocks = re.split(r"\n\s*\n|\n\s*(?:[-*]|\d+\.)\s", "\n" + prose(text))
+    items = re.sub(r"^\s*(?:[-*]|\d+\.)\s+", "\n\n", prose(text), flags=re.MULTILINE)
+    blocks = re.split(r"\n\s*\n", items)
     found = []
     for block in blocks:
         found += re.split(r"(?<=[.!?:;])\s+(?=[\"(*`A-Z0-9])", " ".join(block.split()))

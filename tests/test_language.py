@@ -8,6 +8,7 @@ from __future__ import annotations
 import pytest
 
 from tests import language
+from tests.house import ROOT
 
 PACKAGES = pytest.mark.parametrize("package", language.PACKAGES)
 MOST_WORDS = 25_000
@@ -32,7 +33,7 @@ def test_language_of_pages_is_not_worse_than_their_ceilings() -> None:
 def test_ceilings_have_every_package_and_only_existing_pages() -> None:
     ceilings = language.ceilings()
     assert set(ceilings["packages"]) == set(language.PACKAGES)
-    assert not [page for page in ceilings["pages"] if page != "*" and not (language.ROOT / page).exists()]
+    assert not [page for page in ceilings["pages"] if page != "*" and not (ROOT / page).exists()]
 
 
 @pytest.mark.parametrize(
