@@ -1,4 +1,4 @@
-"""The service without its network: messages in; alerts, tiles, acknowledgements and answers out.
+"""Core of the service without its network: messages in; alerts, tiles, acknowledgements and answers out.
 
 One worker calls `ingest`, `begin_flush`, `written`, `flush`, `tile` and `fade_alerts`; queries come from other threads,
 so that a lock guards the map.
@@ -64,12 +64,12 @@ ERASED = "what it was raised on was erased"
 
 
 class Engine:
-    """State of one service, rebuilt from its archive; `seen` is the latest time that a report told [ns].
+    """State of one service, rebuilt from its archive; `seen` is the latest time in a report [ns].
 
     Args:
         config: settings.
         root: of the archive; it is locked while the engine is open.
-        holding: of the archive, which is closed with the engine; None: it is taken now, without a lease.
+        holding: ownership of the archive, closed with the engine; None to open the archive now, without a lease.
 
     Raises:
         InputError: another service holds the archive.
@@ -87,7 +87,7 @@ class Engine:
             raise
 
     def _open(self, config: ServiceConfig, root: Path) -> None:
-        """Begin with what the archive holds."""
+        """Load the state from the archive."""
         self.counts: Counter[str] = Counter()
         self.report_lag_s = 0.0  # between the end of the newest visit and its arrival
         self._tracks, self._places = Tracks(), NewCells()
@@ -110,7 +110,7 @@ class Engine:
         warm_up()
 
     def _know(self, memory: Memory) -> None:
-        """Go on with what is known of the archive."""
+        """Adopt a state loaded from the archive."""
         self._memory = memory
         self.fusion, self.map, self._alerts, self._streams = memory.fusion, memory.map, memory.alerts, memory.streams
         self._visitors = memory.visitors
@@ -119,10 +119,10 @@ class Engine:
         self.weather.fusion = self.fusion
 
     def recall(self, before: Callable[[], None]) -> None:
-        """Do something, and know what the archive tells then and nothing else; in `between`.
+        """Call `before`, then replace the state by what the archive holds; call it in `between`.
 
         Raises:
-            OSError: the archive cannot be read; what was known stays.
+            OSError: the archive cannot be read; the state stays.
         """
         stood = self._alerts.standing
         before()
@@ -135,20 +135,21 @@ class Engine:
             self._ended += [replace(alert, raised=False, reason=ERASED) for alert in ended]
 
     def drop_old(self) -> int:
-        """Drop cells that are back at the prior and old; returns how many. In `between`."""
+        """Drop old cells that are back at the prior; return their number. Call it in `between`."""
         with self._guard:
             return self._memory.drop_old()
 
     def checkpoint(self, stop: threading.Event) -> Taken | None:
-        """What the service knows, and the segment up to which everything is in it; None if stopped meanwhile.
+        """Return the state and the last segment it includes; None if stopped meanwhile.
 
-        The worker takes it, right after a segment: then every row that is in it is on disk. Called by another thread.
+        The worker copies the state right after a segment, when every row in it is on disk. Another thread calls this.
         """
         return self.between(self._image, stop)
 
     def between(self, work: Callable[[], T], stop: threading.Event) -> T | None:
-        """Let the worker do something right after a segment, when every row that it took is on disk, and return what
-        that gave; None if stopped meanwhile. Called by another thread.
+        """Let the worker run `work` right after a segment, when every row it took is on disk; return the result.
+
+        None if stopped meanwhile. Another thread calls this.
 
         Raises:
             OSError: no segment could be written for too long.
@@ -162,15 +163,15 @@ class Engine:
 
     @property
     def written_to(self) -> Cut:
-        """The segment that was written last."""
+        """Return the last written segment."""
         return self._log.newest
 
     def survived(self) -> None:
-        """It has run for a while with what it began from."""
+        """Record that the service has run for a while with the checkpoint it began from."""
         checkpoints.survived(self._root)
 
     def close(self) -> None:
-        """Give the archive free."""
+        """Release the archive."""
         self._past.close()
         self.survived()
         self._log.close()
@@ -178,36 +179,36 @@ class Engine:
 
     @property
     def full(self) -> bool:
-        """Whether too many rows wait for the disk, or batches for the copy."""
+        """True if too many rows wait for the disk, or batches for the copy."""
         return self._log.rows >= WAITING_ROWS or self._log.unsettled >= WAITING_BATCHES
 
     @property
     def unsettled(self) -> int:
-        """Batches that are admitted and not on disk yet."""
+        """Number of admitted batches that are not on disk yet."""
         return self._log.unsettled
 
     @property
     def newest(self) -> int:
-        """Latest time that a record told which was let in [ns]; a restart finds the same as `seen`."""
+        """Latest time of an admitted record [ns]; a restart finds the same as `seen`."""
         return self._streams.newest
 
     @property
     def hangs_s(self) -> float:
-        """For how long a segment that is being written has not ended [s]."""
+        """How long the current segment has been written [s]."""
         return self._log.hangs_s
 
     @property
     def alerts(self) -> int:
-        """Cells under an alert."""
+        """Number of cells under alert."""
         return len(self._alerts.raised)
 
     @property
     def alerted(self) -> IntArray:
-        """Slots under an alert, (k,)."""
+        """Return the slots under alert, (k,)."""
         return np.array(sorted(self._alerts.raised), np.int64)
 
     def standing(self, wanted: Callable[[int], bool]) -> list[tuple[int, bytes]]:
-        """Tile and payload of the alerts that stand, for the tiles that are wanted."""
+        """Return tile and payload of the standing alerts of selected tiles."""
         tiles: dict[int, list[Alert]] = {}
         with self._guard:
             for alert in self._alerts.standing:
@@ -215,7 +216,7 @@ class Engine:
         return [(tile, wire.encode_standing(alerts)) for tile, alerts in tiles.items() if wanted(tile)]
 
     def repeated(self, most: int) -> list[Alert]:
-        """Alerts that stand, so many at the most and in turn: who was away hears them too."""
+        """Return at most `most` standing alerts, in turn, so that clients that were away receive them too."""
         with self._guard:
             standing = self._alerts.standing
         self._turn = self._turn % max(len(standing), 1)
@@ -224,7 +225,8 @@ class Engine:
         return out
 
     def ingest(self, messages: Sequence[Message], at: int | TimeNow) -> list[Alert]:
-        """Admit and fuse; returns the alerts that this raises or clears. `at`: the time, for sure if it is a number."""
+        """Admit and fuse messages; return the alerts that they raise or clear. `at` is the time; a number is
+        certain."""
         at = at if isinstance(at, TimeNow) else TimeNow(at)
         now, ahead = at.now, int(self._config.clock_ahead_s * NS) + at.slack
         clock = Clock(now, ahead, int(self._config.oldest_s * NS), at.doubt, at.least)
@@ -239,7 +241,7 @@ class Engine:
 
     @property
     def times(self) -> dict[str, int]:
-        """The newest time that each vehicle told in the last `ingest` [ns]."""
+        """Return the newest time that each vehicle reported in the last `ingest` [ns]."""
         return self._intake.times
 
     def _fuse(self, accepted: AcceptedBatches) -> list[Alert]:
@@ -270,7 +272,8 @@ class Engine:
         return raised
 
     def _beyond(self, rows: Rows) -> BoolArray:
-        """Which rows are archived and not fused: their vehicle cannot be there, or makes too many new places."""
+        """Return which rows are archived and not fused: their vehicle cannot be there, or reports too many new
+        places."""
         witness = rows["witness"]
         beyond = self._tracks.impossible(witness, rows["leave_time"], rows["latitude"], rows["longitude"])
         self.counts["implausible_moves"] += int(beyond.sum())
@@ -281,7 +284,7 @@ class Engine:
         return beyond
 
     def update_weather(self, now: int) -> None:
-        """Let the weather act that came since the last call."""
+        """Apply the weather that arrived since the last call."""
         self._use(self.weather.take(now))
 
     def _use(self, reports: Reports | None) -> None:
@@ -291,9 +294,9 @@ class Engine:
             self.counts["weather"] += len(reports.time)
 
     def flush(self) -> list[tuple[str, bytes]]:
-        """Write what waits as durable segments; returns vehicle and bytes of the acknowledgements to put after it.
+        """Write waiting rows as durable segments; return vehicle and bytes of the acknowledgements to send.
 
-        A full disk is counted and tried again at the next call; nothing of it is acknowledged.
+        A full disk is counted, and the next call tries again; nothing of it is acknowledged.
         """
         acks = self._acknowledged(self._log.flush)
         if not self.failing:
@@ -301,9 +304,9 @@ class Engine:
         return acks
 
     def begin_flush(self) -> list[tuple[str, bytes]]:
-        """As `flush`, but messages may be taken while segments are written; `written` gives what is acknowledged.
+        """Begin a flush; messages may be processed while segments are written. `written` returns the acknowledgements.
 
-        If something is wanted in `between`, it is `flush`.
+        If work waits for `between`, this is `flush`.
         """
         if self._wanted:
             return self.flush()
@@ -311,7 +314,7 @@ class Engine:
         return []
 
     def written(self) -> list[tuple[str, bytes]]:
-        """The acknowledgements to put after a flush that was begun, once it has ended."""
+        """Return the acknowledgements of a flush that was begun and has ended."""
         return self._acknowledged(self._log.end) if self._log.ended else []
 
     def _acknowledged(self, durable: Callable[[], list[BatchId]]) -> list[tuple[str, bytes]]:
@@ -330,16 +333,16 @@ class Engine:
         return self._acks.messages(self._now) if self.holding.may_acknowledge else []
 
     def tile(self, tile: int, now: int) -> bytes:
-        """The Arrow stream of a tile as far as it is public; empty where nothing of it is."""
+        """Return the Arrow stream of the public cells of a tile; empty if there are none."""
         shown = self._tiles.make(tile, now)
         return shown.payload if shown.cells.num_rows else b""
 
     def tiles(self, now: int) -> list[tuple[int, bytes]]:
-        """Tile and `tile` of every one that changed since the last call and is not empty."""
+        """Return tile and payload of every tile that changed since the last call and is not empty."""
         return [(tile, stream) for tile in self.map.take_dirty() if (stream := self.tile(tile, now))]
 
     def whole_map(self, now: int) -> pa.Table:
-        """All public cells; the lock is held for a few at a time, so that ingest goes on."""
+        """Return all public cells; the lock is held for a few at a time, so that ingest continues."""
         tables = []
         for start in range(0, self.fusion.size, SLOTS):
             with self._guard:
@@ -349,7 +352,7 @@ class Engine:
         return pa.concat_tables([*tables, MAP_SCHEMA.empty_table()])
 
     def fade_alerts(self, now: int) -> list[Alert]:
-        """Alerts that time alone cleared, or an erasure."""
+        """Return the alerts that expired or were erased."""
         with self._guard:
             ended, self._ended = [replace(alert, time=now) for alert in self._ended], []
             return ended + self._alerts.faded(now)
@@ -357,10 +360,10 @@ class Engine:
     def answer(
         self, query: MapQuery, wanted: Callable[[int], bool], now: int, only: int | None = None
     ) -> Iterator[tuple[int, bytes]]:
-        """Tile and payload of every reply to a query, each made when it is taken; see `answer.answer`.
+        """Yield tile and payload of every reply to a query, computed on demand; see `serve.query.answer`.
 
         Raises:
-            InputError: a route too long, a time in the future, or an archive that cannot be read.
+            InputError: the route is too long, the time is in the future, or the archive cannot be read.
         """
         least = max(query.min_vehicles, self._config.public_vehicles)
         query = query.model_copy(update={"min_vehicles": least})
@@ -373,5 +376,5 @@ class Engine:
         return self._past.ask(past, wanted)
 
     def size(self, query: MapQuery, wanted: Callable[[int], bool], only: int | None = None) -> AnswerSize:
-        """What an answer may have at the most; errors as of `answer`."""
+        """Return the upper bound of an answer's size; errors as for `answer`."""
         return size_asked(self._tiles, query, wanted, only)

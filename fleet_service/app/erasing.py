@@ -1,13 +1,13 @@
-"""Erasure beside a running service: what its owner asked for in `archive.requests`, done in the thread of the upkeep.
+"""Erasure in a running service: handles the requests of `archive.requests` in the thread of the background jobs.
 
-    a segment; what the service knows is on disk up to it
-    in a process of its own:  the vehicle's rows leave the files, and all others, read again, make a checkpoint
-    between two segments:     the service forgets all it knows and begins from that checkpoint and the log since
+    a segment; the service's state is on disk up to it
+    in a separate process:    the vehicle's rows leave the files, and all others, read again, make a checkpoint
+    between two segments:     the service drops its state and begins from that checkpoint and the log since
 
-Checkpoints, snapshots, retention and compaction are of the same thread, so that none of them meets a half of it; others
-wait for the lock of compaction. Messages wait for as long as a start from a checkpoint takes. A service that dies amid
-of it finds the question at its next start, and no checkpoint with the vehicle in it. What the vehicle measures
-afterwards is new.
+Checkpoints, snapshots, retention and compaction run in the same thread, so none of them sees an incomplete erasure.
+Others wait for the lock of compaction. Messages wait for as long as a start from a checkpoint takes. If the service
+dies during the erasure, its next start finds the request, and no checkpoint contains the vehicle. Later measurements of
+the vehicle are new.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from schemas.errors import InputError
 
 
 def asked(engine: Engine, config: ServiceConfig, root: Path, stop: threading.Event) -> str | None:
-    """Answer the questions that wait; returns a line for the operator."""
+    """Handle waiting requests; return a line for the operator."""
     rows = answered = 0
     for question in requests.waiting(root):
         try:
@@ -52,7 +52,7 @@ def asked(engine: Engine, config: ServiceConfig, root: Path, stop: threading.Eve
 
 
 def _followed(copy: Copy) -> str | None:
-    """Let what was erased go from the copy too; what keeps it, and then the upkeep does it later."""
+    """Erase in the copy too; return why this is incomplete, in which case a background job does it later."""
     try:
         copy.follow()
     except OSError as error:
@@ -63,11 +63,11 @@ def _followed(copy: Copy) -> str | None:
 def _erase(
     engine: Engine, config: ServiceConfig, root: Path, wanted: Erasure, stop: threading.Event
 ) -> dict[str, Any] | None:  # fmt: skip
-    """What was done; None if the service stops before it is.
+    """Return the result; None if the service stops before the end.
 
     Raises:
         InputError: there is no such month, or a file is damaged.
-        OSError: a file cannot be read or written; to be tried again.
+        OSError: a file cannot be read or written; the erasure is tried again.
     """
     key_of(root, wanted.month)
     vehicle = wanted.vehicle
@@ -86,7 +86,7 @@ def _erase(
 
 
 def _recalled(engine: Engine, before: Callable[[], None], stop: threading.Event) -> bool | None:
-    """Whether the service has done something and forgot what it knew before; None if it stops first."""
+    """Replace the service's state after calling `before`; None if it stops first."""
 
     def work() -> bool:
         engine.recall(before)
@@ -96,10 +96,10 @@ def _recalled(engine: Engine, before: Callable[[], None], stop: threading.Event)
 
 
 def apart(root: Path, request: dict[str, Any]) -> dict[str, Any]:
-    """The part of a process of its own.
+    """Do the part of the separate process.
 
     Raises:
-        InputError, OSError: as of `retention.forget_vehicle`.
+        InputError, OSError: as for `retention.forget_vehicle`.
     """
     known = weather.files(root)  # one that comes meanwhile is read again, which changes nothing
     with erased(root, request["vehicle"], request["month"]) as done:

@@ -1,4 +1,4 @@
-"""What a running service does for its archive now and then, at low priority beside the worker."""
+"""Background jobs of a running service for its archive, at low priority next to the worker."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _NICE: Final = 10  # the worker goes first
 
 
 class Job(NamedTuple):
-    """Something to do every so often: returns a line for the operator, or None; 0 seconds: never."""
+    """Periodic work: returns a line for the operator, or None; a period of 0 seconds means never."""
 
     name: str
     every_s: float
@@ -47,7 +47,7 @@ class Job(NamedTuple):
 
 
 def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Callable[[], TimeNow]) -> list[Job]:
-    """What keeps an archive in order, as the settings say; `moment` is the service's time."""
+    """Return the jobs that maintain an archive, according to the settings; `moment` returns the service's time."""
 
     def compaction(stop: threading.Event) -> str | None:
         if engine.copy is not None and engine.failing:  # compacted, its segments would never be put as such
@@ -91,7 +91,7 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
         return None
 
     def with_disk_space(work: Callable[[threading.Event], str | None]) -> Callable[[threading.Event], str | None]:
-        """On a full disk a job that makes room has the reserve to work with."""
+        """Release the reserve to a job that makes room, if the disk is full."""
 
         def done(stop: threading.Event) -> str | None:
             try:
@@ -135,10 +135,10 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
 
 
 class Upkeep:
-    """The jobs while they are done, in a thread of their own.
+    """Thread that runs the jobs.
 
     Attributes:
-        failed: how often in a row each job has failed that failed the last time.
+        failed: number of consecutive failures per job whose last run failed.
     """
 
     def __init__(self, jobs: Sequence[Job], counts: Counter[str], log_line: Callable[[str], None]) -> None:
@@ -150,7 +150,7 @@ class Upkeep:
         self._thread = threading.Thread(target=self._keep, name="upkeep")
 
     def troubles(self) -> list[str]:
-        """What is not as it should be."""
+        """Return one message per failed or hanging job."""
         found = [f"{name} failed {times} times in a row" for name, times in list(self.failed.items())]
         busy = self._busy
         if busy is not None and time.monotonic() - busy[1] > HANGS_S:
@@ -161,7 +161,7 @@ class Upkeep:
 
     @property
     def ended(self) -> bool:
-        """Whether its thread is gone though nobody stopped it."""
+        """Return True if the thread has ended although nobody stopped it."""
         return self._thread.ident is not None and not self._thread.is_alive() and not self._stop.is_set()
 
     def __enter__(self) -> Upkeep:
@@ -183,7 +183,7 @@ class Upkeep:
             due[job] = time.monotonic() + again_s
 
     def _done(self, job: Job) -> bool:
-        """Do one turn of a job; whether it went well. Whatever is wrong with it, the others must go on."""
+        """Run one turn of a job; return True on success. A failure must not affect the other jobs."""
         self._busy = (job.name, time.monotonic())
         try:
             line = job.work(self._stop)

@@ -1,4 +1,4 @@
-"""What a service knows of its archive: from the newest checkpoint and the log after it, or from the log alone."""
+"""State of a service, loaded from the newest checkpoint and the log after it, or from the log alone."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ SLOTS: Final = 20_000  # at once: a lock is held for 40 ms, and little memory is
 
 
 class Memory(NamedTuple):
-    """What is known.
+    """State of a service.
 
     Attributes:
         fusion, map, alerts: of all observations.
-        streams: batches that were admitted.
-        weather: all reports that were used.
-        refused: checkpoints that could not be begun from.
-        visitors: who was where lately; None, where every cell is public.
+        streams: admitted batches.
+        weather: all weather reports used.
+        refused: checkpoints that could not be loaded.
+        visitors: recent vehicles per cell; None if every cell is public.
     """
 
     fusion: Fusion
@@ -53,7 +53,7 @@ class Memory(NamedTuple):
     visitors: Visitors | None
 
     def drop_old(self) -> int:
-        """Drop cells that nobody visited for KEPT_NS: what is believed of them is the prior again; returns how many."""
+        """Drop cells not visited for KEPT_NS, whose belief is the prior again; return their number."""
         newest = self.fusion.checkpoint or 0
         stale = self.fusion.untouched(newest - KEPT_NS)
         stale[sorted(self.alerts.raised)] = False
@@ -68,13 +68,14 @@ class Memory(NamedTuple):
         return 0
 
     def image(self, cut: Cut, weather: Iterable[Path]) -> Taken:
-        """What a checkpoint keeps of it; everything up to the segment `cut`, and these files of weather, are in it."""
+        """Return the content of a checkpoint, which includes everything up to the segment `cut` and these weather
+        files."""
         tables = image_of(self.fusion, self.alerts.standing, self.streams) | visited(self.visitors)
         return Taken(tables, cut, tuple(path.name for path in weather))
 
 
 def visited(visitors: Visitors | None) -> dict[str, pa.Table]:
-    """Visitors as tables of a checkpoint: bits and the part of the window in columns of one length."""
+    """Return visitors as tables of a checkpoint: bits and part of the window in columns of one length."""
     if visitors is None:
         return {}
     columns = visitors.columns()
@@ -85,7 +86,7 @@ def visited(visitors: Visitors | None) -> dict[str, pa.Table]:
 def remember(
     root: Path, config: ServiceConfig, damaged: Callable[[Path, str], None] = pass_over, until: Cut | None = None
 ) -> Memory:
-    """Read the archive; of segments that are not compacted, those written up to `until`.
+    """Load the state from the archive; of uncompacted segments, those written up to `until`.
 
     Raises:
         OSError: it cannot be read.

@@ -1,4 +1,4 @@
-"""What an operator sees of a service in numbers, and what counts as trouble."""
+"""Metrics and health problems of a service."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ _SINGLE: Final = {
 
 
 class Pulse(NamedTuple):
-    """What only the running service knows: seconds since the worker's last turn, the queue, routers, clock lag [s], for
-    how long one tile of an answer is being made [s]."""
+    """Values that only the running service knows: seconds since the worker's last turn, queue length, routers, clock
+    lag [s], and how long the current tile of an answer takes [s]."""
 
     turn_age_s: float
     queued: int
@@ -50,7 +50,7 @@ class Pulse(NamedTuple):
 
 
 def metrics(engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path) -> list[Metric]:
-    """All values, now."""
+    """Return all current values."""
     counts = dict(engine.counts)
     away_s = 0.0 if engine.copy is None else engine.copy.away_s
     found = [Metric(name, "counter", text, _below(counts, prefix), label) for prefix, name, label, text in _FAMILIES]
@@ -81,7 +81,7 @@ def metrics(engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path) -> 
 
 
 def of_standby(config: ServiceConfig) -> list[Metric]:
-    """All values of a service that waits."""
+    """Return all values of a waiting service."""
     return [_serves(config, 0.0)]
 
 
@@ -91,7 +91,7 @@ def _serves(config: ServiceConfig, value: float) -> Metric:
 
 
 def troubles(engine: Engine, pulse: Pulse, config: ServiceConfig) -> list[str]:
-    """What is not as it should be."""
+    """Return one message per problem."""
     found = [] if pulse.routers else ["no router is connected"]
     if pulse.turn_age_s > STALLED_S:
         found.append(f"the worker has done nothing for {pulse.turn_age_s:.0f} s")

@@ -1,4 +1,4 @@
-"""Kernels loaded or compiled before the service is ready: compiling takes seconds, and vehicles wait meanwhile."""
+"""Loads or compiles kernels before the service is ready, because compiling takes seconds while vehicles wait."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ DONE: Final = "fleet_service.compiled"  # in the cache, once all of it is there
 
 
 def warm_up() -> None:
-    """Load the kernels. If they were never compiled, a process of its own does it: the compiler leaves a hundred
-    megabytes of holes, into which a service would grow for hours."""
+    """Load the kernels. If they were never compiled, a separate process compiles them: the compiler leaves a hundred
+    megabytes of fragmented memory, into which a service would grow for hours."""
     done = Path(kernel_cache("fleet_service")) / DONE
     if not done.exists():
         beside = subprocess.run([sys.executable, "-c", COMPILE], stderr=subprocess.DEVNULL, check=False)
@@ -41,7 +41,7 @@ def warm_up() -> None:
 
 
 def live() -> None:
-    """Take a throw-away map through its life: update, grow, advance, update late within the window, commit, believe."""
+    """Run a temporary map through its life: update, grow, advance, update late within the window, commit, believe."""
     fusion = Fusion(2 * EPOCH_NS * 1e-9)
     for epoch, cells in ((1, 2), (2, CELLS), (1, 2), (9, 2)):
         o = _visits(epoch * EPOCH_NS, cells)
@@ -59,7 +59,7 @@ def live() -> None:
 
 
 def _visits(time: int, cells: int) -> Observations:
-    """One visit to each of so many cells, by two vehicles."""
+    """Return one visit to each of `cells` cells, by two vehicles."""
     one, number, sector = np.ones(cells, np.int64), np.arange(cells), np.zeros(cells, np.int8)
     flat = as_reported(mugrid.encode_log_likelihood(np.zeros((cells, mugrid.BINS))))
     return Observations(

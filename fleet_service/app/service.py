@@ -52,13 +52,13 @@ LAG_S: Final = 1.0  # of the system's clock that is worth telling
 
 
 class Service:
-    """One service.
+    """One running service.
 
     Args:
         config: settings.
         root: of the archive.
-        log_line: takes the lines for the operator.
-        holding: of the archive; None: it is taken without a lease.
+        log_line: called with lines for the operator.
+        holding: ownership of the archive; None to open it without a lease.
 
     Raises:
         InputError: the archive belongs to another service.
@@ -86,7 +86,7 @@ class Service:
         self._followed = False  # by a service that has the lease now
 
     def run(self, stop: threading.Event) -> None:
-        """Serve until `stop` is set; then flush, acknowledge and leave."""
+        """Serve until `stop` is set; then flush, acknowledge and stop."""
         if self.engine.holding.lease is not None:
             self.engine.holding.lease.serves = self._works
         try:
@@ -99,7 +99,7 @@ class Service:
 
     @property
     def exit_code(self) -> int:
-        """0 where all that was admitted is on disk and nothing failed, else 1: also where another took over."""
+        """Return 0 if everything admitted is on disk and nothing failed, else 1, also if another service took over."""
         return 1 if self.failure is not None or self._followed or self.engine.unsettled else 0
 
     def _serve(self, session: zenoh.Session, stop: threading.Event, address: str) -> None:
@@ -125,14 +125,15 @@ class Service:
                 raise
 
     def _lost(self, came: Callable[[], bool]) -> bool:
-        """Whether another has taken over, by the lease, or by its tokens while the bucket does not say."""
+        """Return True if another service has taken over, by the lease, or by its tokens while the bucket does not
+        answer."""
         holding = self.engine.holding
         if not holding.may_acknowledge and came():
             holding.give_up()
         return holding.lost
 
     def _hanging(self) -> str | None:
-        """What has died or hangs beside the worker, so that only another start helps."""
+        """Return what has died or hangs next to the worker, so that only a restart helps."""
         if self.engine.hangs_s >= HANGS_S:
             return f"a segment is being written for {self.engine.hangs_s:.0f} s"
         if self._replies.hangs_s >= HANGS_S:
@@ -140,12 +141,12 @@ class Service:
         return "upkeep has ended" if self._upkeep.ended else None
 
     def _works(self) -> bool:
-        """Whether this service does for its regions what a successor could do."""
+        """Return True if this service can do for its regions what a successor could do."""
         session, turn_age_s = self._session, time.monotonic() - self._stepped_at
         return session is not None and turn_age_s < STUCK_S and bool(list(session.info.routers_zid()))
 
     def _monitored(self) -> AbstractContextManager[str | None]:
-        """Metrics and health, where the settings want them."""
+        """Serve metrics and health if the settings ask for it."""
         config, engine, root = self._config, self.engine, self._root
 
         def pulse() -> Pulse:
@@ -189,11 +190,11 @@ class Service:
                 queryable.undeclare()
 
     def _hand_over(self, query: zenoh.Query, session: zenoh.Session) -> None:
-        """Leave in good order, for the standby that is named."""
+        """Stop in good order, for the named standby."""
         self.engine.holding.to = moving.asked(query, session, self._config.regions) or self.engine.holding.to
 
     def _standing(self, asked: zenoh.Query) -> None:
-        """Tell who came late which alerts stand."""
+        """Reply with the standing alerts, for late clients."""
         expression = asked.key_expr
         with asked:
             for tile, alerts in self.engine.standing(
@@ -237,7 +238,7 @@ class Service:
             self.engine.survived()
 
     def _shut_down(self, session: zenoh.Session, stop: threading.Event) -> None:
-        """Take what is waiting, as far as LEAVE_S allows, and settle it; the rest its senders keep."""
+        """Process and settle waiting messages within LEAVE_S; senders keep the rest."""
         if self.engine.holding.lost:
             self._followed = True
             stop.set()  # then nothing that hangs on a bucket, or on a router, keeps it for long
@@ -294,14 +295,14 @@ class Service:
 
 
 def take(engine: Engine, clock: SteadyClock, messages: list[Message]) -> list[Alert]:
-    """Let an engine take messages now, and the clock hear what time they tell."""
+    """Let an engine process messages now, and pass their times to the clock."""
     alerts = engine.ingest(messages, clock.moment())
     clock.heard(engine.times)
     return alerts
 
 
 def put(session: zenoh.Session, key: str, payload: bytes, encoding: str) -> None:
-    """Put with the quality of service of the key's topic."""
+    """Publish with the quality of service of the key's topic."""
     topic = keys.parse(key).topic
     congestion = zenoh.CongestionControl.BLOCK if topic.block else zenoh.CongestionControl.DROP
     session.put(

@@ -1,7 +1,7 @@
-"""Which rows are wanted, by the range of a column: what a file's statistics can tell before anything is read.
+"""Row filter by the range of a column, which a file's statistics can evaluate before anything is read.
 
-Ranges and not expressions of Arrow's, whose machinery brings pandas along: 40 MB of a process, and a scan that holds
-several row groups whole.
+Ranges are used instead of Arrow's expressions. Those import pandas (40 MB per process), and their scan holds several
+complete row groups in memory.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ Bound = int | float | str | None
 
 
 class Between(NamedTuple):
-    """Rows whose value lies from `least` to `most`, both included; None: without an end. Times are whole microseconds.
-    A row without a value is not wanted."""
+    """Rows whose value lies from `least` to `most`, both included; None for no limit. Times are whole microseconds. A
+    row without a value is not selected."""
 
     column: str
     least: Bound = None
@@ -29,7 +29,7 @@ Where = Sequence[Between]
 
 
 def those(table: pa.Table, where: Where) -> pa.Table:
-    """The rows of a table that are wanted; it has all of the columns."""
+    """Return the selected rows of a table, with all columns."""
     for column, least, most in where:
         values = table[column]
         if pa.types.is_timestamp(values.type):
@@ -42,7 +42,7 @@ def those(table: pa.Table, where: Where) -> pa.Table:
 
 
 def groups(footer: pq.FileMetaData, where: Where) -> list[int]:
-    """Row groups of a file that may hold rows that are wanted, by their statistics."""
+    """Return the row groups of a file that may hold selected rows, by their statistics."""
     places = {footer.schema.column(at).path: at for at in range(footer.num_columns)}
     known = [(places[one.column], one) for one in where if one.column in places]
     return [

@@ -1,4 +1,4 @@
-"""From the log to the data set: inbox rows, sorted by cell and time, as one file per date and zone.
+"""Compaction: rows of the inbox, sorted by cell and time, become one file per date and zone.
 
 A round takes the oldest segments and only adds:
 
@@ -6,8 +6,8 @@ A round takes the oldest segments and only adds:
     2. they are renamed into place, and their folders synced
     3. the segments are deleted
 
-It may die between any two of these steps and need not be finished afterwards. A row of a segment counts as compacted
-if a file of its partition names the segment, so that `reading` sees it once, and the next round takes what is left.
+It may die between any two of these steps and need not be finished afterwards. A row of a segment counts as compacted if
+a file of its partition names the segment, so that `reading` sees it once, and the next round takes what is left.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ ROUND_ROWS: Final = 1_000_000
 
 
 class Compacted(NamedTuple):
-    """What a compaction did: rows moved, segments deleted, files added."""
+    """Result of a compaction: rows moved, segments deleted, files added."""
 
     rows: int
     segments: int
@@ -41,20 +41,20 @@ class Compacted(NamedTuple):
 
 
 def alone(root: Path) -> BinaryIO:
-    """Take the compacted files for this process, until the handle is closed.
+    """Lock the compacted files for this process until the handle is closed.
 
     Raises:
-        InputError: another process adds to them, or rewrites them.
+        InputError: another process adds to them or rewrites them.
     """
     return exclusive(root / "compaction.lock", f"{root} is being compacted", "wait until that has ended")
 
 
 @contextmanager
 def compacting(root: Path) -> Iterator[None]:
-    """Be the only one that adds to, or rewrites, the compacted files.
+    """Lock the compacted files while the block runs.
 
     Raises:
-        InputError: it is no archive, or another process does.
+        InputError: the folder is no archive, or another process has the lock.
     """
     layout.insist_on_archive(root)
     with alone(root):
@@ -93,7 +93,7 @@ def compact(root: Path, round_rows: int = ROUND_ROWS) -> Compacted:
 
 
 class _Rest(NamedTuple):
-    """Segments that wait, old ones first, and where an earlier run compacted some of their rows."""
+    """Segments that wait, oldest first, and the partitions to which an earlier run moved some of their rows."""
 
     root: Path
     kind: Kind
@@ -103,7 +103,7 @@ class _Rest(NamedTuple):
 
 
 def _round(rest: _Rest, most: int) -> Compacted:
-    """Move the next segments: so many rows, or one segment at least."""
+    """Move the next segments: about `most` rows, or at least one segment."""
     sources: list[Path] = []
     tables: list[pa.Table] = []
     newest = VERSION
@@ -126,15 +126,18 @@ def _round(rest: _Rest, most: int) -> Compacted:
 
 
 def together(tables: list[pa.Table], known: pa.Schema) -> pa.Table:
-    """Rows of segments of several versions: the columns that are known, null where a segment has none, and behind them
-    those that only a newer version knows, so that nothing is lost on the way back to it."""
+    """Join rows of segments of several versions.
+
+    The result has the known columns, null where a segment has none. Columns that only a newer version knows follow, so
+    that a downgrade loses nothing.
+    """
     others = [pa.schema([f for f in table.schema if f.name not in known.names]) for table in tables]
     schema = pa.schema([*known, *pa.unify_schemas(others, promote_options="permissive")])
     return pa.concat_tables([conformed(table, schema) for table in tables])
 
 
 def _place(root: Path, kind: Kind, name: str, table: pa.Table, footer: Mapping[str, str]) -> int:
-    """Write the files of a round and rename them into place; returns how many."""
+    """Write the files of a round and rename them into place; return their number."""
     drafts: list[tuple[Path, Path]] = []
     for partition, part in partitioned(table, kind):
         path = partition.folder(root, layout.TABLES[kind]) / name
@@ -149,7 +152,7 @@ def _place(root: Path, kind: Kind, name: str, table: pa.Table, footer: Mapping[s
 
 
 def runs(names: Iterable[str]) -> list[tuple[str, int, int]]:
-    """Names of segments, in order of age, as runs of consecutive numbers: SHARD-EPOCH, first, last."""
+    """Return names of segments, in order of age, as runs of consecutive numbers: SHARD-EPOCH, first, last."""
     out: list[tuple[str, int, int]] = []
     for name in names:
         prefix, n = Path(name).stem.rpartition("-")[0], layout.age(name)[1]
@@ -161,7 +164,7 @@ def runs(names: Iterable[str]) -> list[tuple[str, int, int]]:
 
 
 def partitioned(table: pa.Table, kind: Kind) -> Iterator[tuple[layout.Partition, pa.Table]]:
-    """Rows of each date and zone, sorted by cell and time."""
+    """Yield the rows of each date and zone, sorted by cell and time."""
     if not table.num_rows:
         return
     table = table.combine_chunks()

@@ -1,4 +1,4 @@
-"""Parts of the archive as files for other programs: GeoParquet, GeoJSON or CSV, by the ending of the name."""
+"""Export of parts of the archive as GeoParquet, GeoJSON or CSV, selected by the ending of the name."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Box = tuple[float, float, float, float]
 
 
 class Extract(NamedTuple):
-    """What is wanted: from, to [ns], the second excluded; west, south, east, north [deg]."""
+    """Selection: from, to [ns], the second excluded; west, south, east, north [deg]."""
 
     since: int
     until: int
@@ -38,7 +38,7 @@ class Extract(NamedTuple):
 
 
 def observations(root: Path, part: Extract) -> pa.Table:
-    """Rows of observations, inbox included, as points."""
+    """Return rows of observations, inbox included, as points."""
     where = [_within("leave_time", part)]
     if part.bbox is not None:
         west, south, east, north = part.bbox
@@ -52,7 +52,7 @@ def observations(root: Path, part: Extract) -> pa.Table:
 
 
 def snapshot_time(root: Path, part: Extract) -> int:
-    """When the last snapshot of the map before `until` was taken [ns]."""
+    """Return the time of the last snapshot of the map before `until` [ns]."""
     return snapshots.time_of(_snapshot(root, part))
 
 
@@ -64,12 +64,12 @@ def _snapshot(root: Path, part: Extract) -> Path:
 
 
 def seen_by(table: pa.Table, vehicles: int) -> pa.Table:
-    """Cells of so many vehicles or more."""
+    """Return cells with at least so many vehicles."""
     return table.filter(pc.greater_equal(table["vehicles"], pa.scalar(vehicles, pa.int32())))
 
 
 def map_then(root: Path, part: Extract) -> pa.Table:
-    """The last snapshot of the map before `until`."""
+    """Return the last snapshot of the map before `until`."""
     path = _snapshot(root, part)
     table = load(path, tables.MAP_ARCHIVE)
     if table is None:
@@ -79,7 +79,7 @@ def map_then(root: Path, part: Extract) -> pa.Table:
 
 
 def without(table: pa.Table, names: Sequence[str], known: BoolArray) -> pa.Table:
-    """A table whose columns `names` are null where nothing was measured: who colours by them paints no bound."""
+    """Return a table with nulls in the columns `names` where nothing was measured, so that no bound gets a colour."""
     for name in names:
         column = table[name]
         held: pa.ChunkedArray[Any] = pc.if_else(pa.array(known), column, pa.scalar(None, column.type))
@@ -88,7 +88,7 @@ def without(table: pa.Table, names: Sequence[str], known: BoolArray) -> pa.Table
 
 
 def cell_hours(root: Path, part: Extract) -> pa.Table:
-    """Parts of the roll-up, with the polygons of their cells."""
+    """Return parts of the roll-up with the polygons of their cells."""
     where = [_within("hour", part)]
     days = layout.days(root, rollup.TABLE, part.since // layout.DAY_NS, part.until // layout.DAY_NS)
     paths = sorted(path for folder in days for path in folder.glob("*/*.parquet"))
@@ -106,22 +106,22 @@ WHAT: Final[dict[str, Callable[[Path, Extract], pa.Table]]] = {
 
 
 def _within(column: str, part: Extract) -> Between:
-    """Rows from the first time on, before the second."""
+    """Return the filter for rows from the first time on and before the second."""
     return Between(column, -(-part.since // tables.US_STEP), -(-part.until // tables.US_STEP) - 1)
 
 
 def _inside(table: pa.Table, bbox: Box | None) -> pa.Table:
-    """Cells that touch a box."""
+    """Return the cells that touch a box."""
     if bbox is None:
         return table
     return table.filter(pa.array(grid.touches(bbox, grid.bounds(table["cell"].to_numpy()))))
 
 
 def write(table: pa.Table, path: Path) -> None:
-    """Write a GeoParquet table as the ending of the name says; CSV leaves binary and nested columns out.
+    """Write a GeoParquet table in the format of the name's ending; CSV omits binary and nested columns.
 
     Raises:
-        InputError: an unknown ending, or the file cannot be written.
+        InputError: the ending is unknown, or the file cannot be written.
     """
     writer = _WRITERS.get(path.suffix)
     if writer is None:
@@ -131,7 +131,7 @@ def write(table: pa.Table, path: Path) -> None:
 
 
 def features(table: pa.Table) -> Iterator[dict[str, Any]]:
-    """The rows of a GeoParquet table as GeoJSON has them; binary and nested columns are left out."""
+    """Yield the rows of a GeoParquet table as GeoJSON features; binary and nested columns are omitted."""
     flat = _flat(table)
     for geometry, *values in zip(geo.shapes(table), *(_texts(flat, name) for name in flat.schema.names), strict=True):
         properties = dict(zip(flat.schema.names, values, strict=True))
@@ -149,7 +149,7 @@ def _geojson(table: pa.Table, path: Path) -> None:
 
 
 def _texts(table: pa.Table, name: str) -> list[Any]:
-    """Values as JSON has them: times as ISO 8601 text, no NaN, no digits that single precision does not have."""
+    """Return values for JSON: times as ISO 8601 text, no NaN, no digits beyond single precision."""
     column = table[name]
     if pa.types.is_timestamp(column.type):
         us = column.cast(tables.US).cast(pa.int64()).to_numpy().astype("datetime64[us]")

@@ -1,7 +1,7 @@
-"""The compacted files as Iceberg tables: registered where they lie, nothing is copied; the inbox is never registered.
+"""Iceberg tables of the compacted files: registered without copying; the inbox is never registered.
 
-One registrar per table. What retention and forgetting remove or rewrite leaves the tables first (`let_go`), for a
-table that names a file that is gone can no longer be read.
+There is one registrar per table. Before retention and erasure remove or rewrite files, these files leave the tables
+(`let_go`), because a table that names a missing file cannot be read.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ PROPERTIES: Final = {
 
 
 class Place(NamedTuple):
-    """Where an archive is registered.
+    """Registration of an archive.
 
     Attributes:
-        catalog: a name of pyiceberg's configuration, or the URI of an SQL catalogue (`sqlite:////var/lib/tables.db`).
+        catalog: a name in pyiceberg's configuration, or the URI of an SQL catalogue (`sqlite:////var/lib/tables.db`).
         namespace: of the tables `observations` and `states`.
-        at: URL under which the tables' readers find the archive's folder; its mirror or copy, or itself.
+        at: URL at which readers of the tables find the archive's folder, its mirror or its copy.
     """
 
     catalog: str
@@ -49,7 +49,7 @@ class Place(NamedTuple):
 
 
 class Registered(NamedTuple):
-    """Files that came into the tables, files that left them, and rows that the tables have of the archive now."""
+    """Result: files added to the tables, files removed from them, and rows of the archive in them."""
 
     added: int
     dropped: int
@@ -57,7 +57,7 @@ class Registered(NamedTuple):
 
 
 def register(root: Path, place: Place) -> Registered:
-    """Make the tables name the compacted files of an archive as they are; again, it changes nothing.
+    """Register the compacted files of an archive in the tables; a repeated call changes nothing.
 
     Files of other archives in the same tables stay.
 
@@ -78,7 +78,7 @@ def register(root: Path, place: Place) -> Registered:
 
 
 def let_go(root: Path, paths: Sequence[Path]) -> None:
-    """Take files out of the tables that name them, before they are removed or rewritten.
+    """Remove files from the tables before they are removed or rewritten on disk.
 
     Raises:
         InputError: the archive is registered and pyiceberg is not installed, or the catalogue refuses.
@@ -96,10 +96,10 @@ def let_go(root: Path, paths: Sequence[Path]) -> None:
 
 
 def place_of(root: Path) -> Place | None:
-    """Where an archive is registered, if it is.
+    """Return the registration of an archive, if it has one.
 
     Raises:
-        InputError: what says so cannot be read: a file that a table names must not go unseen.
+        InputError: the record cannot be read; it must not be ignored, because tables may name files.
     """
     path = root / RECORD
     try:
@@ -111,7 +111,7 @@ def place_of(root: Path) -> Place | None:
 
 
 def _remember(root: Path, place: Place) -> None:
-    """Note where the archive is registered before it is, so that no file goes that a table names."""
+    """Record the registration before it happens, so that no registered file is removed unnoticed."""
     path = root / RECORD
     try:
         before = place_of(root)
@@ -141,7 +141,7 @@ def _catalog(place: Place) -> Catalog:
 
 
 def _table(catalog: Catalog, place: Place, kind: Kind) -> Table:
-    """The table of a kind, with every column that is known today."""
+    """Return the table of a kind with all columns known today."""
     from pyiceberg.transforms import DayTransform
 
     name, schema = (place.namespace, layout.TABLES[kind]), SCHEMAS[kind]
@@ -161,7 +161,7 @@ def _plain(schema: pa.Schema) -> pa.Schema:
 
 
 def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> Registered:
-    """Drop what is gone or no longer the same, add what is missing, in one commit."""
+    """Remove missing and changed files from a table and add new ones, in one commit."""
     there = {_name(root, place, path): path for path in layout.compacted(root, kind)}
     mine = {name: file for name, file in _held(table).items() if name.startswith(_folder(place))}
     # one that was rewritten elsewhere is known by its size
@@ -173,7 +173,7 @@ def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> Registere
 
 
 def _commit(table: Table, removed: list[Any], added: list[str]) -> None:
-    """Change a table at once, or not at all."""
+    """Change a table atomically."""
     if not removed and not added:
         return
     with table.transaction() as change:
@@ -186,7 +186,7 @@ def _commit(table: Table, removed: list[Any], added: list[str]) -> None:
 
 
 def _held(table: Table) -> dict[str, Any]:
-    """Files that a table names, by name."""
+    """Return the files that a table names, by name."""
     return {task.file.file_path: task.file for task in table.scan().plan_files()}
 
 
@@ -200,7 +200,7 @@ def _name(root: Path, place: Place, path: Path) -> str:
 
 @contextmanager
 def _said(place: Place) -> Iterator[None]:
-    """Errors of the catalogue as one line."""
+    """Turn errors of the catalogue into one line."""
     try:
         yield
     except InputError:

@@ -1,4 +1,4 @@
-"""Room set aside on the archive's disk, so that a full one leaves retention and compaction some to make more in."""
+"""Reserve on the archive's disk: retention and compaction use it to make room when the disk is full."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _LEAST_FREE: Final = 4 * SIZE
 
 
 def keep(root: Path) -> None:
-    """Set room aside, if there is plenty."""
+    """Allocate the reserve if there is plenty of room."""
     path = root / NAME
     with suppress(OSError):
         if not path.exists() and shutil.disk_usage(root).free > _LEAST_FREE:
@@ -23,7 +23,7 @@ def keep(root: Path) -> None:
 
 
 def give(root: Path) -> bool:
-    """Give the room free if the disk is full; whether that was so."""
+    """Release the reserve if the disk is full; return True if it was released."""
     path = root / NAME
     if not path.exists() or shutil.disk_usage(root).free > SIZE:
         return False

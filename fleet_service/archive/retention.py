@@ -1,4 +1,4 @@
-"""What is given up: raw rows after so many days, when their roll-ups stay; and what one vehicle left.
+"""Removal of data: raw rows after a number of days, when their roll-ups stay; and the rows of one vehicle.
 
 Only these two rewrite or remove compacted files, one file for one.
 """
@@ -37,7 +37,7 @@ _KEYS: Final = "keys"
 
 
 class Retired(NamedTuple):
-    """Days whose raw rows went, and files."""
+    """Result: days whose raw rows were removed, and files."""
 
     days: int
     files: int
@@ -67,7 +67,7 @@ def retire(root: Path, raw_days: int, today: date) -> Retired:
 
 
 def due(root: Path, raw_days: int, today: date) -> list[Path]:
-    """Folders of days whose raw rows `retire` removes.
+    """Return the folders of days whose raw rows `retire` removes.
 
     Raises:
         InputError: too few days.
@@ -83,7 +83,7 @@ def _last_to_go(raw_days: int, today: date) -> int:
 
 
 def forget_period(root: Path, month: str) -> None:
-    """Destroy the key of a month (2026-01): nobody can tell any more whose its pseudonyms were.
+    """Destroy the key of a month (2026-01): its pseudonyms cannot be attributed any more.
 
     Raises:
         InputError: there is no such key, or a service runs on the archive.
@@ -96,12 +96,12 @@ def forget_period(root: Path, month: str) -> None:
 
 
 def destroy_key(root: Path, month: str, newest: int) -> None:
-    """As `forget_period`, for who holds the archive and keeps nothing of the month in mind. What was measured in it
-    until `newest` [ns], the newest that the archive holds, does not come in again.
+    """Destroy the key like `forget_period`, for a caller that holds the archive and has no data of the month in memory.
+    Measurements of the month up to `newest` [ns], the newest in the archive, are not accepted again.
 
     Raises:
         InputError: there is no such key.
-        OSError: the disk is full or broken; the key may be there still.
+        OSError: the disk is full or broken; the key may still exist.
     """
     key = key_of(root, month)
     erasures.note(key.parent, month, newest)
@@ -111,8 +111,8 @@ def destroy_key(root: Path, month: str, newest: int) -> None:
 
 
 def _newest(root: Path, days: tuple[int, int | None], where: Where = (), until: float = math.inf) -> int:
-    """Newest first time of a record that the archive holds of these days [ns], -1 if of none; one that is not before
-    `until` will do."""
+    """Return the newest first time of a record of these days [ns], -1 if there is none; one not before `until` is
+    enough."""
     newest = -1
     for kind, name in layout.FIRST_TIME.items():
         for table in reading.read(root, kind, [name, *(one.column for one in where)], where, days):
@@ -123,7 +123,7 @@ def _newest(root: Path, days: tuple[int, int | None], where: Where = (), until: 
 
 
 class Forgotten(NamedTuple):
-    """What forgetting a vehicle changed: rows removed, files rewritten or removed."""
+    """Result of forgetting a vehicle: rows removed, files rewritten or removed."""
 
     rows: int
     files: tuple[Path, ...]
@@ -131,12 +131,13 @@ class Forgotten(NamedTuple):
 
 
 def forget_vehicle(root: Path, vehicle: str, month: str) -> Forgotten:
-    """Remove the rows of one vehicle in one month, and what could tell of them: lines of few vehicles in the month's
-    snapshots, files that were set aside, checkpoints. Roll-ups are made anew from what stays. What it measured in that
-    month until the newest of them does not come in again.
+    """Remove the rows of one vehicle in one month, and everything derived that could reveal them.
+
+    That is lines of few vehicles in the month's snapshots, files set aside, and checkpoints. Roll-ups are computed
+    again. Its measurements of that month up to the newest removed row are not accepted again.
 
     Raises:
-        InputError: the month's key is gone, or a service runs on the archive (it remembers more than its files).
+        InputError: the month's key does not exist, or a service runs on the archive (it has more in memory).
         OSError: a file cannot be read or written.
     """
     with lock(root):
@@ -148,11 +149,11 @@ def forget_vehicle(root: Path, vehicle: str, month: str) -> Forgotten:
 
 @contextmanager
 def erased(root: Path, vehicle: str, month: str) -> Iterator[Forgotten]:
-    """What `forget_vehicle` does to the files, while a service may write to the log: of its rows those that were there.
-    Nothing is compacted before the block ends.
+    """Do the file part of `forget_vehicle` while a service may write to the log; of new rows it removes only those that
+    exist at the begin. Nothing is compacted before the block ends.
 
     Raises:
-        as `forget_vehicle`, but for the service.
+        as `forget_vehicle`, except for a running service.
     """
     key_of(root, month)
     compact(root)
@@ -178,7 +179,7 @@ def erased(root: Path, vehicle: str, month: str) -> Iterator[Forgotten]:
 
 
 def forget_witness(root: Path, vehicle: str, month: str) -> None:
-    """Remove the line that tells the number by which the map knew a vehicle in a month.
+    """Remove the line with the number by which the map knew a vehicle in a month.
 
     Raises:
         OSError: it cannot be written.
@@ -191,7 +192,7 @@ def _pseudonym(root: Path, vehicle: str, month: str) -> str:
 
 
 def _thinned(root: Path, path: Path, cells: set[int]) -> bool:
-    """Whether a snapshot had lines of these cells with less than ANONYMOUS vehicles; they are removed."""
+    """Remove lines of these cells with fewer than ANONYMOUS vehicles from a snapshot; return True if there were any."""
     found = content(path, _unread)
     if found is None or not cells:
         return False
@@ -204,10 +205,10 @@ def _thinned(root: Path, path: Path, cells: set[int]) -> bool:
 
 
 def rows_of_vehicle(root: Path, vehicle: str, month: str) -> int:
-    """How many rows `forget_vehicle` would remove; changes nothing.
+    """Return how many rows `forget_vehicle` would remove; change nothing.
 
     Raises:
-        InputError: the month's key is gone.
+        InputError: the month's key does not exist.
         OSError: a file cannot be read.
     """
     key_of(root, month)
@@ -217,7 +218,7 @@ def rows_of_vehicle(root: Path, vehicle: str, month: str) -> int:
 
 
 def drop_checkpoints(root: Path) -> None:
-    """Remove all checkpoints: what they were made from changes; a service then replays the log.
+    """Remove all checkpoints because their sources change; a service then replays the log.
 
     Raises:
         OSError: one cannot be removed.
@@ -228,13 +229,13 @@ def drop_checkpoints(root: Path) -> None:
 
 
 def _names(kind: Kind, path: Path, pseudonym: str) -> bool:
-    """Whether a file may hold rows of a vehicle."""
+    """Return True if a file may hold rows of a vehicle."""
     found = load(path, SCHEMAS[kind], ["vehicle"], damaged=_unread)
     return found is not None and pseudonym in pc.unique(found["vehicle"]).to_pylist()
 
 
 def _without(root: Path, kind: Kind, path: Path, pseudonym: str) -> list[int]:
-    """Cells of the rows of a vehicle, which are removed from a file."""
+    """Remove the rows of a vehicle from a file; return their cells."""
     found = content(path, _unread)
     if found is None or pseudonym not in pc.unique(found.table["vehicle"]).to_pylist():
         return []
@@ -248,15 +249,15 @@ def _without(root: Path, kind: Kind, path: Path, pseudonym: str) -> list[int]:
 
 
 def _unread(path: Path, problem: str) -> None:
-    """A damaged file may hold what is to be forgotten: neither passed over nor kept under another name."""
+    """Raise for a damaged file, because it may hold rows to be forgotten."""
     raise InputError("archive", f"{path} is damaged ({problem})", "remove it or bring it back, then forget again")
 
 
 def key_of(root: Path, month: str) -> Path:
-    """The key of a month.
+    """Return the key file of a month.
 
     Raises:
-        InputError: there is none.
+        InputError: it does not exist.
     """
     erasures.first_day(month)
     path = root / _KEYS / f"{month}.key"
@@ -266,6 +267,7 @@ def key_of(root: Path, month: str) -> Path:
 
 
 def _days(month: str) -> tuple[int, int]:
-    """Days of a month, and the one after it: a batch has the pseudonym of its first record and may end a day later."""
+    """Return the days of a month and the one after it: a batch has the pseudonym of its first record and may end a day
+    later."""
     begin, until = erasures.span_of(month)
     return begin // layout.DAY_NS, until // layout.DAY_NS

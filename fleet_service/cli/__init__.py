@@ -1,8 +1,8 @@
-"""`fleet-service`: run, query, watch, page, hand-over, compact, retention, forget, export, roads, analyze,
-rebuild, certs, evaluate, completion.
+"""`fleet-service`: run, query, watch, page, hand-over, compact, retention, forget, export, roads, analyze, rebuild,
+certs, evaluate, completion.
 
-Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. What a command needs is imported when
-it is chosen, so that help comes at once.
+Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. Modules are imported when a command
+needs them, so that help is fast.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command.
 
     Returns:
-        its exit code; 2 after a one-line error that names the field and the fix.
+        the exit code; 2 after a one-line error that names the field and the fix.
     """
     given = commandline.joined(sys.argv[1:] if argv is None else argv)
     chosen = next((argument for argument in given if not argument.startswith("-")), None)

@@ -1,4 +1,4 @@
-"""`fleet-service analyze`: one of the questions, on a part of an archive, in the terminal and as a file."""
+"""`fleet-service analyze`: ask one of the questions about a part of an archive; print the answer or write a file."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _seconds(text: str | None) -> float | None:
-    """A length of time as people write it."""
+    """Return a duration in seconds from its usual notation."""
     if text is None:
         return None
     found = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)(s|min|h|d)", text)
@@ -87,7 +87,7 @@ def _seconds(text: str | None) -> float | None:
 
 
 def _checked(arguments: argparse.Namespace) -> Question:
-    """The question; all that can be said before anything is computed is said now."""
+    """Return the question, after all checks that need no computation."""
     question = question_of(arguments.question)
     if arguments.out is not None:
         commandline.ending("out", commandline.out_folder("out", arguments.out), ENDINGS)

@@ -1,4 +1,4 @@
-"""`fleet-service certs`: checks its options, enrols, and says what is to be done next."""
+"""`fleet-service certs`: check options, enrol, and print the next steps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`fleet-service compact`: the log as files by date and zone. The service may run meanwhile."""
+"""`fleet-service compact`: sort the log into files by date and zone. The service may run meanwhile."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`fleet-service evaluate`: simulated fleets, beside truth and simple rules."""
+"""`fleet-service evaluate`: simulated fleets, compared with the truth and with simple rules."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""`fleet-service export`: a part of the archive as a file for other programs; the map as it stands now, or stood.
+"""`fleet-service export`: write a part of the archive, or the map as of a moment, as a file for other programs.
 
-`export datex` asks the running services instead, and writes the slippery stretches as road authorities read them.
-`export iceberg` writes no file: it names the compacted ones in Iceberg tables.
+`export datex` queries the running services instead, and writes the slippery stretches for road authorities. `export
+iceberg` writes no file: it registers the compacted files in Iceberg tables.
 """
 
 from __future__ import annotations
@@ -70,10 +70,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command: on its archive, or on what the services say.
+    """Run the command on its archive, or on the answers of the services.
 
     Raises:
-        InputError: an option is missing, or of the other kind of export.
+        InputError: an option is missing, or belongs to another kind of export.
     """
     for name in _NOT[arguments.what]:
         if getattr(arguments, name):

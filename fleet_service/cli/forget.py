@@ -1,4 +1,4 @@
-"""`fleet-service forget`: a vehicle, or a month of all; where a service runs, it does it itself."""
+"""`fleet-service forget`: forget a vehicle or a complete month; a running service does it itself."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def _copied(root: Path, path: str | None) -> Iterator[None]:
     """Let the archive's copy follow, if it has one.
 
     Raises:
-        InputError: it is not known how to reach it, and nothing was done; or it was not reached.
+        InputError: its settings are unknown, and nothing was done; or it was not reached.
     """
     from fleet_service.archive.copied import copy_of
     from fleet_service.archive.copies import Copy

@@ -1,4 +1,4 @@
-"""`fleet-service hand-over`: a region goes from the service that has it to one that stands by."""
+"""`fleet-service hand-over`: move a region from its service to a standby."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Hand over, and say how long nobody served it."""
+    """Hand over, and print how long the region had no service."""
     from fleet_service.client import map_client
     from fleet_service.shards.moving import hand_over
     from schemas.config import REGION_PATTERN

@@ -1,4 +1,4 @@
-"""`fleet-service query`: the map asked once."""
+"""`fleet-service query`: query the map once."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Ask, and print or write the answer; 1 where nobody serves some of what was asked for."""
+    """Query, and print or write the answer; 1 if a part of the area has no service."""
     form = _form(arguments.out, arguments.format)
     from fleet_service.client import map_client
 

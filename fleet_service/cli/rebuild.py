@@ -1,4 +1,4 @@
-"""`fleet-service rebuild`: the map and the roll-ups of an archive, made anew from its raw observations."""
+"""`fleet-service rebuild`: compute the map and the roll-ups of an archive again from raw observations."""
 
 from __future__ import annotations
 

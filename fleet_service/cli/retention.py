@@ -1,4 +1,4 @@
-"""`fleet-service retention`: old raw rows removed. The service may run meanwhile."""
+"""`fleet-service retention`: remove old raw rows. The service may run meanwhile."""
 
 from __future__ import annotations
 

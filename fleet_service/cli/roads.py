@@ -1,4 +1,4 @@
-"""`fleet-service roads`: which link of a road network each cell and sector lies on; for `analyze contract`."""
+"""`fleet-service roads`: assign each cell and sector to a link of a road network, for `analyze contract`."""
 
 from __future__ import annotations
 

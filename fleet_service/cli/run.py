@@ -1,4 +1,4 @@
-"""`fleet-service run`: the service, until a signal."""
+"""`fleet-service run`: run the service until a signal."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Serve."""
+    """Run the service."""
     with talk.busy("loading"):
         from fleet_service.app.precompile import warm_up
         from fleet_service.app.service import Service
@@ -87,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _waited(
     config: ServiceConfig, root: Path, stop: threading.Event, log_line: Callable[[str], None]
 ) -> Holding | None:  # fmt: skip
-    """The archive, once it is this service's; None if stopped before. A standby shows itself while it waits."""
+    """Open the archive once it is available; None if stopped before. A standby serves its metrics while it waits."""
     from fleet_service.app.metrics import of_standby
     from fleet_service.shards.holding import hold
     from fleet_service.shards.serving import standing_by
@@ -115,10 +115,10 @@ def _waited(
 def _leave_at_last(
     stop: threading.Event, stopped: threading.Event, service: Service, log_line: Callable[[str], None]
 ) -> None:
-    """A session that hangs on a frozen router, or a long compaction, must not keep a stopped service.
+    """End a service whose shutdown hangs, on a frozen router or a long compaction.
 
-    Whatever it was doing may end at any instant: what is not acknowledged its senders keep. The exit code is the one
-    that it would have ended with. A lease is given free, or who stands by would wait until it has run out.
+    Whatever it is doing may end at any instant: senders keep what is not acknowledged. The exit code is that of a
+    normal end. The lease is released, because a standby would otherwise wait until it expires.
     """
     stop.wait()
     if not stopped.wait(LEAVE_AT_LAST_S):

@@ -1,4 +1,4 @@
-"""`fleet-service watch`: tiles and alerts as they change."""
+"""`fleet-service watch`: print tiles and alerts as they change."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Low-grip alerts: raised on firm belief of at least two vehicles, cleared with hysteresis and a reason. Pure."""
+"""Low-grip alerts: raised when at least two vehicles support a firm belief, cleared with hysteresis and a reason.
+Pure."""
 
 from __future__ import annotations
 
@@ -31,10 +32,10 @@ SOURCE_NS: Final = 3600 * NS  # ... within the hour; older ice belongs to an old
 
 
 class Alerts:
-    """Which cells are under an alert.
+    """Set of cells under alert.
 
     Args:
-        fusion: whose cells they are.
+        fusion: owner of the cells.
     """
 
     def __init__(self, fusion: Fusion) -> None:
@@ -43,27 +44,28 @@ class Alerts:
 
     @property
     def raised(self) -> set[int]:
-        """Slots under an alert."""
+        """Return the slots under alert."""
         return set(self._standing)
 
     @property
     def standing(self) -> list[Alert]:
-        """The alerts that were raised and not cleared, as they were raised."""
+        """Return the standing alerts as they were raised."""
         return list(self._standing.values())
 
     def resume(self, standing: Sequence[Alert]) -> None:
-        """Go on with alerts that stood before a restart."""
+        """Continue with alerts that stood before a restart."""
         slots = self._fusion.slots_of(
             np.array([a.cell for a in standing], np.int64), np.array([a.sector for a in standing], np.int64)
         )
         self._standing |= {slot: alert for slot, alert in zip(slots.tolist(), standing, strict=True) if slot >= 0}
 
     def renumbered(self, place: IntArray) -> None:
-        """Slots of the fusion, of which none with an alert is gone, have other numbers now: `place` of each."""
+        """Update slots after the fusion renumbered them; `place` is the new number of each. No slot under alert is
+        removed."""
         self._standing = {int(place[slot]): alert for slot, alert in self._standing.items()}
 
     def updated(self, slots: IntArray) -> list[Alert]:
-        """Alerts that the cells just updated raise or clear."""
+        """Return the alerts that updated cells raise or clear."""
         time, slippery = self._fusion.live.time[slots], self._fusion.slippery(slots)
         standing = np.isin(slots, np.fromiter(self._standing, np.int64, len(self._standing)))
         out, likely = [], np.flatnonzero((slippery > LIKELY) & ~standing)
@@ -87,9 +89,10 @@ class Alerts:
         ]
 
     def _corroborated(self, slot: int, side: int, time: int) -> bool:
-        """Whether one side has enough corroborating sources: as many as the other within the hour, within limits.
+        """Return True if one side has enough corroborating sources: as many as the other within the hour, within
+        limits.
 
-        Grip must have been found after the last ice.
+        Grip counts only if it was found after the last ice.
         """
         slots, hour = np.array([slot]), time - SOURCE_NS
         against, last = self._fusion.sources(slots, GRIP if side == ICE else ICE, hour)
@@ -97,7 +100,8 @@ class Alerts:
         return bool(found[0] >= np.clip(against[0], LEAST_SOURCES, MOST_ICE if side == ICE else SOURCES))
 
     def faded(self, now: int) -> list[Alert]:
-        """Alerts that time alone cleared until `now` [ns]: less likely than not, and no source within the hour."""
+        """Return the alerts that expire by `now` [ns]: the belief fell below one half, and no source reported within
+        the hour."""
         slots = np.array(sorted(self._standing), np.int64)
         forgotten = self._fusion.sources(slots, ICE, now - SOURCE_NS)[0] == 0
         faded = (self._fusion.beliefs(slots, now) @ SLIPPERY_SHARE < FADE_BELOW) & forgotten

@@ -1,4 +1,4 @@
-"""What a service has for itself while it runs: the folder by a lock, and where it has a copy, the bucket by a lease."""
+"""Exclusive ownership of a running service: the folder by a lock, and the bucket copy, if any, by a lease."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ REQUESTS: Final = 4  # of a lease that fit into its time
 
 
 class Holding:
-    """A locked archive, filled from its copy; `close` it.
+    """Exclusive ownership of an archive folder and its bucket copy; call `close`.
 
     Attributes:
-        copy: of the archive; None: it has none.
-        lease: of the copy; None: nobody else is to be told.
-        to: the standby that it is to be handed over to; "": none.
-        leaves: all is ready for that.
+        copy: bucket copy of the archive; None without one.
+        lease: of the copy; None if no other service must be excluded.
+        to: standby to hand over to; "" for none.
+        leaves: True once everything is ready for the hand-over.
     """
 
     def __init__(self, lock_file: BinaryIO, copy: Copy | None, lease: Lease | None = None) -> None:
@@ -38,41 +38,41 @@ class Holding:
 
     @property
     def epoch(self) -> int:
-        """Of segments' names, at the least."""
+        """Return the smallest epoch that new segment names may use."""
         return 0 if self.lease is None else self.lease.term.epoch
 
     @property
     def may_acknowledge(self) -> bool:
-        """Whether what is durable now will be known to whoever comes after this service."""
+        """Return True if the next service will know everything that is durable now."""
         return self.lease is None or self.lease.fresh
 
     @property
     def left_s(self) -> float:
-        """For which it may acknowledge without a renewal of the lease [s]; infinite without one."""
+        """Return how long it may acknowledge without renewing the lease [s]; infinite without a lease."""
         return math.inf if self.lease is None else self.lease.left_s
 
     @property
     def lost(self) -> bool:
-        """Whether another has taken over."""
+        """Return True if another service has taken over."""
         return self.lease is not None and self.lease.lost
 
     @property
     def former(self) -> tuple[str, ...]:
-        """Names of the services that had it earlier, and of this one; none without a lease."""
+        """Return the names of this and earlier holders; empty without a lease."""
         return () if self.lease is None else (*self.lease.former, self.lease.service)
 
     def give_up(self) -> None:
-        """Another has taken over, as its tokens tell."""
+        """Record that another service has taken over, as its tokens show."""
         if self.lease is not None:
             self.lease.lost = True
 
     def give_free(self) -> None:
-        """Nothing is acknowledged after this, and the next may have the copy."""
+        """Release the lease; nothing is acknowledged afterwards."""
         if self.lease is not None:
             self.lease.end(self.to if self.leaves else "")
 
     def close(self) -> None:
-        """Let the next have it."""
+        """Release lease and lock."""
         self.give_free()
         if self.copy is not None:
             self.copy.close()
@@ -80,11 +80,11 @@ class Holding:
 
 
 def alone(config: ServiceConfig, root: Path) -> Holding:
-    """An archive without a lease.
+    """Open an archive without a lease.
 
     Raises:
         InputError: another service holds it, or its copy cannot be used.
-        OSError: it cannot be read or written.
+        OSError: the folder cannot be read or written.
     """
     lock_file = lock(root)
     try:
@@ -101,17 +101,19 @@ Signs = tuple[Callable[[], bool], Callable[[str], bool], Callable[[], None]]  # 
 def hold(
     config: ServiceConfig, root: Path, stop: threading.Event, say: Callable[[str], None], signs: Signs | None = None
 ) -> Holding | None:
-    """An archive with the lease of its copy, where it has one; None if stopped.
+    """Open an archive with the lease of its copy, if it has one; None if stopped.
 
     Args:
         config: settings.
         root: of the archive.
         stop: ends the wait.
-        say: takes a line whenever there is something new to wait for.
-        signs: of a standby: whether it would be heard, whether a service's token stands, and what it does at each look.
+        say: called with a line whenever the reason for waiting changes.
+        signs: of a standby: whether it would be reachable, whether a service's token is active, and a function called
+            at
+            each check.
 
     Raises:
-        InputError: another service holds folder or copy, or the copy is not usable as it is set.
+        InputError: another service holds folder or copy, or the copy cannot be used with these settings.
         OSError: the folder cannot be read or written.
     """
     url = config.archive.second
@@ -177,8 +179,8 @@ def _leave(lease: Lease, copy: Copy) -> None:
 def _joined(
     config: ServiceConfig, root: Path, copy: Copy, lease: Lease, stop: threading.Event, say: Callable[[str], None]
 ) -> bool:  # fmt: skip
-    """Let the folder become what the copy is; False if stopped, or another has the lease. A standby tries again while
-    the bucket is away."""
+    """Synchronise the folder with the copy; False if stopped, or if another service has the lease. A standby retries
+    while the bucket is away."""
     logged = ""
     while not stop.is_set():
         try:
@@ -199,12 +201,12 @@ def _joined(
 
 
 class _BusyError(Exception):
-    """Somebody is at work in the folder."""
+    """Another process works in the folder."""
 
 
 def _still(root: Path) -> BinaryIO:
-    """See that no compaction goes on which the service began that had the folder before, and which outlived it: what it
-    has read may be rows that do not count any more."""
+    """Wait until no compaction of the folder's former service is running: it may have read rows that do not count any
+    more."""
     try:
         return compaction.alone(root)
     except InputError as error:

@@ -1,4 +1,4 @@
-"""Handing a region over, live: who serves it leaves in good order, and its lease goes to the standby that is named.
+"""Live hand-over of a region: the active service stops in good order, and its lease goes to a named standby.
 
 ask                                      the service
 get gripmap/v1/shard/SERVICE?to=NAME ──► sees that NAME stands by for its regions, and says so
@@ -27,17 +27,17 @@ FIX: Final = "start it with --standby, the same settings and a name of its own"
 
 
 class Moved(NamedTuple):
-    """From which service, and for how long nobody served the region [s]."""
+    """Result: the service that left, and how long the region had no service [s]."""
 
     service: str
     pause_s: float
 
 
 def asked(query: zenoh.Query, session: zenoh.Session, served: Sequence[str]) -> str | None:
-    """Answer who asks a service to hand over; returns to whom, None where it cannot be done.
+    """Answer a hand-over request; return the target, or None if it is impossible.
 
     Args:
-        query: as `hand_over` puts it.
+        query: as `hand_over` sends it.
         session: of the service.
         served: its region expressions.
     """
@@ -53,16 +53,16 @@ def asked(query: zenoh.Query, session: zenoh.Session, served: Sequence[str]) -> 
 
 
 def hand_over(session: zenoh.Session, region: str, to: str, say: Callable[[str], None]) -> Moved | None:
-    """Have a region's service hand over; None if it is served by that one already.
+    """Make a region's service hand over; None if the target serves the region already.
 
     Args:
-        session: of whoever may ask a service.
+        session: of a client with a service certificate.
         region: key expression.
         to: name of the standby.
-        say: takes a line when there is something new.
+        say: called with a line of progress.
 
     Raises:
-        InputError: nobody serves it, or no such standby waits, or it did not come to it.
+        InputError: the region has no service, the standby does not wait, or it did not take over.
     """
     with tokens.watched(session) as there:
         service = _server(there, region)
@@ -85,7 +85,7 @@ def _server(there: tokens.Watched, region: str) -> str | None:
 
 
 def _ask(session: zenoh.Session, service: str, to: str) -> str:
-    """The regions that go."""
+    """Request the hand-over; return the regions that move."""
     for reply in session.get(f"{keys.shard_key(service)}?to={to}", timeout=ANSWER_S):
         if reply.ok is not None:
             return reply.ok.payload.to_string().replace(",", ", ")

@@ -1,9 +1,9 @@
-"""Many payloads → one set of columns. Python is touched per message and per column, never per record.
+"""Decode many payloads into one set of columns. Python code runs per message and per column, never per record.
 
-A compiled walk (`schemas.runtime.protobuf_scan`) finds the fields in the bytes of all messages; then column by column
-the values of all are taken together. What the walk does not understand, JSON among it, the protobuf library reads and
-writes anew in the plain form, so that there is one way from bytes to columns. What is wrong with a message is an error
-beside the others and never their loss.
+A compiled scanner (`schemas.runtime.protobuf_scan`) finds the fields in the bytes of all messages. Then the values of
+all messages are read column by column. A message that the scanner does not understand, for example JSON, is decoded by
+the protobuf library and encoded again in the plain form. So there is one path from bytes to columns. An error in one
+message is reported for that message and does not affect the others.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ def _walked(kind: Kind, messages: list[bytes], strict: bool) -> tuple[NDArray[np
 
 
 def _plainly(kind: Kind, payload: bytes, encoding: str) -> bytes:
-    """A message as our own encoder writes it.
+    """Return a message as our own encoder writes it.
 
     Raises:
-        WireError: it is none.
+        WireError: the payload is not a message of this kind.
     """
     message = message_of(kind, payload, encoding)
     message.DiscardUnknownFields()
@@ -61,7 +61,7 @@ def _plainly(kind: Kind, payload: bytes, encoding: str) -> bytes:
 
 
 class _Fields(NamedTuple):
-    """The fields of k messages, where they lie."""
+    """Positions of the fields of k messages."""
 
     kind: Kind
     data: NDArray[np.uint8]
@@ -69,18 +69,18 @@ class _Fields(NamedTuple):
 
     @property
     def sizes(self) -> IntArray:
-        """Records of each message."""
+        """Return the number of records of each message, (k,)."""
         return self.walked.sizes
 
     def sent(self) -> PresentColumns:
-        """Which messages come with which column."""
+        """Return which messages contain which column."""
         given = self.walked.counts > 0
         return PresentColumns(
             self.kind, self.sizes, {name: given[:, at] for at, name in enumerate(column_types(self.kind))}
         )
 
     def heads(self) -> Heads:
-        """Heads, with the first of all sequence numbers held where the sender does not say which."""
+        """Return the heads; a missing `first_held` is the lowest sequence number."""
         data = self.data.tobytes()
         texts = {
             name: [
@@ -93,7 +93,7 @@ class _Fields(NamedTuple):
         return Heads(self.kind, texts["vehicle"], boot, region, seq, first_held, texts["estimator"])
 
     def columns(self) -> tuple[IntArray, Columns, BoolArray]:
-        """Sizes, columns as they were sent (integers wide) or filled, and which records have a likelihood."""
+        """Return sizes, columns (missing values filled, integers widened), and which records have a likelihood."""
         out: Columns = {}
         n = int(self.sizes.sum())
         likelihood = np.zeros(n, bool)

@@ -1,4 +1,4 @@
-"""The public face of a package: names that are loaded when they are first asked for, so that importing it is quick."""
+"""Lazy public names of a package: each is imported at first use, so that importing the package is fast."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any
 
 
 def lazy(package: str, names: Mapping[str, str]) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
-    """`__all__`, `__getattr__` and `__dir__` of a package (PEP 562).
+    """Return `__all__`, `__getattr__` and `__dir__` of a package (PEP 562).
 
     Args:
-        package: its name, for the error.
-        names: each name of the face, and the module that has it.
+        package: its name, for the error message.
+        names: each public name and the module that defines it.
     """
     face = sorted(names)
 

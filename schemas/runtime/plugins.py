@@ -1,12 +1,12 @@
-"""What other distributions bring: entry points, by group and name. A name of our own is never replaced.
+"""Plug-ins of other distributions: entry points by group and name. They never replace a built-in name.
 
     [project.entry-points."gripmap.estimators"]
     mine = "my_package.estimators:bank"
 
-group                   what stands behind a name
-gripmap.estimators      bank(vehicles) with `advance` as EstimatorBank has it
-gripmap.tyre_curves     curve(theta): force over its peak of normalised slips, an array; `--estimator aco-fckf@name`
-gripmap.sources         blocks(address), an iterator of edge_agent.Block; asked for as `--source name:address`
+group                   object behind a name
+gripmap.estimators      bank(vehicles) with `advance` as in EstimatorBank
+gripmap.tyre_curves     curve(theta): force over its peak for normalised slips, an array; `--estimator aco-fckf@name`
+gripmap.sources         blocks(address), an iterator of edge_agent.Block; used by `--source name:address`
 gripmap.questions       a fleet_service.analytics.questions.Question
 """
 
@@ -26,12 +26,12 @@ QUESTIONS: Final = "gripmap.questions"
 
 @cache
 def found(group: str) -> dict[str, EntryPoint]:
-    """The entry points of a group, by name."""
+    """Return the entry points of a group by name."""
     return {point.name: point for point in entry_points(group=group)}
 
 
 def loaded(group: str, name: str) -> Any:  # noqa: ANN401 whatever stands behind it
-    """What stands behind a name.
+    """Import the object behind a name.
 
     Raises:
         InputError: it cannot be imported.

@@ -1,7 +1,7 @@
-"""What a command tells a person who waits: on stderr, never on stdout, and nothing when it was asked to be quiet.
+"""Progress messages of a command: on stderr, never on stdout, and none in quiet mode.
 
-On a terminal a line with a clock turns while something takes longer than a second; elsewhere what takes long is said in
-a line once. A library that is imported says nothing: only the command lines call `speak`.
+On a terminal a spinner with a clock appears when something takes longer than a second. Elsewhere a long operation is
+reported once as a line. An imported library reports nothing: only the command lines call `speak`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ COMPILING: Final = "compiling kernels, once on this machine: about 40 s for the 
 
 
 class _Voice:
-    """What is said and shown; one of the process."""
+    """State of the progress messages; one per process."""
 
     def __init__(self) -> None:
         self.on = False
@@ -37,26 +37,26 @@ _voice = _Voice()
 
 
 def speak(*, quiet: bool = False) -> None:
-    """Let this process talk to a person; a command line calls it."""
+    """Enable progress messages; the command lines call it."""
     _voice.on = not quiet
     _voice.said_once.clear()
 
 
 def say(line: str) -> None:
-    """A line of progress."""
+    """Print a line of progress."""
     if _voice.on:
         print_line(line, sys.stderr)
 
 
 def say_once(line: str) -> None:
-    """A line of progress that is the same however often it is due; on a terminal it is what turns."""
+    """Report something once; on a terminal it becomes the spinner's text."""
     if line not in _voice.said_once:
         _voice.said_once.add(line)
         say(line)
 
 
 def doing(words: str) -> None:
-    """What is being done now, for the line that turns."""
+    """Set the current activity, shown by the spinner."""
     with _voice.lock:
         _voice.words = words
         if _voice.shown is not None:
@@ -65,7 +65,7 @@ def doing(words: str) -> None:
 
 @contextmanager
 def busy(words: str) -> Iterator[None]:
-    """Show that it still runs, from PATIENCE_S on and only on a terminal."""
+    """Show a spinner while the block runs, from PATIENCE_S on and only on a terminal."""
     if not (_voice.on and sys.stderr.isatty()) or _voice.shown is not None:
         yield
         return
@@ -80,7 +80,7 @@ def busy(words: str) -> Iterator[None]:
 
 
 def hush() -> None:
-    """Let nothing turn from here on: the command is over, or asks its person something."""
+    """Stop the spinner: the command has ended, or asks the user a question."""
     timer, _voice.timer = _voice.timer, None
     if timer is not None:
         timer.cancel()
@@ -114,5 +114,5 @@ def _show() -> None:
 
 
 def _load() -> None:
-    """What draws, before it is needed."""
+    """Import the drawing library before it is needed."""
     importlib.import_module("rich.progress")

@@ -1,4 +1,4 @@
-"""Who serves which region, as the services' liveliness tokens tell: now, or watched."""
+"""Liveliness tokens of services: which service serves which region, once or continuously."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ALL: Final = f"{SERVES}/**"
 
 
 def standing(session: zenoh.Session, root: str = SERVES) -> set[Served]:
-    """The tokens that stand now, as far as this session may see them; or those below another root."""
+    """Return the tokens that are active now and visible to this session; or those below another root."""
     found = set[Served]()
     for reply in session.liveliness().get(f"{root}/**", timeout=ANSWER_S):
         if reply.ok is not None:
@@ -27,36 +27,36 @@ def standing(session: zenoh.Session, root: str = SERVES) -> set[Served]:
 
 
 class Watched:
-    """Tokens that stand, kept up."""
+    """Tokens that are tracked continuously."""
 
     def __init__(self) -> None:
         self._guard, self._here, self._withdrawn, self._fell = Lock(), set[Served](), set[Served](), set[Served]()
 
     @property
     def here(self) -> set[Served]:
-        """Those that stand."""
+        """Return the active tokens."""
         with self._guard:
             return set(self._here)
 
     @property
     def withdrawn(self) -> set[Served]:
-        """Those that stood and fell."""
+        """Return the tokens that were active and are not any more."""
         with self._guard:
             return set(self._withdrawn)
 
     @property
     def fell(self) -> set[Served]:
-        """Those that fell at any time; they may be back."""
+        """Return the tokens that were lost at any time; they may be active again."""
         with self._guard:
             return set(self._fell)
 
     def asked(self, session: zenoh.Session) -> set[Served]:
-        """Those that stand now. A router's answer may lack the token that it is just telling to the same session's
-        subscription (1 of 60 answers), which is then heard before the answer ends."""
+        """Query the active tokens. A router's answer may lack a token that it is just sending to the same session's
+        subscription (1 of 60 answers); the subscription then delivers it before the answer ends."""
         return standing(session) | self.here
 
     def take(self, token: Served, *, stands: bool) -> None:
-        """A token stands, or fell."""
+        """Record that a token became active or was lost."""
         with self._guard:
             (self._here.add if stands else self._here.discard)(token)
             (self._withdrawn.discard if stands else self._withdrawn.add)(token)
@@ -66,7 +66,7 @@ class Watched:
 
 @contextmanager
 def watched(session: zenoh.Session) -> Iterator[Watched]:
-    """The tokens, from those that stand at the beginning of the block on."""
+    """Yield a tracker of the tokens, from those active at the beginning of the block on."""
     tokens = Watched()
 
     def hear(sample: zenoh.Sample) -> None:
