@@ -1,4 +1,4 @@
-"""What the network says, looked at before it is believed: tiles and alerts as bytes → cells and alerts, or refused."""
+"""Decoding and validation of received tiles and alerts."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _BASIS: Final = {name: number for number, name in enumerate(BASES)}
 
 
 def heard_cells(key: str, payload: bytes, now: int) -> tuple[int, HeardCells]:
-    """Tile and cells of a message about the map.
+    """Return tile and cells of a message about the map.
 
     Raises:
-        WireError: it is not what a service sends; nothing of it is believed.
+        WireError: it is not a valid message of a service; it is ignored completely.
     """
     tile = _tile(key, "map")
     if len(payload) > MOST_TILE_BYTES:
@@ -61,10 +61,10 @@ def heard_cells(key: str, payload: bytes, now: int) -> tuple[int, HeardCells]:
 
 
 def heard_alert(key: str, payload: bytes, now: int) -> Alert:
-    """An alert that was put.
+    """Return a published alert.
 
     Raises:
-        WireError: it is not what a service sends.
+        WireError: it is not a valid message of a service.
     """
     if len(payload) > wire.MAX_BYTES:
         raise WireError("alert", f"{len(payload)} bytes", f"send at most {wire.MAX_BYTES}")
@@ -72,10 +72,10 @@ def heard_alert(key: str, payload: bytes, now: int) -> Alert:
 
 
 def heard_standing(key: str, payload: bytes, now: int) -> tuple[int, list[Alert]]:
-    """Tile, and the alerts that stand in it.
+    """Return a tile and its standing alerts.
 
     Raises:
-        WireError: it is not what a service sends.
+        WireError: it is not a valid message of a service.
     """
     tile = _tile(key, "alert")
     return tile, [_checked(alert, tile, now) for alert in wire.decode_standing(payload)]

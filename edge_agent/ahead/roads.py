@@ -1,8 +1,9 @@
-"""The road as the map shows it: from cell to cell and sector to sector, as vehicles visited them one after the other.
+"""Roads visible in the map: sequences of cells and sectors that vehicles visited one after the other.
 
-Two places of the map follow each other when the second lies within two cells, in front, and vehicles head there as they
-must to come from the first. Where a road forks all ways are followed, the straightest first. Behind its last place that
-one goes straight on, as far as a corridor: a car has heard of no more than it asked for, and it asks along its way.
+Two places of the map follow each other if the second lies within two cells, in front, and vehicles head there as they
+must when they come from the first. All ways at a fork are followed, the straightest first. After its last known place
+that way continues straight on, as far as a corridor: the car requests the map along its way, so a shorter way would
+never grow.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ STEP_M: Final = 10.0  # a cell
 
 
 def ways_on(pose: Pose, keys: IntArray, length: float) -> list[Path]:
-    """The ways on among known places `keys` (n,), at most `length` [m] long; none where the map shows no road here."""
+    """Return the ways on among known places `keys` (n,), at most `length` [m] long; none if the map shows no road
+    here."""
     latitude, longitude = grid.centre(keys // grid.SECTORS)
     x, y = plane(latitude, longitude, pose)
     near = np.hypot(x, y) <= length
@@ -63,7 +65,7 @@ class _Neighbours:
         self.places, self._by_cell, self.side = places, by_cell, side
 
     def onward(self, here: tuple[float, float], heading: float, cells: float) -> list[int]:
-        """Places that may come next, the likeliest first; one of each road."""
+        """Return places that may come next, the likeliest first; one per road."""
         reach, found = cells * self.side, []
         column, row = math.floor(here[0] / self.side), math.floor(here[1] / self.side)
         wide = math.ceil(cells)
@@ -86,7 +88,7 @@ class _Neighbours:
 
 
 def _followed(graph: _Neighbours, way: list[int], pose: Pose, length: float, forks: list[list[int]]) -> list[int]:
-    """Follow a way to its end; what forks off is put on `forks`."""
+    """Follow a way to its end; put branches on `forks`."""
     run, passed = 0.0, set(way)
     for _ in range(MOST_STEPS):
         here = graph.places[way[-1]]
@@ -103,7 +105,7 @@ def _followed(graph: _Neighbours, way: list[int], pose: Pose, length: float, for
 
 
 def _heading(way: list[int], places: dict[int, tuple[float, float]], pose: Pose) -> float:
-    """Of the last three links: centres of cells along a slanting road zigzag."""
+    """Return the heading of the last three links, because the cell centres of a slanting road zigzag."""
     last = [(0.0, 0.0), *(places[key] for key in way)][-4:]
     dx, dy = last[-1][0] - last[0][0], last[-1][1] - last[0][1]
     return math.atan2(dy, dx) if math.hypot(dx, dy) > 1.0 else pose.yaw

@@ -1,4 +1,4 @@
-"""Estimator banks as the commands make them: by name, tuned as shipped or as a file says, or from another package."""
+"""Estimator banks by name, with the shipped or given memberships, also from other packages."""
 
 from __future__ import annotations
 
@@ -13,22 +13,23 @@ from schemas.vehicle import Vehicle
 
 
 def known() -> dict[str, str]:
-    """All estimators by name with a line about each, those of other packages too."""
+    """Return all estimators by name with one line about each, those of other packages too."""
     others = {name: f"from {point.value}" for name, point in plugins.found(plugins.ESTIMATORS).items()}
     return others | ESTIMATORS
 
 
 def bank_of(estimator: str, vehicles: Sequence[Vehicle], memberships: Memberships | None = None) -> EstimatorBank:
-    """A bank of estimators by name, one per vehicle.
+    """Return a bank of estimators by name, one per vehicle.
 
     Args:
-        estimator: a key of `known()`; NAME@CURVE with the tyre curve of another package.
+        estimator: a key of `known()`; NAME@CURVE for the tyre curve of another package.
         vehicles: nominal vehicles, N of them.
-        memberships: fuzzy sets in place of the shipped ones.
+        memberships: fuzzy sets instead of the shipped ones.
 
     Raises:
-        InputError: no such estimator, no vehicle, memberships for an estimator that has none, or its tuned ones cannot
-            be read.
+        InputError: there is no such estimator, no vehicle, memberships for an estimator that has none, or its tuned
+            ones
+            cannot be read.
     """
     estimator, _, own = estimator.partition("@")
     if own and own not in plugins.found(plugins.TYRE_CURVES):

@@ -1,4 +1,4 @@
-"""What an operator sees of an agent in numbers, and what counts as trouble."""
+"""Metrics and health problems of an agent."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _NAMES: Final = {Kind.OBSERVATION: "observation", Kind.STATE: "state"}
 
 
 def metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
-    """All values, now; records are counted by kind."""
+    """Return all current values; records are counted by kind."""
     counts = publisher.counts
     return [
         Metric("published_records", "counter", "put on disk and sent", _named(counts.published), "kind"),
@@ -47,7 +47,7 @@ def metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
 
 
 def troubles(publisher: Publisher, progress: Progress) -> list[str]:
-    """What is not as it should be."""
+    """Return one message per problem."""
     found = [] if publisher.links else ["no session is open"]
     if publisher.cut_off:
         found.append("a session has no router")

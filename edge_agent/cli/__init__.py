@@ -1,7 +1,7 @@
 """`edge-agent`: simulate, import, check, calibrate, replay, run, fleet, tune, evaluate, completion.
 
-Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. What a command needs is imported when
-it is chosen, so that help is quick.
+Bad input is one line on stderr, "error: field: problem; fix", and exit code 2. Modules are imported when a command
+needs them, so that help is fast.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ LINE: Final = ("edge-agent", "Friction and motion of a vehicle from its sensors.
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command line; returns the exit code."""
+    """Run a command line; return the exit code."""
     arguments = commandline.joined(sys.argv[1:] if argv is None else argv)
     chosen = next((argument for argument in arguments if not argument.startswith("-")), None)
     talk.speak(quiet=commandline.wants_quiet(arguments))
@@ -60,7 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: Sequence[str], *, limited: bool, chosen: str | None) -> tuple[int, bool]:
-    """The exit code, and whether something was left behind that would keep the process from ending."""
+    """Return the exit code, and whether a remaining thread would keep the process from ending."""
     args = commandline.parser_of(*LINE, chosen).parse_args(arguments)
     level = logging.DEBUG if args.verbose else logging.ERROR if args.quiet else logging.INFO
     logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)

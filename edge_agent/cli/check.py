@@ -1,4 +1,4 @@
-"""`edge-agent check`: the signal doctor; what of a log is sound, what is wrong with the rest, and its correction."""
+"""`edge-agent check`: run the signal doctor on a log; lists sound and faulty signals with their corrections."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check; 0 when the log has passed, 1 when something is wrong or unknown."""
+    """Check; return 0 if the log has passed, 1 if something is wrong or unknown."""
     from edge_agent.app.backfill import beside
     from edge_agent.app.estimates_file import writable
     from edge_agent.inputs.bring_in import profile_of

@@ -1,4 +1,4 @@
-"""What the commands share: estimators by name, the closing of a publisher, signals, vehicle names."""
+"""Shared parts of the commands: estimators by name, closing of a publisher, signals, vehicle names."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FLEET = "fleet"  # what {name} in the path of an outbox is for many vehicles
 
 
 def checked_name(name: str) -> str:
-    """A name that may stand in a key.
+    """Return a name that may be part of a key.
 
     Raises:
         InputError: it may not.
@@ -48,7 +48,7 @@ def publisher_of(
     estimator: str,
     on_open: Callable[[str, zenoh.Session], None] = lambda *_: None,
 ) -> Publisher:
-    """A started publisher on the configured outbox; `on_open` is told of each vehicle's session.
+    """Return a started publisher on the configured outbox; `on_open` is called with each vehicle's session.
 
     Raises:
         InputError: Zenoh refuses its settings, or the outbox is in use or unusable.
@@ -68,10 +68,10 @@ def publisher_of(
 
 
 def insist_on_sound(log: SignalLog, vehicle: Vehicle) -> None:
-    """Let only a log pass whose signals agree with each other.
+    """Raise unless the signals of a log agree with each other.
 
     Raises:
-        InputError: the signal doctor finds a fault, or cannot tell.
+        InputError: the signal doctor finds a fault, or cannot decide.
     """
     from edge_agent.inputs.doctor.findings import diagnose
     from edge_agent.inputs.doctor.report import advice, lines
@@ -83,7 +83,7 @@ def insist_on_sound(log: SignalLog, vehicle: Vehicle) -> None:
 
 
 def warn_of_faults(log: SignalLog, vehicle: Vehicle) -> None:
-    """Say on stderr what the signal doctor finds wrong with a log that is only estimated."""
+    """Print on stderr the faults that the signal doctor finds in a log that is only estimated."""
     from edge_agent.inputs.doctor.findings import diagnose
 
     found = diagnose(log.t, log.signals, vehicle, log.ground).findings
@@ -95,7 +95,7 @@ def warn_of_faults(log: SignalLog, vehicle: Vehicle) -> None:
 
 @contextmanager
 def stop_on_signal() -> Iterator[threading.Event]:
-    """An event that SIGTERM and Ctrl-C set; a second signal ends the process at once."""
+    """Yield an event that SIGTERM and Ctrl-C set; a second signal ends the process at once."""
     stop = threading.Event()
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
 
@@ -118,9 +118,9 @@ left_behind = threading.Event()
 
 
 def leave(publisher: Publisher, progress: Progress, drain_s: float, **more: float) -> None:
-    """Wait for acknowledgements, close, print the counts, and what else is given, as one line of JSON on stdout.
+    """Wait for acknowledgements, close, and print counts and extra values as one line of JSON on stdout.
 
-    What is unsettled stays in the outbox for the next start.
+    Unsettled records stay in the outbox for the next start.
     """
     from edge_agent.app.live_loop import summary
 
@@ -132,7 +132,7 @@ def leave(publisher: Publisher, progress: Progress, drain_s: float, **more: floa
 
 
 def status(progress: Progress, publisher: Publisher, log_line: Callable[[str], None]) -> None:
-    """One line on how it goes."""
+    """Print one line of progress."""
     from edge_agent.app.live_loop import summary
 
     counts = publisher.counts

@@ -1,4 +1,4 @@
-"""`edge-agent evaluate`: the campaign, its figures.json, its Markdown table and its plots."""
+"""`edge-agent evaluate`: run the evaluation; writes figures.json, a Markdown table and plots."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Evaluate; 0 when all bars hold that were measured, else 1.
+    """Evaluate; return 0 if all measured bars hold, else 1.
 
     Raises:
-        InputError: too few seeds, the folder cannot be made, or matplotlib is not installed.
+        InputError: too few seeds, the folder cannot be created, or matplotlib is not installed.
     """
     from edge_agent.lab.evaluation.bars import figures as figures_of
     from edge_agent.lab.evaluation.campaign import run as campaign

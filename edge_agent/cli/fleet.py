@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Drive until the duration has passed or a signal comes; write the truth before leaving."""
+    """Drive until the duration has passed or a signal arrives; write the truth before the end."""
     from edge_agent.ahead.lookout import Lookout
     from edge_agent.app.estimates_file import writable
     from edge_agent.cli.live import drive_live, warm_up_simulation, warning_lines

@@ -1,4 +1,4 @@
-"""`edge-agent import`: any car's recording to a signal log, by a profile; a profile is drafted where none is named."""
+"""`edge-agent import`: convert a car's recording to a signal log by a profile; without one, a profile is drafted."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Import; 0 when the log was written."""
+    """Import; return 0 if the log was written."""
     from edge_agent.app.estimates_file import writable
     from edge_agent.inputs.bring_in import database_of, read_source, write_log
     from edge_agent.inputs.merge import merge

@@ -1,4 +1,4 @@
-"""What `run` and `fleet` share: bank, pipeline and publisher around the live loop."""
+"""Shared part of `run` and `fleet`: bank, pipeline and publisher around the live loop."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from schemas.wire.ahead import GripWarning
 
 
 def _warm_up(estimator: str, vehicle: Vehicle, config: AgentConfig, memberships: Memberships | None) -> None:
-    """Load or compile the kernels before the clock runs, on a vehicle that is thrown away."""
+    """Load or compile the kernels before the clock runs, on a temporary vehicle."""
     t, time = np.zeros((1, 1)), np.zeros((1, 1), dtype=np.int64)
     signals = np.full((1, 1, len(CHANNELS)), np.nan)
     with talk.busy("starting the estimator"):
@@ -39,7 +39,7 @@ def _warm_up(estimator: str, vehicle: Vehicle, config: AgentConfig, memberships:
 
 
 def warm_up_simulation(scenario: str, rate_hz: float, rough: float = 0.0) -> None:
-    """The same for the simulation: else its first step is silent for as long as its kernels take."""
+    """Load or compile the kernels of the simulation before its first step."""
     from edge_agent.lab.simulation import SimulatedFleet
 
     with talk.busy("starting the simulation"):
@@ -61,11 +61,11 @@ def drive_live(
     vss: RoadFrictionOutput | None = None,
     memberships: Memberships | None = None,
 ) -> int:
-    """Drive in real time, do what is due `at_end`, take leave; prints a line of counts and returns 0.
+    """Drive in real time, call `at_end`, and shut down; print a line of counts and return 0.
 
-    What is learned while not `admitted` is not published; `troubled` tells what is wrong with the sources. A `lookout`
-    hears the map over the vehicles' sessions. `vss` tells the friction where they are, of signals that are admitted.
-    `memberships` stand in for the estimator's own.
+    Records made while not `admitted` are not published; `troubled` returns the problems of the sources. A `lookout`
+    receives the map over the vehicles' sessions. `vss` reports the friction at the vehicles if their signals are
+    admitted. `memberships` replace the estimator's own.
     """
     chosen = estimator or config.estimator
     log_as(config.log, sys.stderr)
@@ -119,14 +119,15 @@ def drive_live(
 
 
 def _show(lookout: Lookout, pipeline: Pipeline) -> None:
-    """Tell a lookout where the vehicles are and what their filters believe."""
+    """Pass the vehicles' positions and their filters' beliefs to a lookout."""
     if pipeline.seen is not None:
         lookout.see([Pose(*row) for row in zip(*(column.tolist() for column in pipeline.seen), strict=True)])
         lookout.believe(pipeline.places, pipeline.beliefs())
 
 
 def warning_lines(config: AgentConfig) -> Callable[[str, GripWarning], None]:
-    """Prints warnings on stdout: lines for people, or JSON where the log is JSON; an infinite time is null there."""
+    """Return a function that prints warnings on stdout: text, or JSON if the log is JSON; an infinite time is null
+    there."""
     say = line_logger(config.log, sys.stdout)
 
     def tell(vehicle: str, warning: GripWarning) -> None:

@@ -1,4 +1,4 @@
-"""`edge-agent replay`: recorded drives through an estimator, as fast as it goes; one onto the map with --publish."""
+"""`edge-agent replay`: estimate recorded drives as fast as possible; with --publish, send one to the map."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay; 0 when all was written and acknowledged, 1 when something was left or refused, 3 when not plausible."""
+    """Replay; return 0 if all was written and acknowledged, 1 if something was left or refused, 3 if not plausible."""
     from edge_agent.app.backfill import backfill, backfill_on_spark, beside, tasks_of
     from edge_agent.app.estimates_file import EstimatesFile
     from edge_agent.app.estimator_factory import bank_of
@@ -113,7 +113,7 @@ def _check_engine(engine: str, jobs: int, *, several: bool) -> None:
 
 
 def _print_outcomes(outcomes: Iterator[Outcome], count: int) -> int:
-    """Say how it goes on stderr; 2 where a log could not be read, else 0."""
+    """Print progress on stderr; return 2 if a log could not be read, else 0."""
     bad, samples, began, last = 0, 0, time.monotonic(), 0.0
     for done, outcome in enumerate(outcomes, 1):
         samples += outcome.samples
@@ -161,7 +161,7 @@ def _published(
 
 
 def _start(given: str | None, log: SignalLog) -> int:
-    """The ns UTC of t = 0."""
+    """Return the time of t = 0 [ns UTC]."""
     from schemas.config import moment
 
     if given is not None and given != NOW:

@@ -1,4 +1,4 @@
-"""`edge-agent run`: one vehicle, live; its signals come from its buses, a simulation, or a log paced in real time."""
+"""`edge-agent run`: drive one vehicle live; signals come from its buses, a simulation, or a log paced in real time."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Drive until the source ends, the duration has passed, or a signal comes."""
+    """Drive until the source ends, the duration has passed, or a signal arrives."""
     with talk.busy("loading"):
         from edge_agent.cli.common import checked_name
         from edge_agent.cli.live import drive_live

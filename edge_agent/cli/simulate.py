@@ -1,4 +1,4 @@
-"""`edge-agent simulate`: the signal log of a manoeuvre."""
+"""`edge-agent simulate`: write the signal log of a manoeuvre."""
 
 from __future__ import annotations
 

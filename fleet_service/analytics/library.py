@@ -1,4 +1,4 @@
-"""The archive asked by a program: an answer is an Arrow table, and pandas, polars and DuckDB are one step away."""
+"""Questions to an archive from a program: an answer is an Arrow table."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def ask_archive(
     """Ask one of the questions of the compacted files (`fleet-service compact`); times are ISO 8601, UTC.
 
     Raises:
-        InputError: no such question or archive, nothing in that part, or an option is missing.
+        InputError: there is no such question or archive, no data in that part, or an option is missing.
     """
     root = Path(archive)
     insist_on_archive(root)
@@ -38,12 +38,12 @@ def ask_archive(
 
 
 def map_of_archive(archive: Path | str, *, at: str | None = None, bbox: Box | None = None) -> pa.Table:
-    """The map as it stood at a time, or now, replayed from the archive, as a GeoParquet table."""
+    """Return the map as of a time, or of now, replayed from the archive, as a GeoParquet table."""
     root = Path(archive)
     insist_on_archive(root)
     return map_at(root, _part(None, at, bbox))
 
 
 def write_answer(table: pa.Table, question: str, path: Path | str) -> None:
-    """Write an answer as the ending says: .parquet, .geo.parquet, .geojson, .csv, .png, .svg, .pdf, .html."""
+    """Write an answer in the format of the ending: .parquet, .geo.parquet, .geojson, .csv, .png, .svg, .pdf, .html."""
     output.write(table, question_of(question), Path(path))

@@ -1,11 +1,11 @@
-"""The map and the roll-ups of an archive made anew from its raw observations, zone by zone: here, or on Spark.
+"""Rebuilding of the map and the roll-ups of an archive from raw observations, zone by zone: here, or on Spark.
 
     OUT/map/date=2026-01-31/zone=q1202310/20260131T070000Z.parquet   the map of a moment, all visited cells
     OUT/rollup/cell_hour/date=2026-01-31/zone=q1202310/NAME.parquet  a part per compacted file, all days
 
-Once the weights that were used are known no cell depends on others, so that a zone needs its own rows and those of a
-margin around it: what comes out is what a replay of everything at once would give. Either engine runs the same function
-for each zone, and what it writes is the same, byte for byte.
+Cells do not depend on each other once the weights are known. A zone therefore needs its own rows and those of a margin
+around it, and gives the same result as a replay of everything. Both engines run the same function for each zone and
+write the same bytes.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ ENGINES: Final = ("local", "spark")
 
 
 class Rebuild(NamedTuple):
-    """What is to be rebuilt: archive, the folder that takes it, the moment of the map [ns], the service's lateness."""
+    """Task: archive, output folder, moment of the map [ns], the service's lateness."""
 
     root: Path
     out: Path
@@ -41,7 +41,7 @@ class Rebuild(NamedTuple):
 
 
 class Rebuilt(NamedTuple):
-    """What came of a zone: cells of the map, parts of the roll-up."""
+    """Result of a zone: cells of the map, parts of the roll-up."""
 
     zone: int
     cells: int
@@ -49,10 +49,10 @@ class Rebuilt(NamedTuple):
 
 
 def insist_on_empty(out: Path) -> None:
-    """Let only an empty folder pass, or a new one: parts of another archive would add up.
+    """Raise unless a folder is empty or new, because parts of another archive would add up.
 
     Raises:
-        InputError: something lies there, or it cannot be made.
+        InputError: it has content, or cannot be created.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -64,10 +64,11 @@ def insist_on_empty(out: Path) -> None:
 
 
 def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[Rebuilt]:
-    """Rebuild all zones; yields what came of each, in their order.
+    """Rebuild all zones; yield the result of each, in order.
 
     Raises:
-        InputError: there are no compacted observations, a file is of a newer version, the engine is none or not there.
+        InputError: there are no compacted observations, a file is of a newer version, the engine is unknown or not
+            installed.
         OSError: something cannot be read or written.
     """
     if engine not in ENGINES:
@@ -81,12 +82,12 @@ def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[Rebuilt]:
 
 
 def zones_of(root: Path) -> list[int]:
-    """Zones that an archive has compacted observations of."""
+    """Return the zones that an archive has compacted observations of."""
     return sorted({layout.partition_of(path).zone for path in layout.compacted(root, Kind.OBSERVATION)})
 
 
 def rebuilt(wanted: Rebuild, zone: int) -> Rebuilt:
-    """Rebuild one zone; done twice, at once too, its files are there once.
+    """Rebuild one zone; repeated or concurrent calls leave its files once.
 
     Raises:
         InputError: a file is of a newer version.
@@ -118,7 +119,7 @@ def _part(path: Path) -> pa.Table | None:
 
 
 def _placed(out: Path, drafts: Path, path: Path, table: pa.Table, encoding: Encoding) -> None:
-    """Write a file such that it is there whole, whoever else writes the same one."""
+    """Write a file atomically, also if another process writes the same one."""
     write_table(table, drafts / path.name, encoding, named=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     (drafts / path.name).rename(path)

@@ -1,4 +1,4 @@
-"""The map watched: a line per changed tile, per stretch that turned slippery or ended, and where nobody serves."""
+"""Watching of the map: a line per changed tile, per stretch alert, and per region that loses or gets a service."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ GATHER_S: Final = 0.3  # for which alerts of neighbouring cells are gathered int
 
 
 class Wishes(NamedTuple):
-    """What is to be heard of.
+    """Selection of what to watch.
 
     Attributes:
-        bbox: west,south,east,north as text; None: everything.
-        only_alerts: no lines of tiles.
-        as_json: lines for programs.
+        bbox: west,south,east,north as text; None for everything.
+        only_alerts: True to omit lines of tiles.
+        as_json: True for lines in JSON.
     """
 
     bbox: str | None = None
@@ -41,10 +41,10 @@ def watch(
     say: Callable[[str], None],
     hear: Callable[[StretchAlert], None] = lambda _: None,
 ) -> None:
-    """Say a line per changed tile and stretch until `stop` is set; waits for a router. `hear` gets the stretches too.
+    """Print a line per change until `stop` is set; wait for a router. `hear` is called with the stretches too.
 
     Raises:
-        InputError: the box cannot be read.
+        InputError: the box is not valid.
     """
     asked = query.parse({} if wishes.bbox is None else {"bbox": wishes.bbox})
     box = asked.bbox
@@ -104,7 +104,7 @@ def watch(
 
 
 def standing_alerts(session: zenoh.Session) -> list[wire.Alert]:
-    """The alerts that stand, of all services that answer."""
+    """Return the standing alerts of all services that answer."""
     replies = (reply.ok for reply in session.get(f"{keys.ROOT}/alert/**", timeout=TIMEOUT_S) if reply.ok is not None)
     return [alert for reply in replies for alert in wire.decode_standing(reply.payload.to_bytes())]
 

@@ -1,7 +1,7 @@
-"""The page's subscriber: a reader's session. Hears tiles and alerts, asks for what it missed, sees which regions
-are served.
+"""Subscriber of the page, with the rights of a reader: receives tiles and alerts, queries what it missed, and tracks
+served regions.
 
-What it puts: nothing. What it may not hear of (tokens, where the access list holds) it does without.
+It publishes nothing. If the access list hides tokens, it works without them.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Reader:
 
     Args:
         connection: how to reach the router.
-        world: takes what is heard.
+        world: receives the data.
     """
 
     def __init__(self, connection: ZenohSettings, world: HeldWorld) -> None:
@@ -52,7 +52,7 @@ class Reader:
         self._served, self._stood, self._tried = False, 0.0, -AGAIN_S
 
     def run(self, stop: threading.Event) -> None:
-        """Listen until `stop` is set."""
+        """Receive until `stop` is set."""
         session = zenoh_session.open_session(self._connection, stop)
         if session is None:
             return
@@ -76,21 +76,21 @@ class Reader:
 
     @property
     def connected(self) -> bool:
-        """Whether a router is there."""
+        """True if a router is connected."""
         session = self._session
         return session is not None and bool(list(session.info.routers_zid()))
 
     @property
     def served(self) -> bool:
-        """Whether any service answers."""
+        """True if any service answers."""
         return self._served and self.connected
 
     def is_heard(self, latitude: float, longitude: float) -> bool:
-        """Whether a service answers for a place [deg]."""
+        """Return True if a service answers for a place [deg]."""
         return self._answers(int(grid.region_of(int(grid.cell_of(latitude, longitude)))))
 
     def regions(self) -> list[dict[str, Any]]:
-        """Regions with cells: their box, whether a service answers for them, since when none does."""
+        """Return regions with cells: their box, whether a service answers, and since when none does."""
         return [
             {"region": grid.quadkey(region, grid.REGION_ZOOM), "box": box_of(region, grid.REGION_ZOOM),
              "served": region not in self._away_since, "since": self._away_since.get(region)}
@@ -101,7 +101,7 @@ class Reader:
         ]  # fmt: skip
 
     def _note_fallen(self, services: tokens.Watched) -> None:
-        """Regions without a service that had one, if no cell of theirs is known: those are seen by themselves."""
+        """Record regions that lost their service and have no known cell; others are found through their cells."""
         here = {token.region for token in services.here}
         known = [keys.chunks(region, grid.REGION_ZOOM) for region in self._queriers]
         fallen = {
@@ -113,14 +113,14 @@ class Reader:
         self._fallen = {region: self._fallen.get(region, time.time()) for region in fallen}
 
     def names(self, kind: str) -> list[str]:
-        """Names with a token; empty where this reader may not hear of them."""
+        """Return names with a token; empty if the access list hides them."""
         return sorted(self._names[kind])
 
     def ask(self, selector: str, parameters: Mapping[str, str]) -> Iterator[tuple[int, pa.Table]]:
-        """Tile and cells of every reply.
+        """Yield tile and cells of every reply.
 
         Raises:
-            InputError: a service refused the question, or no router is there.
+            InputError: a service refused the query, or no router is connected.
         """
         session = self._session
         if session is None:
@@ -147,7 +147,7 @@ class Reader:
             (names.add if sample.kind == zenoh.SampleKind.PUT else names.discard)(str(parsed.name))
 
     def _ask_all(self, session: zenoh.Session) -> None:
-        """What was there before this page; it subscribed first, so that nothing is missed in between."""
+        """Query everything that existed before this page. It subscribed first, so nothing is missed in between."""
         try:
             for tile, table in self.ask(map_client.EVERYWHERE, {}):
                 self._world.take_tile(tile, table, time.time())
@@ -191,10 +191,10 @@ class Reader:
         return querier is not None and bool(querier.matching_status.matching)
 
     def _sees_services(self) -> bool:
-        """Whether a service answers for any place: by its token, or, where none may be heard, by what it serves.
+        """Return True if a service answers for any place: by its token, or by its answers if tokens are hidden.
 
-        A router matches only who answers for all of a key expression: a service of the whole world is found by any
-        tile, one of a region by the regions that are known, and before any is known by its answer.
+        A router matches only services that answer for all of a key expression. A service of the whole world is found by
+        any tile, a service of a region by the known regions, and before any region is known by its answer.
         """
         if self._names["shard"] or any(self._answers(region) for region in self._queriers):
             return True
@@ -214,14 +214,14 @@ class Reader:
 
 
 def _box_of_expression(region: str) -> list[float]:
-    """West, south, east, north [deg] of what its first digits name."""
+    """Return west, south, east, north [deg] of the square that its first digits name."""
     digits = region.partition("*")[0].replace("/", "")
     return box_of(grid.from_quadkey(digits), len(digits))
 
 
 @contextlib.contextmanager
 def _refusals_logged(sample: zenoh.Sample) -> Iterator[None]:
-    """What a stranger put is no reason to end: it is said, and the next is heard."""
+    """Log a malformed message and continue."""
     try:
         yield
     except (InputError, WireError, KeyError) as error:

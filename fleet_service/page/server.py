@@ -1,4 +1,4 @@
-"""The page's process: a reader's session in a thread, a web server on loopback, until a signal."""
+"""Process of the page: a reader's session in a thread and a web server on loopback, until a signal."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ LOOK_S: Final = 0.1
 
 @dataclass(frozen=True)
 class PageSettings:
-    """What a page is started with.
+    """Settings of the page.
 
     Attributes:
         connection: how to reach the router.
-        host, port: where to listen; port 0 is a free one.
-        names: host names under which a proxy passes questions on; none, and not on loopback: any.
-        archive: of the service, for the past; None: there is none.
+        host, port: where to listen; port 0 selects a free one.
+        names: host names under which a proxy forwards requests; empty and not on loopback accepts any.
+        archive: of the service, for the past; None without one.
         metrics: addresses of services' metrics, for the health view.
-        overlay: Parquet of cell, sector, mu to lay over the map.
-        base_map: raster tiles below the cells; None: there are none.
-        datex: a DATEX II publication to keep up and to serve; None: there is none.
-        most: watchers at once.
+        overlay: Parquet of cell, sector, mu to draw over the map.
+        base_map: raster tiles below the cells; None without one.
+        datex: a DATEX II publication to maintain and to serve; None without one.
+        most: maximum number of watchers.
     """
 
     connection: ZenohSettings
@@ -63,10 +63,10 @@ class PageSettings:
 
 
 def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None]) -> None:
-    """Serve until `stop` is set; says `page: ADDRESS` when it listens.
+    """Serve until `stop` is set; print `page: ADDRESS` when it listens.
 
     Raises:
-        InputError: the port is taken.
+        InputError: the port is in use.
     """
     listening = _listen(settings.host, settings.port)
     world = HeldWorld()
@@ -101,7 +101,7 @@ def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None
 
 
 def keep_up(file: DatexFile, world: HeldWorld, reader: Reader, stop: threading.Event) -> None:
-    """Keep a publication up with the alerts that the page hears, until `stop` is set."""
+    """Keep a publication current with the received alerts until `stop` is set."""
     seen = -1
     while not stop.wait(GATHER_S):
         if not reader.served or (world.alerts_heard == seen and not file.is_due):
@@ -134,7 +134,7 @@ async def _serve(
 
 
 class _Server(uvicorn.Server):
-    """Signals are the command's, not the library's."""
+    """Web server that leaves signal handling to the command."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:

@@ -1,4 +1,4 @@
-"""`replay`: the map as of any moment, replayed from the archive as the service fused it; or a day of it, in frames."""
+"""`replay`: the map as of any moment, replayed from the archive; or a day of it in frames."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ REPORT_ROWS: Final = 1_000_000  # between two lines of progress
 
 
 def ask(engine: QueryEngine, options: Options) -> pa.Table:
-    """Cells of the map at `at`, or of each frame from the part's begin to its end; `frame` is its time.
+    """Return the cells of the map at `at`, or of each frame from the part's begin to its end; `frame` is its time.
 
     Raises:
-        InputError: the step is none, or makes more frames than anybody looks at.
+        InputError: the step is not valid, or makes too many frames.
     """
     if options.step_s is not None and not LEAST_STEP_S <= options.step_s < math.inf:
         raise InputError("step", f"{options.step_s:g} s is no step", "give the seconds between two frames, e.g. 600")
@@ -57,10 +57,10 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
 
 
 def _begin(engine: QueryEngine, first: int, step: int) -> int:
-    """When the frames begin [ns]: with the part, or just before the first row where the part begins earlier.
+    """Return the begin of the frames [ns]: that of the part, or just before the first row if the part begins earlier.
 
     Raises:
-        InputError: there would be more of them than anybody looks at.
+        InputError: there would be too many frames.
     """
     days = layout.days(engine.root, layout.TABLES[Kind.OBSERVATION])
     last = (max(map(layout.day_of, days), default=first // layout.DAY_NS) + 1) * layout.DAY_NS
