@@ -1,10 +1,10 @@
-"""A town that listens, without a network: simulated cars, the fusion and its alerts, cars that hear the map and react.
+"""Town with listening cars, without a network: simulated cars, the fusion and its alerts, cars that receive the map.
 
     python -m deploy.listening --out DIR [--seeds 20] [--vehicles 36] [--duration 150] [--scenario hills-SEED]
 
-Every second what the cars observed is fused, as a service would; alerts and, now and then, tiles go to the cars that
-listen, by the bytes that would travel. Each seed is driven twice from the same start, once with all cars listening and
-once with none. DIR/figures.json gets what became of it.
+Every second the cars' observations are fused, as in a service. Alerts and, now and then, tiles are passed to the
+listening cars as bytes. Each seed is driven twice from the same start, once with all cars listening and once with none.
+DIR/figures.json gets the figures.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ LOST: Final = 0.98  # of the grip: a wheel was at its peak or past it
 
 @dataclass
 class Drive:
-    """What became of one drive; rows are visits of a vehicle to a cell, by the simulator's truth."""
+    """Result of one drive; rows are visits of a vehicle to a cell, from the simulator's truth."""
 
     slid: set[tuple[int, int]] = field(default_factory=set)  # (vehicle, lap) that lost grip on the new ice
     passed: set[tuple[int, int]] = field(default_factory=set)  # ... and that were there
@@ -86,7 +86,7 @@ class ListeningTown:
         self._true: dict[int, float] = {}  # friction of the places, as it was driven over last
 
     def run(self, duration_s: float) -> Drive:
-        """Drive, and judge the map at the end."""
+        """Drive, and evaluate the map at the end."""
         for second in range(int(duration_s)):
             parts = [self._block() for _ in range(round(RATE_HZ / BLOCK))]
             self._fuse([part for part in parts if len(part["cell"])])
@@ -98,7 +98,7 @@ class ListeningTown:
         return self.drive
 
     def _covered(self) -> list[bool]:
-        """Whether the map's interval holds the last truth, for each place that several vehicles visited."""
+        """Return whether the map's interval holds the last truth, for each place that several vehicles visited."""
         place = np.array(list(self._true), np.int64)
         slots = self.fusion.slots_of(place // grid.SECTORS, place % grid.SECTORS)
         several = slots >= 0
@@ -118,7 +118,7 @@ class ListeningTown:
         return seen.columns | {"vehicle": seen.vehicle}
 
     def _truth(self, now: float) -> None:
-        """Who is on the new ice, and who slides there."""
+        """Record the cars on the new ice, and those that slide there."""
         true, patch = self.fleet.truth, self.ice
         cells = grid.cell_of(*self.fleet.scenario.to_latlon(true.x[-1], true.y[-1]))
         places = cells * grid.SECTORS + grid.sector_of(true.yaw[-1])
@@ -147,7 +147,7 @@ class ListeningTown:
             self.heard.alert(heard_alert(key, wire.encode_alert(alert), now), now)
 
     def _hear(self, second: int) -> None:
-        """The tiles as they would come, and the alerts that stand put again."""
+        """Pass on the changed tiles, and repeat the standing alerts."""
         now = self._now()
         for alert in self.alerts.standing:
             self.heard.alert(alert, now)
@@ -233,7 +233,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def measured(with_: list[Drive], without: list[Drive]) -> list[Figure]:
-    """The figures of drives with and without listening."""
+    """Return the figures of drives with and without listening."""
     slid, before = (sum(len({k for k, _ in drive.slid}) for drive in drives) for drives in (with_, without))
     laps, laps_before = (sum(len(drive.slid) for drive in drives) for drives in (with_, without))
     errors = np.array([pair for drive in with_ for pair in drive.known_error]).reshape(-1, 2)

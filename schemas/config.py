@@ -1,4 +1,4 @@
-"""Configuration of the agent and the service: every setting with its default, unit and reason, in one place."""
+"""Configuration of agent and service: every setting with its default, unit and reason."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Settings(BaseModel):
 
 
 class ZenohSettings(Settings):
-    """How to reach the routers; `config` is handed to Zenoh as it is (same keys as a Zenoh configuration file)."""
+    """Connection to the routers; `config` is passed to Zenoh unchanged (same keys as a Zenoh configuration file)."""
 
     connect: list[str] = Field(default=["tcp/127.0.0.1:7447"], description="router endpoints, tried in turn")
     config: dict[str, Any] = Field(
@@ -34,7 +34,7 @@ class ZenohSettings(Settings):
 
 
 class MonitoringSettings(Settings):
-    """How a running part shows itself."""
+    """Settings for metrics, health and log format."""
 
     metrics_port: int | None = Field(
         default=None, ge=0, le=65535, description="/metrics (OpenMetrics) and /healthz; 0: a free port; null: off"
@@ -73,12 +73,12 @@ class AgentConfig(MonitoringSettings):
     tyre_season: int = Field(default=0, ge=0, le=3, description="0 unknown, 1 summer, 2 winter, 3 all-season")
 
     def spool_of(self, name: str) -> Path:
-        """The outbox of a vehicle, or of a process."""
+        """Return the path of a vehicle's outbox, or of a process's."""
         return Path(str(self.spool).replace("{name}", name))
 
 
 class ArchiveSettings(Settings):
-    """Where the archive is."""
+    """Location of the archive."""
 
     path: Path | None = Field(default=None, description="folder, one service per archive; `--archive` goes before it")
     second: str | None = Field(
@@ -94,7 +94,7 @@ class ArchiveSettings(Settings):
 
     @property
     def options(self) -> dict[str, str]:
-        """`store` as it is, with its secrets."""
+        """Return `store` with its secrets."""
         return {name: value.get_secret_value() for name, value in self.store.items()}
 
 
