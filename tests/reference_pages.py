@@ -89,7 +89,7 @@ def settings_rows(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[st
             yield from settings_rows(nested, f"{prefix}{name}.")
         else:
             default = "" if field.is_required() else repr(field.get_default(call_default_factory=True))
-            yield f"{prefix}{name}", default, field.description or ""
+            yield f"{prefix}{field.alias or name}", default, field.description or ""
 
 
 def settings_page() -> str:

@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", type=Path, help="signal log (Parquet)")
     parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON) (default: LOG.json beside LOG.parquet)")
     add_json(parser, "what was found")
-    parser.add_argument("--out", type=Path, help="page with the evidence and its plots (HTML)")
+    parser.add_argument("--out", type=Path, help="HTML page with the evidence and plots")
     parser.add_argument(
         "--fix",
         type=Path,

@@ -17,11 +17,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--vehicles", type=int, default=36, help="how many (default 36)")
     parser.add_argument("--scenario", default="demo", help="demo (default), hills, test; hills-7: drawn by seed 7")
-    parser.add_argument("--rough", type=float, default=0.0, help="share of them as real cars are (default 0)")
-    parser.add_argument("--warned", type=float, default=0.0, help="share of them that hear the map and are warned")
+    parser.add_argument(
+        "--rough", type=float, default=0.0, help="share of them with the sensor errors of real cars (default 0)"
+    )
+    parser.add_argument("--warned", type=float, default=0.0, help="share of them that receive the map and are warned")
     add_estimator(parser)
     parser.add_argument("--config", type=Path, help="agent configuration (JSON)")
-    parser.add_argument("--truth", type=Path, help="what they truly drove over, one row per cell visit (Parquet)")
+    parser.add_argument("--truth", type=Path, help="file for the true friction, one row per cell visit (Parquet)")
     parser.add_argument("--rate", type=float, default=100.0, help="samples per second (default 100)")
     parser.add_argument("--seed", type=int, default=0, help="of the simulation (default 0)")
     parser.add_argument("--duration", type=float, default=float("inf"), help="[s]; else until stopped")

@@ -31,17 +31,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="'simulated' (default), a signal log (Parquet), or live ones, as often as there are sources: "
         "can:INTERFACE/CHANNEL, ros2:ENDPOINT, vss:HOST:PORT, gpsd:HOST:PORT, or NAME:ADDRESS of a package of yours",
     )  # fmt: skip
-    parser.add_argument("--profile", help="which live signal is which channel: a file, or a shipped one")
+    parser.add_argument("--profile", help="profile that maps live signals to channels: a file, or a shipped one")
     parser.add_argument("--dbc", type=Path, help="CAN database (default: the profile's)")
-    parser.add_argument("--trust", action="store_true", help="publish what the signal doctor did not pass")
-    parser.add_argument("--ahead", action="store_true", help="hear the map, and warn of slippery road ahead")
-    parser.add_argument("--route", type=Path, help="where it drives to, for --ahead (GPX or GeoJSON)")
-    parser.add_argument("--vss", action="store_true", help="tell the friction here as VSS signals, a line of JSON each")
-    parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON); needed but with simulated")
+    parser.add_argument(
+        "--trust", action="store_true", help="publish although the signal doctor did not pass the signals"
+    )
+    parser.add_argument("--ahead", action="store_true", help="receive the map and warn of slippery road ahead")
+    parser.add_argument("--route", type=Path, help="route for --ahead (GPX or GeoJSON)")
+    parser.add_argument("--vss", action="store_true", help="report the friction as VSS signals, one line of JSON each")
+    parser.add_argument("--vehicle", type=Path, help="vehicle file (JSON); required except for simulated")
     add_estimator(parser)
     parser.add_argument("--name", help="name to publish under (default: the vehicle's)")
     parser.add_argument("--config", type=Path, help="agent configuration (JSON)")
-    parser.add_argument("--scenario", default="demo", help="where the simulated vehicle drives (default demo)")
+    parser.add_argument("--scenario", default="demo", help="scenario of the simulated vehicle (default demo)")
     parser.add_argument("--rate", type=float, default=100.0, help="samples per second of the simulation")
     parser.add_argument("--seed", type=int, default=0, help="of the simulation")
     parser.add_argument("--duration", type=float, default=float("inf"), help="[s]; else until stopped or the log ends")

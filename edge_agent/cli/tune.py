@@ -48,9 +48,9 @@ POSITIONS: Final = 7  # per vertex: the default and three to each side
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `edge-agent tune`."""
-    parser.add_argument("log", type=Path, nargs="*", help="signal logs of your own in place of simulated drives")
+    parser.add_argument("log", type=Path, nargs="*", help="signal logs of your own instead of simulated drives")
     parser.add_argument("--vehicle", type=Path, help="vehicle file of the logs (default: LOG.json beside LOG.parquet)")
-    parser.add_argument("--seed", type=int, default=0, help="of the ants and of the random search (default 0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of both searches (default 0)")
     parser.add_argument("--ants", type=int, help=f"paths per iteration (default {ANTS})")
     parser.add_argument("--iterations", type=int, help=f"default {ITERATIONS}")
     parser.add_argument(
@@ -59,13 +59,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="interval score of friction (needs the truth: simulated drives' default), log-likelihood of the"
         " innovations, or that with a price on wrong calibration (default with logs: predictive)",
     )
-    parser.add_argument("--repeats", type=int, default=1, help="searches each way (default %(default)s)")
+    parser.add_argument("--repeats", type=int, default=1, help="number of searches of each kind (default %(default)s)")
     parser.add_argument("--out", type=Path, default=Path(f"{ESTIMATOR}.json"), help="default %(default)s")
     parser.add_argument(
         "--study", type=Path, metavar="DIR",
         help="the study of paper 004's filter instead: figures.json, study.md, convergence.png, paper-aco-fckf.json",
     )  # fmt: skip
-    parser.add_argument("--quick", action="store_true", help="a few ants on short drives: tries the way, tunes nothing")
+    parser.add_argument("--quick", action="store_true", help="a few ants on short drives, to check that it runs")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -156,7 +156,7 @@ class Upkeep:
         if busy is not None and time.monotonic() - busy[1] > HANGS_S:
             found.append(f"{busy[0]} has not ended for {time.monotonic() - busy[1]:.0f} s")
         if self.ended:
-            found.append("upkeep has ended; start the service again")
+            found.append("background jobs have ended; restart the service")
         return found
 
     @property

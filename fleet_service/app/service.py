@@ -135,9 +135,9 @@ class Service:
     def _hanging(self) -> str | None:
         """Return what has died or hangs next to the worker, so that only a restart helps."""
         if self.engine.hangs_s >= HANGS_S:
-            return f"a segment is being written for {self.engine.hangs_s:.0f} s"
+            return f"a segment write has been in progress for {self.engine.hangs_s:.0f} s"
         if self._replies.hangs_s >= HANGS_S:
-            return f"a tile of an answer is being made for {self._replies.hangs_s:.0f} s"
+            return f"a tile of an answer has been in progress for {self._replies.hangs_s:.0f} s"
         return "upkeep has ended" if self._upkeep.ended else None
 
     def _works(self) -> bool:
@@ -230,7 +230,7 @@ class Service:
         if now - self._reported_at >= STATUS_S:
             self._status(now)
             if hanging := self._hanging():
-                self._log_line(f"no sign of life is given: {hanging}")
+                self._log_line(f"watchdog signal withheld: {hanging}")
             else:
                 watchdog.alive()
         if not self._survived and now - self._began >= SURVIVED_S:
@@ -242,7 +242,7 @@ class Service:
         if self.engine.holding.lost:
             self._followed = True
             stop.set()  # then nothing that hangs on a bucket, or on a router, keeps it for long
-            self._log_line("followed: another service has the lease; what it did not get its senders keep")
+            self._log_line("lease lost to another service; senders keep everything that was not acknowledged")
             return
         leaves = self.engine.holding.leaves
         if leaves:
@@ -285,8 +285,8 @@ class Service:
             f"status: {counts[Kind.OBSERVATION]} observations ({rate:.0f}/s), {counts[Kind.STATE]} states, "
             f"{self.engine.fusion.size} cells, {self.engine.alerts} alerts, queue {len(self.inbox)}"
             + (f"; {rest}" if rest else "")
-            + (f"; the system's clock is {behind:.0f} s behind" if behind >= LAG_S else "")
-            + (f"; the system's clock has jumped {-behind:.0f} s ahead, no report agrees" if behind <= -LAG_S else "")
+            + (f"; the system clock is {behind:.0f} s behind" if behind >= LAG_S else "")
+            + (f"; the system clock jumped {-behind:.0f} s ahead, no report confirms it" if behind <= -LAG_S else "")
         )
         self._log_line(Line(text, cells=self.engine.fusion.size, queue=len(self.inbox), counts=dict(counts)))
 

@@ -30,20 +30,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.description = "; ".join(f"{question.name}: {question.about}" for question in known().values())
     parser.add_argument("question", metavar="NAME", help=" | ".join(known()))
-    parser.add_argument("--archive", metavar="DIR", type=Path, required=True, help="what waits in its log is compacted")
+    parser.add_argument(
+        "--archive",
+        metavar="DIR",
+        type=Path,
+        required=True,
+        help="archive; segments waiting in its log are compacted first",
+    )
     add_part(parser)
     parser.add_argument("--out", metavar="FILE", type=Path, help=f"ends in {', '.join(ENDINGS)}")
     parser.add_argument("--engine", default="duckdb", metavar="duckdb|spark", help="default %(default)s")
-    parser.add_argument("--at", metavar="TIME", help="before-after: of the treatment; replay: of the map")
+    parser.add_argument("--at", metavar="TIME", help="before-after: time of the treatment; replay: time of the map")
     parser.add_argument("--stations", metavar="FILE", type=Path, help="weather, change-rates: readings, CSV or Parquet")
-    parser.add_argument("--step", metavar="SECONDS", type=float, help="replay: between frames")
+    parser.add_argument("--step", metavar="SECONDS", type=float, help="replay: seconds between frames")
     vehicles = f"worst, spells, contract: default {USUAL_VEHICLES}"
     parser.add_argument("--min-vehicles", metavar="K", type=int, help=vehicles)
-    parser.add_argument("--roads", metavar="FILE", type=Path, help="contract: what `fleet-service roads` wrote")
-    parser.add_argument("--level", metavar="MU", type=float, help="contract: grip that was agreed, e.g. .35")
-    parser.add_argument("--within", metavar="TIME", help="contract: in which it is to be restored, e.g. 4h or 90min")
-    parser.add_argument("--as-it-lies", action="store_true", help="leave the log alone: only compacted files are read")
-    parser.add_argument("--json", action="store_true", help="print the rows as JSON, one a line")
+    parser.add_argument("--roads", metavar="FILE", type=Path, help="contract: file written by `fleet-service roads`")
+    parser.add_argument("--level", metavar="MU", type=float, help="contract: agreed grip, e.g. .35")
+    parser.add_argument(
+        "--within", metavar="TIME", help="contract: time within which it must be restored, e.g. 4h or 90min"
+    )
+    parser.add_argument("--as-it-lies", action="store_true", help="do not compact the log; read compacted files only")
+    parser.add_argument("--json", action="store_true", help="print the rows as JSON, one per line")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -38,9 +38,11 @@ def add_connection(parser: argparse.ArgumentParser) -> None:
 
 def add_supplier(parser: argparse.ArgumentParser) -> None:
     """Declare the supplier of a DATEX II publication."""
-    parser.add_argument("--country", metavar="CC", help="datex: the supplier's, e.g. se")
-    parser.add_argument("--supplier", metavar="NAME", help="datex: the supplier's name at its National Access Point")
-    parser.add_argument("--status", choices=STATUSES, default="test", help="datex: of the information; default test")
+    parser.add_argument("--country", metavar="CC", help="datex: country of the supplier, e.g. se")
+    parser.add_argument("--supplier", metavar="NAME", help="datex: name of the supplier at its National Access Point")
+    parser.add_argument(
+        "--status", choices=STATUSES, default="test", help="datex: status of the information; default test"
+    )
 
 
 def supplier_of(arguments: argparse.Namespace) -> Supplier:
@@ -60,20 +62,22 @@ def supplier_of(arguments: argparse.Namespace) -> Supplier:
 def add_part(parser: argparse.ArgumentParser) -> None:
     """Declare the options that select a part of the archive."""
     parser.add_argument("--from", dest="since", metavar="TIME", help="e.g. 2026-01-31 or 2026-01-31T07:00:00Z, UTC")
-    parser.add_argument("--to", dest="until", metavar="TIME", help="likewise, excluded; default now")
-    parser.add_argument("--bbox", metavar="W,S,E,N", help="degrees; without it, everything")
+    parser.add_argument("--to", dest="until", metavar="TIME", help="end, excluded, in the same form (default: now)")
+    parser.add_argument("--bbox", metavar="W,S,E,N", help="box in degrees (default: everything)")
 
 
 def add_archive(parser: argparse.ArgumentParser, *, required: bool = True) -> None:
     """Declare the archive of a command, and the form of its report."""
-    parser.add_argument("--archive", metavar="DIR", type=Path, required=required, help="of a service, running or not")
-    parser.add_argument("--json", action="store_true", help="say what was done as one line of JSON")
+    parser.add_argument(
+        "--archive", metavar="DIR", type=Path, required=required, help="archive of a service, running or not"
+    )
+    parser.add_argument("--json", action="store_true", help="print the result as one line of JSON")
 
 
 def add_dry_run(parser: argparse.ArgumentParser) -> None:
     """Declare the safety options of a destructive command."""
-    parser.add_argument("--dry-run", action="store_true", help="only say what would be done")
-    parser.add_argument("--yes", action="store_true", help="do not ask; on a terminal it asks")
+    parser.add_argument("--dry-run", action="store_true", help="only print what would be done")
+    parser.add_argument("--yes", action="store_true", help="do not ask for confirmation")
 
 
 def confirmed(arguments: argparse.Namespace, what: str) -> bool:

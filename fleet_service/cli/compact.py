@@ -12,7 +12,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_archive(parser)
     parser.add_argument(
-        "--put-to", "--to", dest="to", metavar="URI", help="then put what is new there, e.g. s3://bucket/folder"
+        "--put-to", "--to", dest="to", metavar="URI", help="then copy new files there, e.g. s3://bucket/folder"
     )  # --to: its name until 0.2
     parser.add_argument(
         "--round-rows", metavar="N", type=int, help="rows in memory at once; default a million, half a gigabyte"

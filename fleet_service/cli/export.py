@@ -56,17 +56,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="FILE", type=Path, help=f"ends in {', '.join(ENDINGS)}; datex: in .xml")
     add_part(parser)
     parser.add_argument(
-        "--min-vehicles", metavar="K", type=int, default=1, help="map: only cells of K vehicles or more"
+        "--min-vehicles", metavar="K", type=int, default=1, help="map: only cells with at least K vehicles"
     )
-    parser.add_argument("--snapshot", action="store_true", help="map: the service's last hourly one, at once")
+    parser.add_argument("--snapshot", action="store_true", help="map: use the service's last hourly snapshot, at once")
     add_connection(parser)
     add_supplier(parser)
-    parser.add_argument("--follow", action="store_true", help="datex: keep the file up until a signal")
+    parser.add_argument("--follow", action="store_true", help="datex: keep the file current until a signal")
     parser.add_argument(
-        "--catalog", metavar="NAME|URI", help="iceberg: of pyiceberg's configuration, or sqlite:///FILE, postgresql+…"
+        "--catalog",
+        metavar="NAME|URI",
+        help="iceberg: name in pyiceberg's configuration, or sqlite:///FILE, postgresql+…",
     )
-    parser.add_argument("--namespace", metavar="NAME", help="iceberg: of the tables observations, states; or gripmap")
-    parser.add_argument("--at", metavar="URL", help="iceberg: where readers find the archive's files; default: there")
+    parser.add_argument("--namespace", metavar="NAME", help="iceberg: namespace of the tables (default: gripmap)")
+    parser.add_argument(
+        "--at", metavar="URL", help="iceberg: URL at which readers find the archive's files (default: its path)"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:

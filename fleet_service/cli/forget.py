@@ -24,9 +24,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_archive(parser)
     parser.add_argument("--period", metavar="MONTH", required=True, help="e.g. 2026-01")
-    parser.add_argument("--vehicle", metavar="NAME", help="only this vehicle; its rows are removed")
-    parser.add_argument("--config", metavar="FILE", help="the service's: how the archive's copy is reached")
-    parser.add_argument("--put-to", metavar="URI", help="the mirror, where what was rewritten is put again")
+    parser.add_argument("--vehicle", metavar="NAME", help="remove only the rows of this vehicle")
+    parser.add_argument("--config", metavar="FILE", help="the service's configuration, with the archive's copy")
+    parser.add_argument("--put-to", metavar="URI", help="mirror to which rewritten files are copied again")
     add_dry_run(parser)
 
 

@@ -10,8 +10,8 @@ from fleet_service.cli.common import add_connection
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("region", metavar="REGION", help="as services are given it, e.g. 1202/310/*")
-    parser.add_argument("--to", metavar="NAME", required=True, help="the standby that is to serve it")
+    parser.add_argument("region", metavar="REGION", help="region key expression, e.g. 1202/310/*")
+    parser.add_argument("--to", metavar="NAME", required=True, help="name of the standby that takes over")
     add_connection(parser)
 
 

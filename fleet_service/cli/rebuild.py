@@ -15,9 +15,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_archive(parser)
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="a new folder: map/ and rollup/ by zone")
-    parser.add_argument("--to", dest="until", metavar="TIME", help="of the map; default now")
+    parser.add_argument("--to", dest="until", metavar="TIME", help="moment of the map (default: now)")
     parser.add_argument("--engine", default="local", metavar="local|spark", help="default %(default)s")
-    parser.add_argument("--as-it-lies", action="store_true", help="leave the log alone: roll-ups of what is compacted")
+    parser.add_argument(
+        "--as-it-lies", action="store_true", help="do not compact the log; roll up compacted files only"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -32,11 +32,18 @@ FREEING_S = 0.4  # of them, for a bucket to take a word
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--config", metavar="FILE", help="JSON; every setting has a default")
-    parser.add_argument("--archive", metavar="DIR", type=Path, help="one service per archive; else the configuration's")
     parser.add_argument(
-        "--standby", action="store_true", help="wait until the service with this copy is gone; go on as it"
+        "--archive",
+        metavar="DIR",
+        type=Path,
+        help="folder of the archive, one service per archive (default: the configuration's)",
     )
-    parser.add_argument("--weather", metavar="FILE", type=Path, help="Parquet of road weather to begin with")
+    parser.add_argument(
+        "--standby", action="store_true", help="run as standby: take over when the active service on this replica stops"
+    )
+    parser.add_argument(
+        "--weather", metavar="FILE", type=Path, help="Parquet file of road weather to read at the start"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -122,7 +129,7 @@ def _leave_at_last(
     """
     stop.wait()
     if not stopped.wait(LEAVE_AT_LAST_S):
-        log_line("left at last: a session or a job did not end in time")
+        log_line("shutdown incomplete: a session or a job did not end in time")
         faulthandler.dump_traceback()  # which one, and where
         if service.failure is not None:
             traceback.print_exception(service.failure)

@@ -207,7 +207,7 @@ def _mended(host: Host, random_: random.Random) -> None:
 
 def _followed(host: Host, _: random.Random) -> None:
     assert host.part.wait(PATIENCE_S) == 1
-    assert host.said("followed: ")
+    assert host.said("lease lost to another service")
 
 
 TWO: Final = "two standbys"

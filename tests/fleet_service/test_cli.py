@@ -194,7 +194,7 @@ def test_a_service_that_has_to_be_ended_says_with_its_exit_code_whether_all_was_
     try:
         service.line_with("hangs")
         assert service.stop() == code
-        assert "left at last: a session or a job did not end in time" in service.lines()
+        assert "shutdown incomplete: a session or a job did not end in time" in service.lines()
         assert ("IndexError: list index out of range" in service.lines()) == bool(more)
     finally:
         service.kill()
@@ -213,7 +213,7 @@ def test_a_service_that_has_to_be_ended_gives_its_lease_free(
         service.line_with("hangs")
         service.line_with("ready: ")
         assert service.stop() == 0
-        assert "left at last: a session or a job did not end in time" in service.lines()
+        assert "shutdown incomplete: a session or a job did not end in time" in service.lines()
     finally:
         service.kill()
     (lease,) = bucket.place("lease").glob("*.json")

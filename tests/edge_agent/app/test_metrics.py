@@ -67,7 +67,7 @@ def test_an_agent_that_nobody_answers_or_whose_outbox_is_full_is_in_trouble(tmp_
     late.append(metrics.UNANSWERED_S)
     found = metrics.troubles(publisher, Progress())
     assert any(text.startswith("nothing was acknowledged for 6") for text in found)
-    assert "the outbox is full: the oldest states go first" in found
+    assert "the outbox is full: the oldest states are dropped first" in found
     publisher.close(within_s=0.0)
 
 

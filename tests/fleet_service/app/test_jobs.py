@@ -87,7 +87,7 @@ def test_upkeep_that_has_died_is_known_and_told() -> None:
 
     with Upkeep([Job("fatal", 0.001, work)], Counter(), lambda _: None) as upkeep:
         until(lambda: upkeep.ended)
-        assert upkeep.troubles()[-1] == "upkeep has ended; start the service again"
+        assert upkeep.troubles()[-1] == "background jobs have ended; restart the service"
     assert not upkeep.ended, "it was stopped"
 
 

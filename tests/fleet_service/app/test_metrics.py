@@ -85,8 +85,8 @@ def test_each_trouble_is_told(tmp_path: Path) -> None:
     ill = Pulse(turn_age_s=60.0, queued=99, routers=0, clock_lag_s=0.0, answer_s=60.0)
     assert metrics.troubles(engine, ill, config) == [
         "no router is connected",
-        "the worker has done nothing for 60 s",
-        "a tile of an answer is being made for 60 s",
+        "the worker has been idle for 60 s",
+        "a tile of an answer has been in progress for 60 s",
         "segments cannot be written",
         "the queue is full",
     ]

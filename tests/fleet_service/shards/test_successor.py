@@ -74,7 +74,7 @@ def test_a_standby_goes_on_with_all_that_was_acknowledged(
         one.to_router.mend()
         if how not in {"killed", "stopped"}:  # cut from the bucket, it hears of its successor by the token
             assert one.part.wait(PATIENCE_S) == 1
-            assert one.said("followed: ")
+            assert one.said("lease lost to another service")
         one.to_bucket.mend()
         one.part.start()  # and is the standby from now on, whose folder becomes what the bucket is
         one.part.line_with("standby: ")
