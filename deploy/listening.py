@@ -18,12 +18,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from edge_agent.ahead.hearing import heard_alert, heard_cells
+from edge_agent.ahead.hearing import decode_alert_message, decode_cells
 from edge_agent.ahead.horizon import horizon_length, look_ahead
-from edge_agent.ahead.known import HeardMap
+from edge_agent.ahead.known import LocalMap
 from edge_agent.ahead.path import Pose
 from edge_agent.ahead.prior import MapPrior
-from edge_agent.ahead.warnings import Active, warn
+from edge_agent.ahead.warnings import Active, update_warnings
 from edge_agent.app.estimator_factory import bank_of
 from edge_agent.inputs.block import Block, absolute
 from edge_agent.lab.seeds import FIGURES
@@ -76,7 +76,7 @@ class ListeningTown:
         self.fusion = Fusion(LATENESS_S)
         self.alerts = Alerts(self.fusion)
         self.drivers = WarnedDrivers(self.fleet, 1.0 if listening else 0.0)
-        self.heard, self.prior = HeardMap(), MapPrior(vehicles)
+        self.heard, self.prior = LocalMap(), MapPrior(vehicles)
         self.active: list[tuple[Active, ...]] = [()] * vehicles
         self.drive = Drive()
         self.ice = self.fleet.scenario.events[0]
@@ -93,11 +93,11 @@ class ListeningTown:
             if self._listening:
                 self._hear(second)
                 self._look()
-        self.drive.inside = self._covered()
+        self.drive.inside = self._check_intervals()
         self.drive.visits = self.fusion.live.visits[: self.fusion.size].sum()
         return self.drive
 
-    def _covered(self) -> list[bool]:
+    def _check_intervals(self) -> list[bool]:
         """Return whether the map's interval holds the last truth, for each place that several vehicles visited."""
         place = np.array(list(self._true), np.int64)
         slots = self.fusion.slots_of(place // grid.SECTORS, place % grid.SECTORS)
@@ -136,7 +136,7 @@ class ListeningTown:
         if not parts:
             return
         columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        raised = self.alerts.updated(self.fusion.update(observations_in(columns)).slots)
+        raised = self.alerts.update(self.fusion.update(observations_in(columns)).slots)
         now = self._now()
         for alert in raised:
             if alert.raised and self._on_ice(alert.latitude, alert.longitude):
@@ -144,12 +144,12 @@ class ListeningTown:
                     self.drive.alert_passes = float(len(self.drive.passed))
                 self.drive.alerts += 1
             key = keys.alert_key(int(grid.tile_of(alert.cell)))
-            self.heard.alert(heard_alert(key, wire.encode_alert(alert), now), now)
+            self.heard.alert(decode_alert_message(key, wire.encode_alert(alert), now), now)
 
     def _hear(self, second: int) -> None:
         """Pass on the changed tiles, and repeat the standing alerts."""
         now = self._now()
-        for alert in self.alerts.standing:
+        for alert in self.alerts.standing_alerts:
             self.heard.alert(alert, now)
         if second - self._asked < ASKED_S:
             return
@@ -158,7 +158,7 @@ class ListeningTown:
         tiles = grid.tile_of(self.fusion.live.key[: self.fusion.size] // grid.SECTORS)
         for tile in np.unique(tiles).tolist():
             payload = arrow_stream(batch_of(view(self.fusion, slots[tiles == tile], now), now))
-            self.heard.take(*heard_cells(keys.map_key(tile), payload, now), now)
+            self.heard.take(*decode_cells(keys.map_key(tile), payload, now), now)
 
     def _look(self) -> None:
         self.drivers.refresh()
@@ -169,7 +169,9 @@ class ListeningTown:
             path = route.ahead(pose, horizon_length(pose.speed)) if route is not None else None
             if path is None:
                 continue
-            self.active[k], issued = warn(self.active[k], [look_ahead(path, self.heard, pose.time)], pose, self.heard)
+            self.active[k], issued = update_warnings(
+                self.active[k], [look_ahead(path, self.heard, pose.time)], pose, self.heard
+            )
             self.drive.warnings += sum(one.state == "raised" for one in issued)
             for warning in issued:
                 self.drivers.hear(self.fleet.names[k], warning)
@@ -225,14 +227,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             passes = f"{len(drive.slid)} of {len(drive.passed)} passes slid, alert after {drive.alert_passes:.0f}"
             more = f"{drive.alerts} alerts on the ice, {drive.warnings} warnings"
             print(f"  seed {seed} {'listening' if listening else 'deaf'}: {passes}; {more}", flush=True)
-    found = measured(with_, without)
+    found = measure(with_, without)
     campaign = "deploy.listening" + (f" --seeds {args.seeds}" if args.seeds < SEEDS else "")
     figures.write(args.out / "figures.json", campaign, [args.first, args.first + args.seeds - 1], found)
     print(figures.markdown(found))
     return 0 if all(figure.holds for figure in found if figure.bar is not None) else 1
 
 
-def measured(with_: list[Drive], without: list[Drive]) -> list[Figure]:
+def measure(with_: list[Drive], without: list[Drive]) -> list[Figure]:
     """Return the figures of drives with and without listening."""
     slid, before = (sum(len({k for k, _ in drive.slid}) for drive in drives) for drives in (with_, without))
     laps, laps_before = (sum(len(drive.slid) for drive in drives) for drives in (with_, without))

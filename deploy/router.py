@@ -17,7 +17,7 @@ from pathlib import Path
 import zenoh
 
 from schemas.errors import InputError
-from schemas.runtime.process import end_now
+from schemas.runtime.process import force_exit
 
 CLOSE_S = 2.0
 ENDING = (signal.SIGINT, signal.SIGTERM)
@@ -85,4 +85,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 if __name__ == "__main__":
     # Zenoh may hang where one of two connected routers is closed, then or when the interpreter ends; a router has
     # nothing to save.
-    end_now(main())
+    force_exit(main())

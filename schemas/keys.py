@@ -14,7 +14,7 @@ from schemas.config import NAME_PATTERN, REGION_PATTERN
 from schemas.errors import InputError
 
 ROOT: Final = "gripmap/v1"
-SERVES: Final = f"{ROOT}/serves"  # tokens of who serves which region, see `Served`
+SERVES: Final = f"{ROOT}/serves"  # tokens of who serves which region, see `ServiceToken`
 CLAIMS: Final = f"{ROOT}/claims"  # likewise of who has it for itself, from before it answers until it does no more
 WAITS: Final = f"{ROOT}/waits"  # likewise of who stands by for it
 _ALL: Final = "all"
@@ -122,7 +122,7 @@ def shard_key(service: str) -> str:
     return f"{ROOT}/shard/{service}"
 
 
-class Served(NamedTuple):
+class ServiceToken(NamedTuple):
     """Announcement that a service serves a region: a liveliness token that exists as long as the service.
 
     Attributes:
@@ -139,14 +139,14 @@ class Served(NamedTuple):
     def key(self) -> str:
         """Return the token: `gripmap/v1/serves/<region>/<service>/<start>`, with `all` for `*`, which no key may
         contain."""
-        return self.below(SERVES)
+        return self.key_under(SERVES)
 
-    def below(self, root: str) -> str:
+    def key_under(self, root: str) -> str:
         """Return the token below another root: CLAIMS, or WAITS for a standby."""
         return f"{root}/{self.region.replace('*', _ALL)}/{self.service}/{self.start}"
 
 
-def parse_served(key: str, root: str = SERVES) -> Served:
+def parse_served(key: str, root: str = SERVES) -> ServiceToken:
     """Parse such a token.
 
     Raises:
@@ -155,8 +155,8 @@ def parse_served(key: str, root: str = SERVES) -> Served:
     *found, service, start = ["", "", *key.removeprefix(f"{root}/").split("/")]
     region = "/".join(found[2:]).replace(_ALL, "*")
     if not key.startswith(f"{root}/") or not re.fullmatch(REGION_PATTERN, region):
-        raise InputError("key", f"{key[:80]!r} names no service's region", "see `Served`")
-    return Served(region, service, start)
+        raise InputError("key", f"{key[:80]!r} names no service's region", "see `ServiceToken`")
+    return ServiceToken(region, service, start)
 
 
 class Parsed(NamedTuple):

@@ -19,7 +19,7 @@ import time
 from pathlib import Path
 from typing import Final
 
-from schemas.runtime.talk import COMPILING
+from schemas.runtime.progress_messages import COMPILING
 from tests.house import ROOT
 from tests.packaging import candidates
 from tests.waiting import until

@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from fleet_service.archive.copies import Copy
+from fleet_service.archive.copies import BucketReplica
 from tests.buckets import BucketServer
 from tests.faults.processes import Part
 
@@ -122,9 +122,9 @@ def restored(folder: Path, bucket: BucketServer) -> Path:
     """The archive that an empty disk gets from the bucket; nothing is changed there."""
     root = folder / "archive"
     root.mkdir(parents=True)
-    copy = Copy(root, bucket.url, bucket.store)
+    copy = BucketReplica(root, bucket.url, bucket.store)
     try:
-        copy.get_ahead()
+        copy.prefetch()
     finally:
         copy.close()
     return root

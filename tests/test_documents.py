@@ -69,7 +69,7 @@ def test_every_command_of_every_page_is_understood() -> None:
     for page, line in found:
         name, *words = shlex.split(line)
         try:
-            commandline.parser_of(*LINES[name].LINE, words[0]).parse_args(commandline.joined(words))
+            commandline.parser_of(*LINES[name].LINE, words[0]).parse_args(commandline.join_negative_numbers(words))
         except SystemExit:
             pytest.fail(f"{page}: {line}")
 
@@ -91,7 +91,9 @@ def test_every_command_of_the_tutorials_is_understood_and_writes_to_try() -> Non
             continue
         words = shlex.split(command)
         if words[0] in LINES:
-            arguments = commandline.parser_of(*LINES[words[0]].LINE, words[1]).parse_args(commandline.joined(words[1:]))
+            arguments = commandline.parser_of(*LINES[words[0]].LINE, words[1]).parse_args(
+                commandline.join_negative_numbers(words[1:])
+            )
             written = [
                 str(getattr(arguments, name))
                 for name in ("out", "archive", "vehicle_out")

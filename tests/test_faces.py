@@ -191,7 +191,7 @@ def test_a_plug_in_that_cannot_be_loaded_is_a_line(monkeypatch: pytest.MonkeyPat
     from schemas.runtime import plugins
 
     broken = {"odd": EntryPoint("odd", "no_such_module:bank", plugins.ESTIMATORS)}
-    monkeypatch.setattr(plugins, "found", lambda group: broken)
+    monkeypatch.setattr(plugins, "entry_points_of", lambda group: broken)
     with pytest.raises(InputError, match="estimator: 'odd' cannot be loaded from no_such_module:bank"):
         edge_agent.make_bank("odd", [])
 

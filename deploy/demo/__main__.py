@@ -100,7 +100,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"\n  See it: {address}\n", flush=True)
         listener, counts = drive(FOLDER, endpoint, args)
         visits = pq.read_table(FOLDER / "truth.parquet")
-        changed_ns = compare.started(visits) + int(appears_s * NS)
+        changed_ns = compare.start_time(visits) + int(appears_s * NS)
         comparison = compare.compare(listener.whole_map(), visits, changed_ns)
         compare.write_truth(visits, changed_ns, FOLDER / "overlay.parquet")
         show(FOLDER, endpoint, comparison)

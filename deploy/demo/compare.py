@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 
 from edge_agent.lab.simulation.listeners import warned_ones
 from fleet_service.archive import reading
-from fleet_service.client.stretches import Stretches, linked
+from fleet_service.client.stretches import Stretches, link_cells
 from fleet_service.lab.end_to_end import false_ice
 from schemas.numeric import BoolArray, FloatArray, IntArray
 from schemas.runtime.figures import Figure
@@ -51,18 +51,18 @@ class MapComparison:
     truth: FloatArray
 
     @property
-    def covered(self) -> BoolArray:
+    def is_covered(self) -> BoolArray:
         """True where the truth lies in the interval."""
         lower, upper = (self.cells[end].to_numpy() for end in ("mu_lower", "mu_upper"))
         return np.asarray((lower <= self.truth) & (self.truth <= upper))
 
     @property
-    def several(self) -> BoolArray:
+    def has_several_vehicles(self) -> BoolArray:
         """True where two or more vehicles were."""
         return np.asarray(self.cells["vehicles"].to_numpy() >= 2)
 
     @property
-    def measured(self) -> BoolArray:
+    def is_measured(self) -> BoolArray:
         """True where the value rests on more than lower bounds."""
         return np.asarray(self.cells["basis"].to_numpy(zero_copy_only=False) == "measured")
 
@@ -70,7 +70,7 @@ class MapComparison:
     def values(self) -> FloatArray:
         """Median of the map, (n,); NaN where nothing was measured."""
         mu = self.cells["mu"].to_numpy()
-        return np.where(self.measured, mu, np.nan)
+        return np.where(self.is_measured, mu, np.nan)
 
 
 def final_truth(visits: pa.Table, changed_ns: int) -> dict[tuple[int, int], float]:
@@ -139,14 +139,14 @@ def figures(
     counts: dict[str, float], archive: Path, wall_s: float,
 ) -> list[Figure]:  # fmt: skip
     """Return the demo's figures with their bars."""
-    several, value = comparison.several, comparison.several & comparison.measured
+    several, value = comparison.has_several_vehicles, comparison.has_several_vehicles & comparison.is_measured
     error = comparison.cells["mu"].to_numpy() - comparison.truth
     patch = (visits["mu"].to_numpy() < SLIPPERY_MU) & newly_slippery(visits, changed_ns)
-    rows, distinct, vehicles = archived(archive)
+    rows, distinct, vehicles = archive_counts(archive)
     false, _ = false_ice([alert for _, alert in alerts if alert.raised], visits)
     return [
         Figure("demo.vehicles", vehicles, "", 30, "more"),
-        Figure(COVERAGE, _mean(comparison.covered[several]), "", (0.80, WIDEST), "within"),
+        Figure(COVERAGE, _mean(comparison.is_covered[several]), "", (0.80, WIDEST), "within"),
         Figure("demo.map.rmse", float(np.sqrt(_mean(error[value] ** 2))), "", 0.12),
         Figure(DELAY, delay_passes(visits, patch, alerts, changed_ns), "passes", 4),
         Figure("demo.alerts.on_dry_roads", false, "alerts", 0),
@@ -239,11 +239,11 @@ def per_stretch(alerts: list[tuple[int, Alert]], visits: pa.Table) -> float:
         ids |= {one.id for one in road.changes()}
     icy = visits.filter(pc.less(visits["mu"], pa.scalar(SLIPPERY_MU)))
     cell, sector = icy["cell"].to_numpy(), icy["sector"].to_numpy()
-    stretches = sum(int(linked(np.unique(cell[sector == k])).max(initial=-1)) + 1 for k in np.unique(sector))
+    stretches = sum(int(link_cells(np.unique(cell[sector == k])).max(initial=-1)) + 1 for k in np.unique(sector))
     return len(ids) / stretches if stretches else float("nan")
 
 
-def archived(archive: Path) -> tuple[int, int, int]:
+def archive_counts(archive: Path) -> tuple[int, int, int]:
     """Return rows, distinct rows and distinct vehicles of the archived observations."""
     identity = ["vehicle", "boot", "region", "seq", "row"]
     tables = list(reading.read(archive, Kind.OBSERVATION, identity))
@@ -253,7 +253,7 @@ def archived(archive: Path) -> tuple[int, int, int]:
     return whole.num_rows, whole.group_by(identity).aggregate([]).num_rows, len(pc.unique(whole["vehicle"]))
 
 
-def started(visits: pa.Table) -> int:
+def start_time(visits: pa.Table) -> int:
     """Return when the first vehicle moved [ns]."""
     return int(visits["enter_time"].cast(pa.int64()).to_numpy().min())
 

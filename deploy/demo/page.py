@@ -37,7 +37,7 @@ def write(comparison: MapComparison, figures: list[Figure], path: Path) -> None:
     panels = {"truth": truth, "map": [mu if np.isfinite(mu) else None for mu in found]}
     lines = [_words(one, true) for one, true in zip(cells.to_pylist(), truth, strict=True)]
     drawn = DrawnCells(boxes.round(7).tolist(), sector, panels, NAMES, lines)
-    several = int(comparison.several.sum())
+    several = int(comparison.has_several_vehicles.sum())
     about = (
         f"{cells.num_rows} cells and directions that have a truth; {several} of them seen by two or more vehicles, "
         "and the figures below judge these."

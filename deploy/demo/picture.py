@@ -36,8 +36,8 @@ def draw(comparison: MapComparison, path: Path, grip: LostGrip | None = None) ->
     bar.set_ticks(list(SURFACES.values()), labels=[f"{mu:g} {name}" for name, mu in SURFACES.items()])
     figure.colorbar(wide, ax=width, label="width [1]", shrink=0.8)
     figure.suptitle(
-        f"{cells.num_rows} cells and directions; truth inside the interval in {comparison.covered.mean():.0%}, "
-        f"{comparison.several.sum()} of them seen by two or more vehicles"
+        f"{cells.num_rows} cells and directions; truth inside the interval in {comparison.is_covered.mean():.0%}, "
+        f"{comparison.has_several_vehicles.sum()} of them seen by two or more vehicles"
     )
     figure.savefig(path, dpi=130)
 

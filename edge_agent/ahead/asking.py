@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from edge_agent.ahead.path import Path, Pose, degrees
+from edge_agent.ahead.path import Path, Pose, to_degrees
 from schemas import grid
 from schemas.numeric import BoolArray, IntArray
 from schemas.thresholds import NS
@@ -37,7 +37,7 @@ class Box(NamedTuple):
     north: float
 
 
-class Asked:
+class RequestLog:
     """The last MOST_BOXES requested boxes, with the time of the request."""
 
     def __init__(self) -> None:
@@ -52,7 +52,7 @@ class Asked:
 
         Nothing is requested until something nearer than `within` [m] is missing; then all of the path is.
         """
-        latitude, longitude = degrees(path.x[::STEP], path.y[::STEP], pose)
+        latitude, longitude = to_degrees(path.x[::STEP], path.y[::STEP], pose)
         open_ = np.ones(len(latitude), np.bool_)
         for box, at in self._boxes:
             if pose.time - at < REFRESH_S * NS:
@@ -81,7 +81,7 @@ class Tiles:
         here = int(grid.tile_of(grid.cell_of(pose.latitude, pose.longitude)))
         ahead: list[int] = [here]
         for path in paths:
-            ahead += _in_order(grid.tile_of(grid.cell_of(*degrees(path.x[::STEP], path.y[::STEP], pose))))
+            ahead += _in_order(grid.tile_of(grid.cell_of(*to_degrees(path.x[::STEP], path.y[::STEP], pose))))
         wanted = list(dict.fromkeys(ahead))[:MOST_TILES]
         fresh = [tile for tile in wanted if tile not in self._wanted]
         self._wanted |= dict.fromkeys(wanted, pose.time)
@@ -129,5 +129,5 @@ def _around(path: Path, first: int, last: int, pose: Pose) -> Box:
     x, y = path.x[first : last + 1], path.y[first : last + 1]
     east = np.array([x.min() - BESIDE_M, x.max() + BESIDE_M])
     north = np.array([y.min() - BESIDE_M, y.max() + BESIDE_M])
-    latitude, longitude = degrees(east, north, pose)
+    latitude, longitude = to_degrees(east, north, pose)
     return Box(float(longitude[0]), float(latitude[0]), float(longitude[1]), float(latitude[1]))

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 import pyarrow as pa
 
-from edge_agent.ahead.known import BASES, BOUND, HeardCells, belief_of
+from edge_agent.ahead.known import BASES, BOUND, ReceivedCells, belief_of
 from schemas import grid, keys, mugrid, wire
 from schemas.errors import InputError, WireError
 from schemas.numeric import BoolArray, FloatArray, IntArray
@@ -22,7 +22,7 @@ SLACK: Final = 1e-3  # single precision, and quantiles to the ends of their bins
 _BASIS: Final = {name: number for number, name in enumerate(BASES)}
 
 
-def heard_cells(key: str, payload: bytes, now: int) -> tuple[int, HeardCells]:
+def decode_cells(key: str, payload: bytes, now: int) -> tuple[int, ReceivedCells]:
     """Return tile and cells of a message about the map.
 
     Raises:
@@ -57,10 +57,10 @@ def heard_cells(key: str, payload: bytes, now: int) -> tuple[int, HeardCells]:
     if len(np.unique(place)) < len(place):
         raise WireError("cell", "is there twice", "send each place once")
     heard = np.minimum(last + (age * NS).astype(np.int64), now)  # when the tile was made: somebody may have kept it
-    return tile, HeardCells(place, belief_of(lower, mu, upper, p), basis, vehicles, np.minimum(last, now), heard)
+    return tile, ReceivedCells(place, belief_of(lower, mu, upper, p), basis, vehicles, np.minimum(last, now), heard)
 
 
-def heard_alert(key: str, payload: bytes, now: int) -> Alert:
+def decode_alert_message(key: str, payload: bytes, now: int) -> Alert:
     """Return a published alert.
 
     Raises:
@@ -71,7 +71,7 @@ def heard_alert(key: str, payload: bytes, now: int) -> Alert:
     return _checked(wire.decode_alert(payload), _tile(key, "alert"), now)
 
 
-def heard_standing(key: str, payload: bytes, now: int) -> tuple[int, list[Alert]]:
+def decode_standing_alerts(key: str, payload: bytes, now: int) -> tuple[int, list[Alert]]:
     """Return a tile and its standing alerts.
 
     Raises:

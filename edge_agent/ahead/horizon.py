@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from edge_agent.ahead.known import MEASURED, UNKNOWN, HeardMap, PlaceBelief
+from edge_agent.ahead.known import MEASURED, UNKNOWN, LocalMap, PlaceBelief
 from edge_agent.ahead.path import NONE, Path
 from schemas import mugrid
 from schemas.numeric import BoolArray, FloatArray, IntArray
@@ -63,7 +63,7 @@ def horizon_length(speed: float) -> float:
     return float(min(max(stop, SHORTEST_M), LONGEST_M))
 
 
-def look_ahead(path: Path, known: HeardMap, now: int) -> Horizon:
+def look_ahead(path: Path, known: LocalMap, now: int) -> Horizon:
     """Return the horizon along a path, now [ns]."""
     places, inverse = np.unique(path.places, return_inverse=True)
     found = known.look_up(places, now)
@@ -74,7 +74,7 @@ def look_ahead(path: Path, known: HeardMap, now: int) -> Horizon:
     column = rank.argmin(axis=1)
     row = inverse[np.arange(len(column)), column]
     nothing = rank.min(axis=1) == 3
-    slippery = worth_a_warning(found)
+    slippery = justifies_warning(found)
     values = (
         np.where(nothing, np.nan, column[row])
         for column in (found.mu, found.mu_lower, found.mu_upper, found.p_slippery, found.age_s)
@@ -88,7 +88,7 @@ def look_ahead(path: Path, known: HeardMap, now: int) -> Horizon:
     )  # fmt: skip
 
 
-def worth_a_warning(found: PlaceBelief) -> BoolArray:
+def justifies_warning(found: PlaceBelief) -> BoolArray:
     """Return which places (n,) are slippery and certain enough for a warning."""
     firm = (found.basis == MEASURED) & (found.p_slippery >= WARN_ABOVE) & (found.vehicles >= LEAST_VEHICLES)
     return np.asarray(found.alerted | firm)

@@ -29,7 +29,7 @@ SLIPPERY_BINS: Final[FloatArray] = np.clip(
 )  # share of each bin that is slippery
 
 
-class HeardCells(NamedTuple):
+class ReceivedCells(NamedTuple):
     """Received cells, (n,); belief (n, 32) on the friction grid."""
 
     key: IntArray
@@ -78,19 +78,19 @@ def belief_of(lower: FloatArray, mu: FloatArray, upper: FloatArray, slippery: Fl
     return out
 
 
-NOTHING: Final = HeardCells(
+NOTHING: Final = ReceivedCells(
     np.zeros(0, np.int64), np.zeros((0, mugrid.BINS)), *(np.zeros(0, np.int64) for _ in range(4))
 )
 
 
-class HeardMap:
+class LocalMap:
     """Cache of one car: received tiles, the latest with up to MOST_CELLS cells, and standing alerts."""
 
     def __init__(self, most_cells: int = MOST_CELLS) -> None:
         self._most = most_cells
-        self._tiles: OrderedDict[int, HeardCells] = OrderedDict()
+        self._tiles: OrderedDict[int, ReceivedCells] = OrderedDict()
         self._alerts: dict[int, tuple[Alert, int]] = {}
-        self._all: HeardCells | None = NOTHING  # of all tiles, by key; None when it has to be made anew
+        self._all: ReceivedCells | None = NOTHING  # of all tiles, by key; None when it has to be made anew
 
     @property
     def cells(self) -> int:
@@ -102,7 +102,7 @@ class HeardMap:
         """Return the standing alerts known to the car."""
         return [alert for alert, _ in self._alerts.values()]
 
-    def take(self, tile: int, cells: HeardCells, now: int) -> None:
+    def take(self, tile: int, cells: ReceivedCells, now: int) -> None:
         """Store received cells of a tile; they replace older knowledge only."""
         before = self._tiles.pop(tile, NOTHING)
         both = _joined([_some(before, now - before.heard < HELD_S * NS), cells])
@@ -186,7 +186,7 @@ class HeardMap:
         """Return the known places, sorted."""
         return self._whole().key
 
-    def _whole(self) -> HeardCells:
+    def _whole(self) -> ReceivedCells:
         if self._all is None:
             found = _joined(list(self._tiles.values()))
             order = np.argsort(found.key)
@@ -208,9 +208,9 @@ class HeardMap:
         return belief, basis, last, heard, vehicles
 
 
-def _some(cells: HeardCells, rows: IntArray | BoolArray) -> HeardCells:
-    return HeardCells._make(column[rows] for column in cells)
+def _some(cells: ReceivedCells, rows: IntArray | BoolArray) -> ReceivedCells:
+    return ReceivedCells._make(column[rows] for column in cells)
 
 
-def _joined(parts: list[HeardCells]) -> HeardCells:
-    return HeardCells._make(np.concatenate(columns) for columns in zip(NOTHING, *parts, strict=True))
+def _joined(parts: list[ReceivedCells]) -> ReceivedCells:
+    return ReceivedCells._make(np.concatenate(columns) for columns in zip(NOTHING, *parts, strict=True))

@@ -18,10 +18,10 @@ import zenoh
 from edge_agent.ahead.asking import FURTHER_M
 from edge_agent.ahead.horizon import Horizon, horizon_length, look_ahead
 from edge_agent.ahead.map_subscriber import MapSubscriber
-from edge_agent.ahead.path import GivenRoute, Path, Pose, corridor
+from edge_agent.ahead.path import GivenRoute, Path, Pose, straight_path
 from edge_agent.ahead.prior import MapPrior
 from edge_agent.ahead.roads import ways_on
-from edge_agent.ahead.warnings import Active, warn
+from edge_agent.ahead.warnings import Active, update_warnings
 from schemas import grid, mugrid
 from schemas.numeric import FloatArray, IntArray
 from schemas.thresholds import NS
@@ -58,7 +58,7 @@ class LookoutCounts:
     busy_s: float = 0.0  # of the processor, by the thread that looks
     subscribers: dict[str, MapSubscriber] = field(default_factory=dict)
 
-    def heard(self, what: str) -> int:
+    def total_of(self, what: str) -> int:
         """Return the sum of a counter over all subscribers."""
         return sum(one.counts[what] for one in self.subscribers.values())
 
@@ -69,7 +69,7 @@ class LookoutCounts:
         )
         return {
             "warnings": self.warnings, "looks": self.looks, "look_s": round(self.busy_s, 3),
-            "heard_bytes": self.heard("bytes"), "heard_alerts": self.heard("alerts"), "heard_refused": refused,
+            "heard_bytes": self.total_of("bytes"), "heard_alerts": self.total_of("alerts"), "heard_refused": refused,
         }  # fmt: skip
 
 
@@ -195,7 +195,7 @@ class Lookout:
         with subscriber.looking():
             paths = paths_ahead(pose, self._route_of(k), subscriber, length + FURTHER_M)
             horizons = [look_ahead(path.near(length), subscriber.known, pose.time) for path in paths]
-            watcher.active, issued = warn(watcher.active, horizons, pose, subscriber.known)
+            watcher.active, issued = update_warnings(watcher.active, horizons, pose, subscriber.known)
         watcher.places = frozenset(np.concatenate([path.places.ravel() for path in paths]).tolist())
         self.counts.looks += 1
         for warning in issued:
@@ -218,7 +218,7 @@ def paths_ahead(pose: Pose, route: GivenRoute | None, subscriber: MapSubscriber,
     given = route.ahead(pose, length) if route is not None else None
     if given is not None:
         return [given]
-    return ways_on(pose, subscriber.known.keys(), length) or [corridor(pose, length)]
+    return ways_on(pose, subscriber.known.keys(), length) or [straight_path(pose, length)]
 
 
 def runs(horizon: Horizon) -> Runs:

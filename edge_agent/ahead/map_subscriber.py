@@ -14,9 +14,9 @@ from typing import Any, Final
 
 import zenoh
 
-from edge_agent.ahead.asking import Asked, Box, Tiles, keys_of
-from edge_agent.ahead.hearing import heard_alert, heard_cells, heard_standing
-from edge_agent.ahead.known import HeardMap
+from edge_agent.ahead.asking import Box, RequestLog, Tiles, keys_of
+from edge_agent.ahead.hearing import decode_alert_message, decode_cells, decode_standing_alerts
+from edge_agent.ahead.known import LocalMap
 from edge_agent.ahead.path import Path, Pose
 from schemas import grid, keys
 from schemas.errors import WireError
@@ -47,7 +47,7 @@ class MapSubscriber:
     ) -> None:  # fmt: skip
         self._session, self._urgent, self._clock = session, urgent, clock
         self._lock = threading.Lock()
-        self._map, self._asked, self._tiles = HeardMap(), Asked(), Tiles()
+        self._map, self._asked, self._tiles = LocalMap(), RequestLog(), Tiles()
         self._subscribers: dict[int, Any] = {}
         self._routers: frozenset[str] = frozenset()
         self._again, self._answered = list[int](), False  # [ns] when to ask once more; since the router is there
@@ -62,7 +62,7 @@ class MapSubscriber:
         return self._lock
 
     @property
-    def known(self) -> HeardMap:
+    def known(self) -> LocalMap:
         """Return the local copy of the map; hold the lock."""
         return self._map
 
@@ -79,7 +79,7 @@ class MapSubscriber:
     def follow(self, paths: list[Path], pose: Pose, within: float) -> None:
         """Subscribe and query along the ways on, the likeliest first; never waits for an answer.
 
-        Alerts are subscribed to for the metres `within`; the map is requested farther ahead, see `Asked.wanting`.
+        Alerts are subscribed to for the metres `within`; the map is requested farther ahead, see `RequestLog.wanting`.
         """
         routers = frozenset(str(zid) for zid in self._session.info.routers_zid())
         back, self._routers = bool(routers - self._routers), routers
@@ -153,7 +153,7 @@ class MapSubscriber:
 
     def _hear_alert(self, key: str, payload: bytes) -> None:
         now = self._clock()
-        alert = heard_alert(key, payload, now)
+        alert = decode_alert_message(key, payload, now)
         self.counts["alerts"] += 1
         with self._lock:
             news = self._map.alert(alert, now)
@@ -162,7 +162,7 @@ class MapSubscriber:
 
     def _on_standing(self, key: str, payload: bytes) -> None:
         now = self._clock()
-        tile, alerts = heard_standing(key, payload, now)
+        tile, alerts = decode_standing_alerts(key, payload, now)
         with self._lock:
             news = self._map.standing(tile, alerts, now)
         if news:
@@ -170,7 +170,7 @@ class MapSubscriber:
 
     def _on_cells(self, key: str, payload: bytes) -> None:
         now = self._clock()
-        tile, cells = heard_cells(key, payload, now)
+        tile, cells = decode_cells(key, payload, now)
         self.counts["cells"] += len(cells.key)
         with self._lock:
             self._map.take(tile, cells, now)

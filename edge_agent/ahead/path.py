@@ -67,19 +67,19 @@ class Path(NamedTuple):
         return Path(self.kind, self.distance[:n], self.places[:n], self.curvature[:n], self.x[:n], self.y[:n])
 
 
-def plane(latitude: FloatArray, longitude: FloatArray, pose: Pose) -> tuple[FloatArray, FloatArray]:
+def to_plane(latitude: FloatArray, longitude: FloatArray, pose: Pose) -> tuple[FloatArray, FloatArray]:
     """Return east and north [m] of the car; exact to a centimetre within a kilometre."""
     east = METRES_PER_DEGREE * np.cos(np.radians(pose.latitude))
     return (np.asarray(longitude) - pose.longitude) * east, (np.asarray(latitude) - pose.latitude) * METRES_PER_DEGREE
 
 
-def degrees(x: FloatArray, y: FloatArray, pose: Pose) -> tuple[FloatArray, FloatArray]:
+def to_degrees(x: FloatArray, y: FloatArray, pose: Pose) -> tuple[FloatArray, FloatArray]:
     """Return latitude and longitude [deg] of points [m] relative to the car."""
     east = METRES_PER_DEGREE * np.cos(np.radians(pose.latitude))
     return pose.latitude + y / METRES_PER_DEGREE, pose.longitude + x / east
 
 
-def along(kind: Way, line: FloatArray, pose: Pose, length: float, first: IntArray | None = None) -> Path:
+def path_along(kind: Way, line: FloatArray, pose: Pose, length: float, first: IntArray | None = None) -> Path:
     """Return the way along a line (n, 2) [m] that begins at the car, at most `length` [m] long.
 
     `first` (n,) are known keys at the line's points; they precede those that follow from the position.
@@ -99,11 +99,11 @@ def along(kind: Way, line: FloatArray, pose: Pose, length: float, first: IntArra
     return Path(kind, s, places, curvature, x, y)
 
 
-def corridor(pose: Pose, length: float) -> Path:
+def straight_path(pose: Pose, length: float) -> Path:
     """Return the way straight on along the heading."""
     reach = min(length, CORRIDOR_M)
     end = [reach * np.cos(pose.yaw), reach * np.sin(pose.yaw)]
-    return along("corridor", np.array([[0.0, 0.0], end]), pose, length)
+    return path_along("corridor", np.array([[0.0, 0.0], end]), pose, length)
 
 
 class GivenRoute:
@@ -120,7 +120,7 @@ class GivenRoute:
 
     def ahead(self, pose: Pose, length: float) -> Path | None:
         """Return the way on along the route; None if the car has left it."""
-        x, y = plane(self._latitude, self._longitude, pose)
+        x, y = to_plane(self._latitude, self._longitude, pose)
         line = np.column_stack([x, y])
         run = _run(line)
         place = self._match(line, run, pose)
@@ -130,7 +130,7 @@ class GivenRoute:
         rest = run > place
         here = [np.interp(place, run, x), np.interp(place, run, y)]
         ahead = np.concatenate([[here], line[rest]])
-        return along("route", ahead, pose, length) if len(ahead) > 1 else None
+        return path_along("route", ahead, pose, length) if len(ahead) > 1 else None
 
     def _match(self, line: FloatArray, run: FloatArray, pose: Pose) -> float | None:
         """Return the metre of the route at which the car is: the next one after the last, with the same heading."""
@@ -156,7 +156,7 @@ def _places(x: FloatArray, y: FloatArray, yaw: FloatArray, widen: FloatArray | f
     sectors = [np.asarray(sector, np.int64) for sector in grid.sectors_touched(yaw)]
     columns = []
     for side in (0.0, 1.0, -1.0):
-        cell = grid.cell_of(*degrees(x - side * widen * np.sin(yaw), y + side * widen * np.cos(yaw), pose))
+        cell = grid.cell_of(*to_degrees(x - side * widen * np.sin(yaw), y + side * widen * np.cos(yaw), pose))
         columns += [np.where(sector >= 0, cell * grid.SECTORS + sector, NONE) for sector in sectors]
     return np.column_stack(columns)
 

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.ahead.path import CORRIDOR_M, NONE, Path, Pose, along, plane
+from edge_agent.ahead.path import CORRIDOR_M, NONE, Path, Pose, path_along, to_plane
 from schemas import grid
 from schemas.numeric import IntArray
 
@@ -34,7 +34,7 @@ def ways_on(pose: Pose, keys: IntArray, length: float) -> list[Path]:
     """Return the ways on among known places `keys` (n,), at most `length` [m] long; none if the map shows no road
     here."""
     latitude, longitude = grid.centre(keys // grid.SECTORS)
-    x, y = plane(latitude, longitude, pose)
+    x, y = to_plane(latitude, longitude, pose)
     near = np.hypot(x, y) <= length
     places = dict(zip(keys[near].tolist(), zip(x[near].tolist(), y[near].tolist(), strict=True), strict=True))
     west, _, east, _ = (float(side) for side in grid.bounds(grid.cell_of(pose.latitude, pose.longitude)))
@@ -49,7 +49,7 @@ def ways_on(pose: Pose, keys: IntArray, length: float) -> list[Path]:
     ways = [[begin[0]]]
     done: list[list[int]] = []
     while ways and len(done) < MOST_WAYS:
-        done.append(_followed(graph, ways.pop(0), pose, length, ways))
+        done.append(_follow_way(graph, ways.pop(0), pose, length, ways))
     for way in (
         done[::-1] if len(done) > 1 else []
     ):  # one that joins another, or ends where another bends, is no way of its own
@@ -87,7 +87,7 @@ class _Neighbours:
         return [key for key, _ in chosen]
 
 
-def _followed(graph: _Neighbours, way: list[int], pose: Pose, length: float, forks: list[list[int]]) -> list[int]:
+def _follow_way(graph: _Neighbours, way: list[int], pose: Pose, length: float, forks: list[list[int]]) -> list[int]:
     """Follow a way to its end; put branches on `forks`."""
     run, passed = 0.0, set(way)
     for _ in range(MOST_STEPS):
@@ -123,7 +123,7 @@ def _as_path(
         straight = smooth[-1] + metres[:, None] * [math.cos(heading), math.sin(heading)]
         smooth = np.concatenate([smooth, straight])
         known = np.concatenate([known, np.full(len(straight), NONE)])
-    return along("road", smooth, pose, length, known)
+    return path_along("road", smooth, pose, length, known)
 
 
 def _apart(a: float, b: float) -> float:

@@ -12,8 +12,8 @@ from typing import Final
 
 import numpy as np
 
-from edge_agent.ahead.horizon import MARGIN_M, Horizon, braking_from, worth_a_warning
-from edge_agent.ahead.known import MEASURED, HeardMap
+from edge_agent.ahead.horizon import MARGIN_M, Horizon, braking_from, justifies_warning
+from edge_agent.ahead.known import MEASURED, LocalMap
 from edge_agent.ahead.path import Pose
 from schemas import grid
 from schemas.numeric import BoolArray
@@ -50,8 +50,8 @@ class _Stretch:
     horizon: Horizon
 
 
-def warn(
-    active: tuple[Active, ...], horizons: list[Horizon], pose: Pose, known: HeardMap
+def update_warnings(
+    active: tuple[Active, ...], horizons: list[Horizon], pose: Pose, known: LocalMap
 ) -> tuple[tuple[Active, ...], list[GripWarning]]:
     """Return the standing warnings after an update, and the ones to report.
 
@@ -91,7 +91,7 @@ def warn(
     for name, last in list(kept.items()):
         if name in here:
             continue
-        stands = worth_a_warning(known.look_up(np.array(sorted(last.places)), pose.time)).any()
+        stands = justifies_warning(known.look_up(np.array(sorted(last.places)), pose.time)).any()
         if not stands or pose.time - last.seen > ABSENT_S * NS:
             issued.append(_ended(last, pose, stands=bool(stands)))
             del kept[name]

@@ -47,7 +47,7 @@ def tasks_of(logs: Sequence[Path], vehicle: Path | None, folder: Path) -> list[T
     Raises:
         InputError: two logs have one name, or estimates would replace a log.
     """
-    tasks = [Task(log, vehicle or beside(log), folder / f"{log.stem}.parquet") for log in logs]
+    tasks = [Task(log, vehicle or vehicle_file_of(log), folder / f"{log.stem}.parquet") for log in logs]
     seen: dict[Path, Path] = {}
     for task in tasks:
         if (other := seen.setdefault(task.out, task.log)) is not task.log:
@@ -57,7 +57,7 @@ def tasks_of(logs: Sequence[Path], vehicle: Path | None, folder: Path) -> list[T
     return tasks
 
 
-def beside(log: Path) -> Path:
+def vehicle_file_of(log: Path) -> Path:
     """Return the vehicle file of a log: the same name, ending in .json."""
     return log.with_suffix(".json")
 
@@ -87,12 +87,14 @@ def backfill_on_spark(
         InputError: Spark is not available or gave up, or the folder of the estimates cannot be created.
     """
     folders = {writable("out", task.out).parent for task in tasks}
-    yield from spark.spread(spark.session(), tasks, partial(tried, estimator=estimator, memberships=memberships))
+    yield from spark.spread(
+        spark.session(), tasks, partial(estimate_atomically, estimator=estimator, memberships=memberships)
+    )
     for folder in folders:
         sweep_drafts(folder)
 
 
-def tried(task: Task, estimator: str, memberships: Memberships | None) -> Outcome:
+def estimate_atomically(task: Task, estimator: str, memberships: Memberships | None) -> Outcome:
     """Estimate one drive and write its file atomically, also if another process estimates the same drive."""
     folder = task.out.parent
     with own_drafts(folder) as drafts:

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from schemas.errors import InputError
 from schemas.numeric import FloatArray
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 from schemas.signals import per_wheel
 from schemas.tables import ESTIMATES_SCHEMA
 
@@ -48,7 +48,7 @@ def write_table(field: str, path: Path, table: pa.Table) -> None:
     Raises:
         InputError: the path cannot be written, or its ending is not one of ENDINGS.
     """
-    with written(writable(field, path)) as file, _table_writer(path, field)(file, table.schema) as writer:
+    with open_durably(writable(field, path)) as file, _table_writer(path, field)(file, table.schema) as writer:
         writer.write_table(table)
 
 
@@ -69,7 +69,7 @@ class EstimatesFile:
     def __init__(self, path: Path) -> None:
         with ExitStack() as opened:
             writer = _table_writer(path)
-            file = opened.enter_context(written(writable("out", path)))
+            file = opened.enter_context(open_durably(writable("out", path)))
             self._writer = opened.enter_context(writer(file, ESTIMATES_SCHEMA))
             self._opened = opened.pop_all()
 

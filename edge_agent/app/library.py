@@ -116,6 +116,6 @@ def plot(estimates: dict[str, pa.Table], *, truth: pa.Table | None = None, title
 
 def known_estimators() -> Iterator[tuple[str, str]]:
     """Return names of all estimators, those of other packages too, with one line about each."""
-    from edge_agent.app.estimator_factory import known
+    from edge_agent.app.estimator_factory import known_estimators
 
-    yield from known().items()
+    yield from known_estimators().items()

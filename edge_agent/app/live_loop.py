@@ -75,7 +75,7 @@ def drive(
         if clock() - started >= status_at:
             status_at += STATUS_EVERY_S
             if not publisher.broken:
-                watchdog.alive()
+                watchdog.notify_alive()
             on_status(progress)
     if (last := pipeline.finish()) is not None:
         _offer(publisher, progress, admitted(), last)

@@ -47,7 +47,7 @@ def metrics(publisher: Publisher, progress: Progress) -> list[Metric]:
     ]  # fmt: skip
 
 
-def troubles(publisher: Publisher, progress: Progress) -> list[str]:
+def health_problems(publisher: Publisher, progress: Progress) -> list[str]:
     """Return one message per problem."""
     found = [] if publisher.links else ["no session is open"]
     if publisher.cut_off:

@@ -73,16 +73,16 @@ class Plausibility:
         return max(self.last - self.first, 0.0)
 
     @property
-    def off(self) -> float:
+    def median_speed_error(self) -> float:
         """Median of |v_x − wheels| over the wheels' speed; 0 for a car that stood."""
         away = np.concatenate(self.away) if self.away else np.zeros(0)
         return float(np.median(away)) if len(away) else 0.0
 
-    def troubles(self) -> list[str]:
+    def problems(self) -> list[str]:
         """Return one message per implausible finding."""
         n = max(self.samples, 1)
         found = {
-            "speed far off the wheels": self.off > FURTHEST_SPEED,
+            "speed far off the wheels": self.median_speed_error > FURTHEST_SPEED,
             "an upper bound below the grip in use": self.violations / n > MOST_VIOLATION,
             "started anew again and again": self.resets > 1 + MOST_RESETS_PER_S * self.seconds,
         }
@@ -92,9 +92,9 @@ class Plausibility:
         """Return the summary line."""
         n = max(self.samples, 1)
         summary = (
-            f"{self.samples} samples, {self.seconds:.1f} s; speed {self.off:.1%} off the wheels, "
+            f"{self.samples} samples, {self.seconds:.1f} s; speed {self.median_speed_error:.1%} off the wheels, "
             f"excited {self.excited / n:.0%}, sliding {self.sliding / n:.0%}, "
             f"violations {self.violations / n:.1%}, resets {self.resets}"
         )
-        bad = self.troubles()
+        bad = self.problems()
         return f"{summary}; NOT PLAUSIBLE: {', '.join(bad)}; run edge-agent check" if bad else summary

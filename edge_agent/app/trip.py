@@ -152,7 +152,7 @@ class Trip:
             _write(self._path, self._known)
 
 
-def beside(spool: Path, name: str) -> Path:
+def state_path_for(spool: Path, name: str) -> Path:
     """Return the path of a car's stored knowledge, next to its outbox."""
     return spool.with_name(f"{spool.stem}.{name}.json")
 

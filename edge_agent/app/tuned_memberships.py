@@ -121,7 +121,7 @@ def shipped(estimator: str) -> Memberships:
     return load(FOLDER / f"{estimator}.json").memberships
 
 
-def candidates(estimator: str) -> dict[str, list[Memberships]]:
+def search_results(estimator: str) -> dict[str, list[Memberships]]:
     """Return the results of every search behind the shipped file, by search; empty if the file does not have them."""
     document = load(FOLDER / f"{estimator}.json").document
     return {way: [Memberships.from_json(one) for one in found] for way, found in document.candidates.items()}

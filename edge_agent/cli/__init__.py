@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from typing import Final
 
-from schemas.runtime import commandline, talk
+from schemas.runtime import commandline, progress_messages
 from schemas.runtime.commandline import Command
 
 FAILED: Final = commandline.FAILED
@@ -47,15 +47,17 @@ LINE: Final = ("edge-agent", "Friction and motion of a vehicle from its sensors.
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command line; return the exit code."""
-    arguments = commandline.joined(sys.argv[1:] if argv is None else argv)
+    arguments = commandline.join_negative_numbers(sys.argv[1:] if argv is None else argv)
     chosen = next((argument for argument in arguments if not argument.startswith("-")), None)
-    talk.speak(quiet=commandline.wants_quiet(arguments))
-    with nullcontext() if chosen is None or chosen in LIVE else talk.busy(chosen):  # what it loads takes a second
+    progress_messages.enable_messages(quiet=commandline.wants_quiet(arguments))
+    with (
+        nullcontext() if chosen is None or chosen in LIVE else progress_messages.show_status(chosen)
+    ):  # what it loads takes a second
         code, left = _run(arguments, limited=argv is None and chosen in LIVE, chosen=chosen)
     if left:
-        from schemas.runtime.process import end_now
+        from schemas.runtime.process import force_exit
 
-        end_now(code)
+        force_exit(code)
     return code
 
 
@@ -71,7 +73,7 @@ def _run(arguments: Sequence[str], *, limited: bool, chosen: str | None) -> tupl
         limit_memory()
     code = FAILED
     try:
-        code = commandline.guarded(lambda: int(args.run(args)))
+        code = commandline.run_guarded(lambda: int(args.run(args)))
     except Exception:
         if not left_behind.is_set():
             raise

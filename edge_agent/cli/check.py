@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check; return 0 if the log has passed, 1 if something is wrong or unknown."""
-    from edge_agent.app.backfill import beside
+    from edge_agent.app.backfill import vehicle_file_of
     from edge_agent.app.estimates_file import writable
     from edge_agent.inputs.bring_in import profile_of
     from edge_agent.inputs.doctor.findings import diagnose
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     from edge_agent.inputs.signal_log import read_log
     from schemas.vehicle import load_vehicle
 
-    file = args.vehicle or beside(args.log)
+    file = args.vehicle or vehicle_file_of(args.log)
     vehicle, log = load_vehicle(file), read_log(args.log)
     diagnosis = diagnose(log.t, log.signals, vehicle, log.ground)
     if args.json:

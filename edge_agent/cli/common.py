@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from schemas.config import NAME_PATTERN, AgentConfig
 from schemas.errors import InputError
-from schemas.runtime.process import Line, print_line
+from schemas.runtime.process import LogLine, print_line
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -67,7 +67,7 @@ def publisher_of(
     return publisher
 
 
-def insist_on_sound(log: SignalLog, vehicle: Vehicle) -> None:
+def require_valid_signals(log: SignalLog, vehicle: Vehicle) -> None:
     """Raise unless the signals of a log agree with each other.
 
     Raises:
@@ -82,7 +82,7 @@ def insist_on_sound(log: SignalLog, vehicle: Vehicle) -> None:
         raise InputError("log", "is not fit to be published", f"{advice(diagnosis)}; --trust publishes it as it is")
 
 
-def warn_of_faults(log: SignalLog, vehicle: Vehicle) -> None:
+def warn_about_faults(log: SignalLog, vehicle: Vehicle) -> None:
     """Print on stderr the faults that the signal doctor finds in a log that is only estimated."""
     from edge_agent.inputs.doctor.findings import diagnose
 
@@ -117,7 +117,7 @@ def stop_on_signal() -> Iterator[threading.Event]:
 left_behind = threading.Event()
 
 
-def leave(publisher: Publisher, progress: Progress, drain_s: float, **more: float) -> None:
+def close_publisher(publisher: Publisher, progress: Progress, drain_s: float, **more: float) -> None:
     """Wait for acknowledgements, close, and print counts and extra values as one line of JSON on stdout.
 
     Unsettled records stay in the outbox for the next start.
@@ -131,7 +131,7 @@ def leave(publisher: Publisher, progress: Progress, drain_s: float, **more: floa
     print(json.dumps(summary(progress, publisher) | more), flush=True)
 
 
-def status(progress: Progress, publisher: Publisher, log_line: Callable[[str], None]) -> None:
+def print_status(progress: Progress, publisher: Publisher, log_line: Callable[[str], None]) -> None:
     """Print one line of progress."""
     from edge_agent.app.live_loop import summary
 
@@ -141,4 +141,4 @@ def status(progress: Progress, publisher: Publisher, log_line: Callable[[str], N
         f"{progress.signals_s:7.1f} s  {publisher.links} sessions, {sum(counts.published.values())} records published, "
         f"{sum(counts.acknowledged.values())} acknowledged, {publisher.unsettled()} unsettled{late}"
     )
-    log_line(Line(text, event="status", **summary(progress, publisher)))
+    log_line(LogLine(text, event="status", **summary(progress, publisher)))

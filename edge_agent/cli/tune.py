@@ -18,9 +18,9 @@ from typing import Final
 import numpy as np
 
 from edge_agent.adaptation.memberships import Memberships
-from edge_agent.app.backfill import beside
+from edge_agent.app.backfill import vehicle_file_of
 from edge_agent.app.tuned_memberships import WAYS, Budget, Document, Provenance, Score, SplitScores, save
-from edge_agent.cli.common import warn_of_faults
+from edge_agent.cli.common import warn_about_faults
 from edge_agent.inputs.signal_log import read_log
 from edge_agent.lab.tuning import colony, random_search
 from edge_agent.lab.tuning.objectives import (
@@ -119,9 +119,9 @@ def _drives(args: argparse.Namespace, objective: str, duration_s: float) -> tupl
         raise InputError("objective", "interval wants the true friction, which no log tells", "use predictive")
     logs = []
     for path in args.log:
-        vehicle = load_vehicle(args.vehicle or beside(path))
+        vehicle = load_vehicle(args.vehicle or vehicle_file_of(path))
         logs.append((read_log(path), vehicle))
-        warn_of_faults(*logs[-1])
+        warn_about_faults(*logs[-1])
     return own_drives(logs, duration_s)
 
 

@@ -101,7 +101,7 @@ class Batcher:
     def _draft(self, place: _Place, columns: Columns) -> Draft:
         name = self._names[place.vehicle]
         batch = Batch(place.kind, name, self._boot, place.region, UNNUMBERED, UNNUMBERED, columns, self._estimator)
-        return Draft(name, place.kind, place.region, batch.rows, partial(_encoded, batch))
+        return Draft(name, place.kind, place.region, batch.rows, partial(_encode_batch, batch))
 
 
 def _runs(time: IntArray, ready: int, rows: int) -> Iterator[tuple[int, int]]:
@@ -118,6 +118,6 @@ def _slice(columns: Columns, first: int, last: int) -> Columns:
     return {name: column[first:last] for name, column in columns.items()}
 
 
-def _encoded(batch: Batch, seq: int, first_held: int) -> bytes:
+def _encode_batch(batch: Batch, seq: int, first_held: int) -> bytes:
     """Return the payload of a batch with the number from the outbox."""
     return encode(replace(batch, seq=seq, first_held=first_held))

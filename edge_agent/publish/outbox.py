@@ -140,14 +140,14 @@ class Outbox:
             self._pacer(self._entries[key]).wait(key)
         self._evict()
 
-    def mend(self) -> None:
+    def recover(self) -> None:
         """Continue in a new file with the readable content of the current, damaged one.
 
         Raises sqlite3.Error or OSError if the disk refuses; the call may then be repeated.
         """
         self._database.close()
         before = sum(entry.records for entry in self._entries.values())
-        self._database, _ = spool_file.mended(self._path)
+        self._database, _ = spool_file.recover_file(self._path)
         self.counts.damages += 1
         own = {stream: sequence for stream, sequence in self._streams.items() if stream.boot == self.boot}
         for sequence in own.values():
@@ -181,7 +181,7 @@ class Outbox:
         if not sequence.held and entry.stream.boot != self.boot:
             del self._streams[entry.stream]
         if entry.due is not None:
-            self._pacer(entry).settled()
+            self._pacer(entry).record_settled()
         self._bytes -= entry.size
         self._deletable.append(key)
         return entry
@@ -229,7 +229,7 @@ class Outbox:
                 pacer.wait(batch.key)
                 held[place] = replace(batch, fresh=False)
             else:
-                self._fly(batch.key, now)
+                self._mark_in_flight(batch.key, now)
         self._evict()
         return [batch for batch in held if batch.key in self._entries]
 
@@ -249,14 +249,14 @@ class Outbox:
             raise sqlite3.DatabaseError("an insert gave no row id")
         return StoredBatch(key, stream, seq, draft.records, payload)
 
-    def _fly(self, key: int, now: float) -> None:
+    def _mark_in_flight(self, key: int, now: float) -> None:
         """Mark a batch as in flight, and set the time of its next resend."""
         entry = self._entries[key]
         delay = min(max(LONGEST_RESEND_S, self.first_resend_s), self.first_resend_s * 2.0 ** min(entry.attempts, 16))
         entry.attempts += 1
         entry.due = now + delay * self._jitter()
         heapq.heappush(self._later, (entry.due, key))
-        self._pacer(entry).fly(now)
+        self._pacer(entry).record_sent(now)
 
     def _jitter(self) -> float:
         return self._random.uniform(1 - JITTER, 1 + JITTER)
@@ -265,7 +265,7 @@ class Outbox:
         """Treat everything a vehicle had in flight as lost: it has just found a router again."""
         for (name, _), pacer in self._pacers.items():
             if name == vehicle:
-                pacer.reconnected(now)
+                pacer.record_reconnect(now)
         for _, key in self._later:
             entry = self._entries.get(key)
             if entry is not None and entry.stream.vehicle == vehicle and entry.due is not None:
@@ -301,7 +301,7 @@ class Outbox:
             return 0
         pacer = self._pacers.get((stream.vehicle, stream.region))
         if pacer is not None:
-            pacer.answered()
+            pacer.record_answer()
         keys = {key for first, last in ranges for key in _within(sequence.held, first, last)}
         records = sum(self._forget(key).records for key in keys)
         self.counts.settled += records
@@ -318,8 +318,8 @@ class Outbox:
             entry = self._entries.get(key)
             if entry is not None and entry.due == at:
                 entry.due = None
-                self._pacer(entry).unanswered(now, self._jitter())
-                if self._passed_over(entry):
+                self._pacer(entry).record_timeout(now, self._jitter())
+                if self._is_passed_over(entry):
                     self.counts.unanswered += self._forget(key).records
                 else:
                     self._pacer(entry).wait(key)
@@ -328,18 +328,18 @@ class Outbox:
             if vehicles is None or vehicle in vehicles:
                 taken = pacer.take(now, self._jitter(), limit - len(keys), self._entries)
                 for key in taken:
-                    self._fly(key, now)
+                    self._mark_in_flight(key, now)
                 keys += taken
         self._pacers = {name: pacer for name, pacer in self._pacers.items() if not pacer.idle or pacer.silent}
         return [batch for key in sorted(keys) if (batch := self._read(key)) is not None]
 
-    def _passed_over(self, entry: _Entry) -> bool:
+    def _is_passed_over(self, entry: _Entry) -> bool:
         """Return True if PASSED_OVER later batches of the stream were settled and this one, the oldest, was not."""
         sequence = self._streams[entry.stream]
         later = sequence.next - entry.seq - len(sequence.held)
         return later >= PASSED_OVER and sequence.first_held() == entry.seq
 
-    def held(self) -> list[StoredBatch]:
+    def held_batches(self) -> list[StoredBatch]:
         """Return all held batches, oldest first. Raises sqlite3.Error."""
         return [batch for key in list(self._entries) if (batch := self._read(key)) is not None]
 

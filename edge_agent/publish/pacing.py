@@ -72,26 +72,26 @@ class Pacer:
         """Queue a batch; lower keys are older and are sent first."""
         heapq.heappush(self._waiting, key)
 
-    def fly(self, now: float) -> None:
+    def record_sent(self, now: float) -> None:
         """Record that a batch was sent."""
         self.flying += 1
         if self._unanswered_since is None:
             self._unanswered_since = now
 
-    def settled(self) -> None:
+    def record_settled(self) -> None:
         """Record that a batch in flight was answered."""
         self.flying -= 1
         grown = self._window + (1.0 if self._window < self._sure else 1.0 / self._window)
         self._window = min(grown, LARGEST_WINDOW)
 
-    def answered(self) -> None:
+    def record_answer(self) -> None:
         """Record that any acknowledgement arrived."""
         self._answered = True
         if self.silent:
             self.silent, self._window, self._sure = False, FIRST_WINDOW, LARGEST_WINDOW
             self._stale = self.flying
 
-    def unanswered(self, now: float, jitter: float) -> None:
+    def record_timeout(self, now: float, jitter: float) -> None:
         """Record that a batch in flight was not answered in time."""
         self.flying -= 1
         if self.silent:
@@ -105,7 +105,7 @@ class Pacer:
             self._halved, self._window = now, max(self._window / 2.0, LEAST_WINDOW)
             self._sure = self._window
 
-    def reconnected(self, now: float) -> None:
+    def record_reconnect(self, now: float) -> None:
         """Record that a router is available again: batches in flight are lost, and a silent route is probed at once."""
         self.flying, self._unanswered_since = 0, None
         self._probe_at, self._probe_s = now, FIRST_PROBE_S

@@ -193,7 +193,7 @@ class Publisher:
                 self._round()
             except sqlite3.Error as error:
                 if is_damage(error):
-                    self._mend()
+                    self._recover_outbox()
                 else:
                     log.warning("the outbox cannot be read or tidied (%s); trying again", error)
                 self._stopped.wait(TICK_S)
@@ -205,16 +205,16 @@ class Publisher:
     def _round(self) -> None:
         self._take()
         self._settle()
-        self._look()
+        self._check_connections()
         self._waiting += self._batcher.due(self._clock(), everything=self._closing.is_set())
         self._store()
         self._outbox.delete_settled()
         self._resend()
 
-    def _mend(self) -> None:
+    def _recover_outbox(self) -> None:
         """Save the readable content of an outbox that was damaged during use, and continue."""
         try:
-            self._outbox.mend()
+            self._outbox.recover()
         except (sqlite3.Error, OSError) as error:
             log.warning("the damaged outbox cannot be mended (%s); trying again", error)
 
@@ -290,7 +290,7 @@ class Publisher:
             log.warning("the clock is %.0f s behind the service's: reports come late, or are refused", behind)
         self.clock_behind_s = behind
 
-    def _look(self) -> None:
+    def _check_connections(self) -> None:
         """Check for each vehicle whether it has a router. Batches sent without one are lost and are sent again when one
         is found."""
         if self._clock() - self._checked_at < CHECK_S and len(self._connected) == len(self._links):

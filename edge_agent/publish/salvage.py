@@ -22,7 +22,7 @@ _LARGEST: Final = 1 << 20  # bytes of a row; a batch has less than a tenth
 Value = int | str | bytes | None
 
 
-def rows(database: bytes, log: bytes) -> Iterator[tuple[int, list[Value]]]:
+def recover_rows(database: bytes, log: bytes) -> Iterator[tuple[int, list[Value]]]:
     """Yield row id and columns of every intact cell; the cells of the write-ahead log first, from its end on."""
     pages = {at // PAGE + 1: database[at : at + PAGE] for at in range(0, len(database), PAGE)}
     newer = [

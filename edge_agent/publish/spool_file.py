@@ -60,7 +60,7 @@ def open_file(path: Path) -> tuple[sqlite3.Connection, Path | None]:
             if not is_damage(error) or not _ours(path):
                 raise
             log.warning("the outbox %s is damaged (%s): set aside, and what can be read is saved", path, error)
-            return mended(path)
+            return recover_file(path)
     except (sqlite3.Error, OSError) as error:
         if isinstance(error, sqlite3.OperationalError) and "locked" in str(error):
             raise InputError("spool", f"{path} is used by another agent", "give each agent its own") from error
@@ -68,7 +68,7 @@ def open_file(path: Path) -> tuple[sqlite3.Connection, Path | None]:
         raise InputError("spool", problem, "name a writable place, or move the file aside") from error
 
 
-def mended(path: Path) -> tuple[sqlite3.Connection, Path]:
+def recover_file(path: Path) -> tuple[sqlite3.Connection, Path]:
     """Return a new file with the readable content of a damaged one, which is set aside.
 
     Raises sqlite3.Error or OSError if the disk refuses.
@@ -122,7 +122,7 @@ def _readable(path: Path) -> list[Row]:
     """Return the batches of a damaged file by age, each once, with a correct checksum or from before checksums."""
     log_file = path.with_name(f"{path.name}-wal")
     found: dict[int, Row] = {}
-    for key, values in salvage.rows(path.read_bytes(), log_file.read_bytes() if log_file.exists() else b""):
+    for key, values in salvage.recover_rows(path.read_bytes(), log_file.read_bytes() if log_file.exists() else b""):
         values += [None] * (len(TYPES) - len(values))
         if len(values) != len(TYPES) or not all(isinstance(v, t) for v, t in zip(values[1:], TYPES[1:], strict=True)):
             continue

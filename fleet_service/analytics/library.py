@@ -13,7 +13,7 @@ from fleet_service.analytics.options import Options
 from fleet_service.analytics.past_map import map_at
 from fleet_service.analytics.questions import question_of
 from fleet_service.archive.export import Box, Extract
-from fleet_service.archive.layout import insist_on_archive
+from fleet_service.archive.layout import require_archive
 from schemas.config import moment
 
 
@@ -32,7 +32,7 @@ def ask_archive(
         InputError: there is no such question or archive, no data in that part, or an option is missing.
     """
     root = Path(archive)
-    insist_on_archive(root)
+    require_archive(root)
     asked = question_of(question)
     return asked.ask(QueryEngine(engine, root, _part(since, until, bbox)), options or Options(report=lambda _: None))
 
@@ -40,7 +40,7 @@ def ask_archive(
 def map_of_archive(archive: Path | str, *, at: str | None = None, bbox: Box | None = None) -> pa.Table:
     """Return the map as of a time, or of now, replayed from the archive, as a GeoParquet table."""
     root = Path(archive)
-    insist_on_archive(root)
+    require_archive(root)
     return map_at(root, _part(None, at, bbox))
 
 

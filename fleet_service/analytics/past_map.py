@@ -10,7 +10,7 @@ import pyarrow as pa
 from fleet_service.archive import geo
 from fleet_service.archive.export import Box, Extract
 from fleet_service.fusion import Fusion
-from fleet_service.replay.rebuild import past
+from fleet_service.replay.rebuild import past_fusion
 from fleet_service.serve.encode import cell_table
 from schemas import grid, tables
 
@@ -27,10 +27,12 @@ def visited_cells(fusion: Fusion, at: int, box: Box | None) -> pa.Table:
 
 def map_at(root: Path, part: Extract, lateness_s: float = LATENESS_S) -> pa.Table:
     """Return the map at the end of a part, replayed from everything received by then, as a GeoParquet table."""
-    return kept(visited_cells(past(root, lateness_s, part.until, part.bbox), part.until, part.bbox), part.until)
+    return snapshot_table(
+        visited_cells(past_fusion(root, lateness_s, part.until, part.bbox), part.until, part.bbox), part.until
+    )
 
 
-def kept(table: pa.Table, at: int) -> pa.Table:
+def snapshot_table(table: pa.Table, at: int) -> pa.Table:
     """Return cells as believed at a moment [ns], as the GeoParquet table of a snapshot."""
     time = pa.array(np.full(table.num_rows, at // tables.US_STEP)).cast(tables.US)
     table = table.append_column("snapshot_time", time).sort_by([("cell", "ascending"), ("sector", "ascending")])

@@ -17,11 +17,11 @@ from typing import Final, NamedTuple
 
 import pyarrow as pa
 
-from fleet_service.analytics.past_map import LATENESS_S, kept, visited_cells
+from fleet_service.analytics.past_map import LATENESS_S, snapshot_table, visited_cells
 from fleet_service.archive import layout, rollup, snapshots
 from fleet_service.archive.files import MAP, ROLLUP, Encoding, sync_tree, write_table
-from fleet_service.archive.load import pass_over
-from fleet_service.replay.rebuild import past
+from fleet_service.archive.load import skip_damaged
+from fleet_service.replay.rebuild import past_fusion
 from schemas import grid
 from schemas.errors import InputError
 from schemas.runtime import spark
@@ -40,7 +40,7 @@ class Rebuild(NamedTuple):
     lateness_s: float = LATENESS_S
 
 
-class Rebuilt(NamedTuple):
+class RebuildResult(NamedTuple):
     """Result of a zone: cells of the map, parts of the roll-up."""
 
     zone: int
@@ -48,7 +48,7 @@ class Rebuilt(NamedTuple):
     parts: int
 
 
-def insist_on_empty(out: Path) -> None:
+def require_empty(out: Path) -> None:
     """Raise unless a folder is empty or new, because parts of another archive would add up.
 
     Raises:
@@ -63,7 +63,7 @@ def insist_on_empty(out: Path) -> None:
         raise InputError("out", f"{out} holds {something.name}", "give a new folder, or empty this one")
 
 
-def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[Rebuilt]:
+def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[RebuildResult]:
     """Rebuild all zones; yield the result of each, in order.
 
     Raises:
@@ -76,17 +76,17 @@ def rebuild(wanted: Rebuild, engine: str = "local") -> Iterator[Rebuilt]:
     zones = zones_of(wanted.root)
     if not zones:
         raise InputError("archive", f"no compacted observations in {wanted.root}", "run fleet-service compact")
-    work = partial(rebuilt, wanted)
+    work = partial(rebuild_zone, wanted)
     yield from map(work, zones) if engine == "local" else spark.spread(spark.session(), zones, work)
     sweep_drafts(wanted.out)
 
 
 def zones_of(root: Path) -> list[int]:
     """Return the zones that an archive has compacted observations of."""
-    return sorted({layout.partition_of(path).zone for path in layout.compacted(root, Kind.OBSERVATION)})
+    return sorted({layout.partition_of(path).zone for path in layout.compacted_files(root, Kind.OBSERVATION)})
 
 
-def rebuilt(wanted: Rebuild, zone: int) -> Rebuilt:
+def rebuild_zone(wanted: Rebuild, zone: int) -> RebuildResult:
     """Rebuild one zone; repeated or concurrent calls leave its files once.
 
     Raises:
@@ -95,30 +95,30 @@ def rebuilt(wanted: Rebuild, zone: int) -> Rebuilt:
     """
     west, south, east, north = (float(side) for side in grid.bounds(zone, grid.ZONE_ZOOM))
     box = (west, south, east, north)
-    cells = visited_cells(past(wanted.root, wanted.lateness_s, wanted.until, box), wanted.until, box)
+    cells = visited_cells(past_fusion(wanted.root, wanted.lateness_s, wanted.until, box), wanted.until, box)
     cells = cells.filter(pa.array(grid.zone_of(cells["cell"].to_numpy()) == zone))
     named = f"zone=q{grid.quadkey(zone, grid.ZONE_ZOOM)}"
     with own_drafts(wanted.out) as drafts:
-        place = partial(_placed, wanted.out, drafts)
+        place = partial(_write_atomically, wanted.out, drafts)
         if cells.num_rows:
             path = snapshots.path_of(wanted.out, wanted.until)
-            place(path.parent / named / path.name, kept(cells, wanted.until), MAP)
+            place(path.parent / named / path.name, snapshot_table(cells, wanted.until), MAP)
         parts = 0
-        for path in layout.compacted(wanted.root, Kind.OBSERVATION):
+        for path in layout.compacted_files(wanted.root, Kind.OBSERVATION):
             if layout.partition_of(path).zone == zone and (part := _part(path)) is not None:
                 place(rollup.part_of(path, wanted.out), part, ROLLUP)
                 parts += 1
-    return Rebuilt(zone, cells.num_rows, parts)
+    return RebuildResult(zone, cells.num_rows, parts)
 
 
 def _part(path: Path) -> pa.Table | None:
     try:
-        return rollup.computed(path, pass_over)
+        return rollup.compute_part(path, skip_damaged)
     except FileNotFoundError:
         return None  # its day was retired meanwhile
 
 
-def _placed(out: Path, drafts: Path, path: Path, table: pa.Table, encoding: Encoding) -> None:
+def _write_atomically(out: Path, drafts: Path, path: Path, table: pa.Table, encoding: Encoding) -> None:
     """Write a file atomically, also if another process writes the same one."""
     write_table(table, drafts / path.name, encoding, named=False)
     path.parent.mkdir(parents=True, exist_ok=True)

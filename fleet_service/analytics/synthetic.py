@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from fleet_service.archive.segments import Rows, Writer, stepped
+from fleet_service.archive.segments import Rows, Writer, round_to_steps
 from schemas import grid, mugrid
 from schemas.numeric import BoolArray, ByteArray, FloatArray, IntArray
 from schemas.thresholds import NS, Z_95
@@ -106,7 +106,7 @@ def _chunk(
         "spread": np.ones(rows, np.float32), "slope": np.full(rows, 0.4, np.float32),
     }  # fmt: skip
     order = np.argsort(leave, kind="stable")
-    return {name: column[order] for name, column in stepped(found).items()}
+    return {name: column[order] for name, column in round_to_steps(found).items()}
 
 
 def _places(road: IntArray, along: IntArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -13,7 +13,9 @@ from schemas.errors import InputError
 LOOK_S: Final = 0.1  # between two looks whether it shall stop
 
 
-def run(what: str, module: str, words: Sequence[str], stop: threading.Event, document: str | None = None) -> str | None:
+def run_module(
+    what: str, module: str, words: Sequence[str], stop: threading.Event, document: str | None = None
+) -> str | None:
     """Run a module as a process with `document` on its stdin; return its stdout, or None if it was stopped. The process
     must tolerate a kill at any instant.
 

@@ -81,7 +81,7 @@ class SteadyClock:
             return TimeNow(now, slack, max(0, wall - now - slack), min(now, wall))
         return TimeNow(now, slack, ANY, min(now, wall, seen) if self._seen else 0, self._sure)
 
-    def heard(self, times: Mapping[str, int]) -> None:
+    def record_reports(self, times: Mapping[str, int]) -> None:
         """Record the times [ns] that vehicles just reported."""
         now, wall = self.now(), self._wall()
         if self._doubted is None:

@@ -1,7 +1,7 @@
 """Core of the service without its network: messages in; alerts, tiles, acknowledgements and answers out.
 
-One worker calls `ingest`, `begin_flush`, `written`, `flush`, `tile` and `fade_alerts`; queries come from other threads,
-so that a lock guards the map.
+One worker calls `ingest`, `begin_flush`, `end_flush`, `flush`, `tile` and `fade_alerts`. Queries come from other
+threads, so a lock guards the map.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_service.app.clock import TimeNow
-from fleet_service.app.memory import SLOTS, Memory, remember, visited
-from fleet_service.app.past import PastMaps, PastQuery
+from fleet_service.app.memory import SLOTS, ServiceState, load_state, visitor_tables
+from fleet_service.app.past import HistoricalMaps, PastQuery
 from fleet_service.app.precompile import warm_up
 from fleet_service.app.tasks import Tasks
 from fleet_service.archive.bucket import CopyError
@@ -29,7 +29,7 @@ from fleet_service.archive.load import count_set_aside, set_aside
 from fleet_service.archive.log import SegmentLog
 from fleet_service.archive.pseudonyms import Pseudonyms
 from fleet_service.archive.segments import Rows
-from fleet_service.archive.witnesses import mend
+from fleet_service.archive.witnesses import remove_damaged_lines
 from fleet_service.fusion import observations_of
 from fleet_service.fusion.standing import ERRORS, unknown
 from fleet_service.fusion.weather import Reports
@@ -46,7 +46,7 @@ from fleet_service.replay.restart import image_of
 from fleet_service.serve.encode import batch_of
 from fleet_service.serve.query import AnswerSize, answer, size_asked
 from fleet_service.serve.tile_cache import TileCache
-from fleet_service.shards.holding import Holding, alone
+from fleet_service.shards.holding import Ownership, open_exclusive
 from schemas import grid, wire
 from schemas.config import ServiceConfig, nanoseconds
 from schemas.errors import InputError
@@ -76,9 +76,11 @@ class Engine:
         OSError: the archive cannot be read or written.
     """
 
-    def __init__(self, config: ServiceConfig, root: Path, holding: Holding | None = None) -> None:
-        self._config, self._root, self._past = config, root, PastMaps(root)
-        self.holding = holding or alone(config, root)  # before anything is read: an empty disk is filled from the copy
+    def __init__(self, config: ServiceConfig, root: Path, holding: Ownership | None = None) -> None:
+        self._config, self._root, self._past = config, root, HistoricalMaps(root)
+        self.holding = holding or open_exclusive(
+            config, root
+        )  # before anything is read: an empty disk is filled from the copy
         self.copy = self.holding.copy
         try:
             self._open(config, root)
@@ -93,23 +95,23 @@ class Engine:
         self._tracks, self._places = Tracks(), NewCells()
         self._turn = 0  # of the alerts that are told again
         self.failing = False  # the last segment could not be written
-        self.counts["witnesses_damaged"] += mend(root / "keys")
+        self.counts["witnesses_damaged"] += remove_damaged_lines(root / "keys")
         self._guard = threading.Lock()
         self._acks, self._now = Acks(), 0
         self._log: SegmentLog[BatchId] = SegmentLog(root, config.name, self.copy, self.holding.epoch)
         self._wanted = Tasks()
         self._ended: list[Alert] = []  # alerts that nobody was told the end of yet
-        memory = remember(root, config, set_aside)
+        memory = load_state(root, config, set_aside)
         self.counts["checkpoints_refused"] += memory.refused
         self.weather = WeatherInbox(root, config.name, memory.fusion, self.counts)
-        self._know(memory)
+        self._adopt(memory)
         self.seen = self._streams.newest
         self.counts["files_set_aside"] = count_set_aside(root)
         if config.weather is not None:
             self._use(self.weather.begin(config.weather, memory.weather, time.time_ns()))
         warm_up()
 
-    def _know(self, memory: Memory) -> None:
+    def _adopt(self, memory: ServiceState) -> None:
         """Adopt a state loaded from the archive."""
         self._memory = memory
         self.fusion, self.map, self._alerts, self._streams = memory.fusion, memory.map, memory.alerts, memory.streams
@@ -118,24 +120,24 @@ class Engine:
         self._intake = BatchIntake(self._streams, Pseudonyms(self._root / "keys"), self.counts, self._acks)
         self.weather.fusion = self.fusion
 
-    def recall(self, before: Callable[[], None]) -> None:
-        """Call `before`, then replace the state by what the archive holds; call it in `between`.
+    def reload_state(self, before: Callable[[], None]) -> None:
+        """Call `before`, then replace the state by what the archive holds; call it in `run_between_segments`.
 
         Raises:
             OSError: the archive cannot be read; the state stays.
         """
-        stood = self._alerts.standing
+        stood = self._alerts.standing_alerts
         before()
-        memory = remember(self._root, self._config, set_aside)
+        memory = load_state(self._root, self._config, set_aside)
         with self._guard:
             self._tracks, self._places = Tracks(), NewCells()
-            self._know(memory)
-            still = {(alert.cell, alert.sector) for alert in self._alerts.standing}
+            self._adopt(memory)
+            still = {(alert.cell, alert.sector) for alert in self._alerts.standing_alerts}
             ended = [alert for alert in stood if (alert.cell, alert.sector) not in still]
             self._ended += [replace(alert, raised=False, reason=ERASED) for alert in ended]
 
     def drop_old(self) -> int:
-        """Drop old cells that are back at the prior; return their number. Call it in `between`."""
+        """Drop old cells that are back at the prior; return their number. Call it in `run_between_segments`."""
         with self._guard:
             return self._memory.drop_old()
 
@@ -144,9 +146,9 @@ class Engine:
 
         The worker copies the state right after a segment, when every row in it is on disk. Another thread calls this.
         """
-        return self.between(self._image, stop)
+        return self.run_between_segments(self._image, stop)
 
-    def between(self, work: Callable[[], T], stop: threading.Event) -> T | None:
+    def run_between_segments(self, work: Callable[[], T], stop: threading.Event) -> T | None:
         """Let the worker run `work` right after a segment, when every row it took is on disk; return the result.
 
         None if stopped meanwhile. Another thread calls this.
@@ -158,27 +160,27 @@ class Engine:
 
     def _image(self) -> Taken:
         with self._guard:
-            tables = image_of(self.fusion, self._alerts.standing, self._streams) | visited(self._visitors)
-        return Taken(tables, self.written_to, tuple(path.name for path in weather_files(self._root)))
+            tables = image_of(self.fusion, self._alerts.standing_alerts, self._streams) | visitor_tables(self._visitors)
+        return Taken(tables, self.newest_segment, tuple(path.name for path in weather_files(self._root)))
 
     @property
-    def written_to(self) -> Cut:
+    def newest_segment(self) -> Cut:
         """Return the last written segment."""
         return self._log.newest
 
-    def survived(self) -> None:
+    def mark_survived(self) -> None:
         """Record that the service has run for a while with the checkpoint it began from."""
-        checkpoints.survived(self._root)
+        checkpoints.mark_survived(self._root)
 
     def close(self) -> None:
         """Release the archive."""
         self._past.close()
-        self.survived()
+        self.mark_survived()
         self._log.close()
         self.holding.close()
 
     @property
-    def full(self) -> bool:
+    def is_full(self) -> bool:
         """True if too many rows wait for the disk, or batches for the copy."""
         return self._log.rows >= WAITING_ROWS or self._log.unsettled >= WAITING_BATCHES
 
@@ -200,25 +202,25 @@ class Engine:
     @property
     def alerts(self) -> int:
         """Number of cells under alert."""
-        return len(self._alerts.raised)
+        return len(self._alerts.slots)
 
     @property
-    def alerted(self) -> IntArray:
+    def alert_slots(self) -> IntArray:
         """Return the slots under alert, (k,)."""
-        return np.array(sorted(self._alerts.raised), np.int64)
+        return np.array(sorted(self._alerts.slots), np.int64)
 
-    def standing(self, wanted: Callable[[int], bool]) -> list[tuple[int, bytes]]:
+    def standing_alerts(self, wanted: Callable[[int], bool]) -> list[tuple[int, bytes]]:
         """Return tile and payload of the standing alerts of selected tiles."""
         tiles: dict[int, list[Alert]] = {}
         with self._guard:
-            for alert in self._alerts.standing:
+            for alert in self._alerts.standing_alerts:
                 tiles.setdefault(int(grid.tile_of(alert.cell)), []).append(alert)
         return [(tile, wire.encode_standing(alerts)) for tile, alerts in tiles.items() if wanted(tile)]
 
-    def repeated(self, most: int) -> list[Alert]:
+    def alerts_to_repeat(self, most: int) -> list[Alert]:
         """Return at most `most` standing alerts, in turn, so that clients that were away receive them too."""
         with self._guard:
-            standing = self._alerts.standing
+            standing = self._alerts.standing_alerts
         self._turn = self._turn % max(len(standing), 1)
         out = standing[self._turn : self._turn + most]
         self._turn += len(out)
@@ -248,13 +250,13 @@ class Engine:
         rows = accepted.rows
         self.report_lag_s = float((rows["received_at"] - rows["leave_time"]).min()) * 1e-9
         with self._guard:
-            heard = np.flatnonzero(~self._beyond(rows))
+            heard = np.flatnonzero(~self._excluded_from_fusion(rows))
             taken = observations_of(rows, rows["witness"]).take(heard)
             updated = self.fusion.update(taken)
             if self._visitors is not None:
-                self._visitors.heard(taken)
-            self.map.changed(updated.slots)
-            raised = self._alerts.updated(updated.slots)
+                self._visitors.add(taken)
+            self.map.mark_changed(updated.slots)
+            raised = self._alerts.update(updated.slots)
             if raised:
                 self._tiles.acknowledge()
         n = len(rows["row"])
@@ -268,10 +270,10 @@ class Engine:
             missed = np.zeros(n, bool)
             missed[heard] = updated.late
             of_batch = np.logical_or.reduceat(missed, np.flatnonzero(rows["row"] == 0))
-            self._acks.late(compress(accepted.batches, of_batch.tolist()))
+            self._acks.record_late(compress(accepted.batches, of_batch.tolist()))
         return raised
 
-    def _beyond(self, rows: Rows) -> BoolArray:
+    def _excluded_from_fusion(self, rows: Rows) -> BoolArray:
         """Return which rows are archived and not fused: their vehicle cannot be there, or reports too many new
         places."""
         witness = rows["witness"]
@@ -304,23 +306,23 @@ class Engine:
         return acks
 
     def begin_flush(self) -> list[tuple[str, bytes]]:
-        """Begin a flush; messages may be processed while segments are written. `written` returns the acknowledgements.
+        """Begin a flush; messages may be processed while segments are written. `end_flush` returns the acks.
 
-        If work waits for `between`, this is `flush`.
+        If work waits for `run_between_segments`, this is `flush`.
         """
         if self._wanted:
             return self.flush()
         self._log.begin()
         return []
 
-    def written(self) -> list[tuple[str, bytes]]:
+    def end_flush(self) -> list[tuple[str, bytes]]:
         """Return the acknowledgements of a flush that was begun and has ended."""
         return self._acknowledged(self._log.end) if self._log.ended else []
 
     def _acknowledged(self, durable: Callable[[], list[BatchId]]) -> list[tuple[str, bytes]]:
         try:
             self._intake.sync()
-            self._intake.settled(durable())
+            self._intake.acknowledge(durable())
         except OSError as error:
             if isinstance(error, CopyError) and self.copy is not None:
                 self.counts["copy_failures"] = self.copy.failures
@@ -355,7 +357,7 @@ class Engine:
         """Return the alerts that expired or were erased."""
         with self._guard:
             ended, self._ended = [replace(alert, time=now) for alert in self._ended], []
-            return ended + self._alerts.faded(now)
+            return ended + self._alerts.expire(now)
 
     def answer(
         self, query: MapQuery, wanted: Callable[[int], bool], now: int, only: int | None = None

@@ -14,10 +14,10 @@ from schemas.runtime.process import limit_memory
 def main() -> int:
     """Erase, and print the result."""
     limit_memory(*UNUSED)
-    from fleet_service.app.erasing import apart
+    from fleet_service.app.erasing import run_erasure_process
 
     try:
-        print(json.dumps(apart(Path(sys.argv[1]), json.load(sys.stdin))))
+        print(json.dumps(run_erasure_process(Path(sys.argv[1]), json.load(sys.stdin))))
     except (InputError, OSError) as error:
         print(error, file=sys.stderr)
         return 2

@@ -18,7 +18,7 @@ from fleet_service.app.clock import TimeNow
 from fleet_service.app.engine import Engine
 from fleet_service.archive import layout, reserve, segments, snapshots
 from fleet_service.archive.load import count_set_aside
-from fleet_service.archive.retention import retire
+from fleet_service.archive.retention import retire_rows
 from fleet_service.ingest import weather
 from fleet_service.replay import checkpoints
 from schemas.config import ServiceConfig
@@ -52,13 +52,13 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
     def compaction(stop: threading.Event) -> str | None:
         if engine.copy is not None and engine.failing:  # compacted, its segments would never be put as such
             return "compaction waits for the copy"
-        reserve.keep(root)
-        weather.gather(root)
+        reserve.allocate(root)
+        weather.join_daily_files(root)
         if not config.put_to and not any(segments.paths(root, kind) for kind in Kind):
             return None
         words = ["compact", "--archive", str(root), "--round-rows", str(ROUND_ROWS)]
         words += ["--to", config.put_to] if config.put_to else []
-        output = beside.run("compact", "fleet_service.cli", words, stop)
+        output = beside.run_module("compact", "fleet_service.cli", words, stop)
         return output and f"compacted: {output}"
 
     def snapshot(_: threading.Event) -> str | None:
@@ -78,12 +78,12 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
         at = moment()
         if not at.sure:
             return "retention waits: no report has confirmed the clock yet"
-        done = retire(root, config.raw_days, datetime.fromtimestamp(at.now // NS, UTC).date())
+        done = retire_rows(root, config.raw_days, datetime.fromtimestamp(at.now // NS, UTC).date())
         weather.retire(root, at.now // layout.DAY_NS - config.raw_days - 1)
         return f"retired: {done.days} days" if done.days else None
 
     def old_cells(stop: threading.Event) -> str | None:
-        dropped = engine.between(engine.drop_old, stop)
+        dropped = engine.run_between_segments(engine.drop_old, stop)
         return f"dropped: {dropped} cells that nobody visited for a week" if dropped else None
 
     def inventory(_: threading.Event) -> str | None:
@@ -97,7 +97,7 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
             try:
                 return work(stop)
             except (OSError, InputError):
-                if not reserve.give(root):
+                if not reserve.release(root):
                     raise
                 return work(stop)
 
@@ -105,7 +105,7 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
 
     def following(_: threading.Event) -> str | None:
         if engine.copy is not None:
-            engine.copy.follow()
+            engine.copy.sync()
         return None
 
     def handing_over(stop: threading.Event) -> str | None:
@@ -130,11 +130,11 @@ def archive_jobs(engine: Engine, config: ServiceConfig, root: Path, moment: Call
         Job("old_cells", DAY_S, old_cells),
         Job("following", 0.0 if engine.copy is None else FOLLOW_S, following),
         Job("handing_over", ASKED_S if engine.holding.lease is not None else 0.0, handing_over),
-        Job("erasure", ASKED_S, lambda stop: erasing.asked(engine, config, root, stop)),
+        Job("erasure", ASKED_S, lambda stop: erasing.handle_requests(engine, config, root, stop)),
     ]
 
 
-class Upkeep:
+class BackgroundJobs:
     """Thread that runs the jobs.
 
     Attributes:
@@ -149,22 +149,22 @@ class Upkeep:
         self._busy: tuple[str, float] | None = None
         self._thread = threading.Thread(target=self._keep, name="upkeep")
 
-    def troubles(self) -> list[str]:
+    def health_problems(self) -> list[str]:
         """Return one message per failed or hanging job."""
         found = [f"{name} failed {times} times in a row" for name, times in list(self.failed.items())]
         busy = self._busy
         if busy is not None and time.monotonic() - busy[1] > HANGS_S:
             found.append(f"{busy[0]} has not ended for {time.monotonic() - busy[1]:.0f} s")
-        if self.ended:
+        if self.has_ended:
             found.append("background jobs have ended; restart the service")
         return found
 
     @property
-    def ended(self) -> bool:
+    def has_ended(self) -> bool:
         """Return True if the thread has ended although nobody stopped it."""
         return self._thread.ident is not None and not self._thread.is_alive() and not self._stop.is_set()
 
-    def __enter__(self) -> Upkeep:
+    def __enter__(self) -> BackgroundJobs:
         self._thread.start()
         return self
 
@@ -179,10 +179,10 @@ class Upkeep:
         due = {job: began + min(job.every_s, SOON_S) for job in self._jobs}
         while due and not self._stop.wait(max(min(due.values()) - time.monotonic(), 0.0)):
             job = min(due, key=lambda job: due[job])
-            again_s = job.every_s if self._done(job) else min(job.every_s, SOON_S)
+            again_s = job.every_s if self._run_job(job) else min(job.every_s, SOON_S)
             due[job] = time.monotonic() + again_s
 
-    def _done(self, job: Job) -> bool:
+    def _run_job(self, job: Job) -> bool:
         """Run one turn of a job; return True on success. A failure must not affect the other jobs."""
         self._busy = (job.name, time.monotonic())
         try:

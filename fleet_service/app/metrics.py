@@ -81,7 +81,7 @@ def metrics(engine: Engine, pulse: Pulse, config: ServiceConfig, root: Path) -> 
     ]  # fmt: skip
 
 
-def of_standby(config: ServiceConfig) -> list[Metric]:
+def standby_metrics(config: ServiceConfig) -> list[Metric]:
     """Return all values of a waiting service."""
     return [_serves(config, 0.0)]
 
@@ -91,7 +91,7 @@ def _serves(config: ServiceConfig, value: float) -> Metric:
     return Metric("serves", "gauge", text, {" ".join(sorted(config.regions)): value}, "regions")
 
 
-def troubles(engine: Engine, pulse: Pulse, config: ServiceConfig) -> list[str]:
+def health_problems(engine: Engine, pulse: Pulse, config: ServiceConfig) -> list[str]:
     """Return one message per problem."""
     found = [] if pulse.routers else ["no router is connected"]
     if pulse.turn_age_s > STALLED_S:

@@ -19,7 +19,7 @@ from typing import BinaryIO, Final, NamedTuple
 import pyarrow as pa
 
 from fleet_service.fusion import Fusion, Observations
-from fleet_service.replay.rebuild import Box, past, rows_near, too_much
+from fleet_service.replay.rebuild import Box, past_fusion, rows_near, too_much
 from fleet_service.serve.map_state import MapState
 from fleet_service.serve.query import answer
 from fleet_service.serve.tile_cache import TileCache
@@ -51,7 +51,7 @@ class PastQuery(NamedTuple):
     public: int = 1
 
 
-class PastMaps:
+class HistoricalMaps:
     """Answers about the past. The process is kept for IDLE_S for the next question, because it takes a second to start.
 
     Args:
@@ -125,7 +125,7 @@ class _Process:
 
     def ask(self, question: PastQuery) -> bytes:
         """Ask; return the head of the first reply."""
-        self._in.write(encoded(question))
+        self._in.write(encode_question(question))
         self._in.flush()
         return self.head()
 
@@ -157,7 +157,7 @@ def box_of(question: PastQuery) -> Box | None:
     return query.bbox
 
 
-def replies(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
+def replies_to(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
     """Yield tile and payload of every reply.
 
     Raises:
@@ -167,18 +167,18 @@ def replies(root: Path, question: PastQuery) -> Iterator[tuple[int, bytes]]:
 
     def listener(fusion: Fusion) -> Callable[[Observations], None]:
         heard.append(Visitors(fusion))
-        return heard[0].heard
+        return heard[0].add
 
     listening = listener if question.public > 1 else None
     try:
-        then = past(root, question.lateness_s, question.at, box_of(question), MOST_ROWS, listening)
+        then = past_fusion(root, question.lateness_s, question.at, box_of(question), MOST_ROWS, listening)
     except OSError as error:
         raise InputError("at", f"the archive cannot be read ({error.strerror})", "ask again later") from error
     cache = TileCache(MapState(then), nullcontext(), question.public, heard[0] if heard else None)
     yield from answer(cache, question.query, lambda _: True, question.at, question.only)
 
 
-def encoded(question: PastQuery) -> bytes:
+def encode_question(question: PastQuery) -> bytes:
     """Return a question as a line for `answer_line`."""
     return json.dumps({**question._asdict(), "query": question.query.model_dump_json()}).encode() + b"\n"
 
@@ -188,7 +188,7 @@ def answer_line(root: Path, line: bytes, out: BinaryIO) -> None:
     heard = json.loads(line)
     question = PastQuery(**{**heard, "query": MapQuery.model_validate_json(heard["query"])})
     try:
-        for tile, payload in replies(root, question):
+        for tile, payload in replies_to(root, question):
             out.write(_HEAD.pack(tile, len(payload)) + payload)
         out.write(_HEAD.pack(_END, 0))
     except InputError as error:

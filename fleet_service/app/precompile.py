@@ -16,7 +16,7 @@ from fleet_service.fusion.likelihoods import at_least, levelled, supported
 from fleet_service.fusion.reported import as_reported
 from fleet_service.fusion.space import shares
 from fleet_service.ingest.budgets import Tracks
-from fleet_service.ingest.grouping import grouped, largest_of
+from fleet_service.ingest.grouping import group_rows, largest_of
 from fleet_service.serve.alerts import Alerts
 from fleet_service.serve.encode import cell_table
 from schemas import mugrid
@@ -45,13 +45,13 @@ def live() -> None:
     fusion = Fusion(2 * EPOCH_NS * 1e-9)
     for epoch, cells in ((1, 2), (2, CELLS), (1, 2), (9, 2)):
         o = _visits(epoch * EPOCH_NS, cells)
-        Alerts(fusion).updated(fusion.update(o).slots)
+        Alerts(fusion).update(fusion.update(o).slots)
         fusion.slots_of(o.cell, o.sector)
     at_least(np.zeros(1))
     supported(levelled(np.zeros((1, mugrid.BINS), np.uint8), np.zeros(1)), np.zeros(1))
     column = np.zeros(1, np.int64)  # as Arrow hands it out: not to be written to
     column.flags.writeable = False
-    group, _ = grouped(np.zeros(1, np.int64), column, column)
+    group, _ = group_rows(np.zeros(1, np.int64), column, column)
     largest_of(column, group, 1)
     Tracks().impossible(column, np.zeros(1, np.int64), np.zeros(1), np.zeros(1))
     shares(np.ones(1), np.ones(1))

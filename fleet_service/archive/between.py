@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 Bound = int | float | str | None
 
 
-class Between(NamedTuple):
+class ValueRange(NamedTuple):
     """Rows whose value lies from `least` to `most`, both included; None for no limit. Times are whole microseconds. A
     row without a value is not selected."""
 
@@ -25,10 +25,10 @@ class Between(NamedTuple):
     most: Bound = None
 
 
-Where = Sequence[Between]
+Where = Sequence[ValueRange]
 
 
-def those(table: pa.Table, where: Where) -> pa.Table:
+def filter_table(table: pa.Table, where: Where) -> pa.Table:
     """Return the selected rows of a table, with all columns."""
     for column, least, most in where:
         values = table[column]
@@ -41,7 +41,7 @@ def those(table: pa.Table, where: Where) -> pa.Table:
     return table
 
 
-def groups(footer: pq.FileMetaData, where: Where) -> list[int]:
+def matching_row_groups(footer: pq.FileMetaData, where: Where) -> list[int]:
     """Return the row groups of a file that may hold selected rows, by their statistics."""
     places = {footer.schema.column(at).path: at for at in range(footer.num_columns)}
     known = [(places[one.column], one) for one in where if one.column in places]
@@ -52,7 +52,7 @@ def groups(footer: pq.FileMetaData, where: Where) -> list[int]:
     ]
 
 
-def _may(statistics: Any, wanted: Between) -> bool:  # noqa: ANN401 pyarrow's has no name
+def _may(statistics: Any, wanted: ValueRange) -> bool:  # noqa: ANN401 pyarrow's has no name
     if statistics is None or not statistics.has_min_max:
         return True
     least, most = (bound.encode() if isinstance(bound, str) else bound for bound in wanted[1:])

@@ -14,7 +14,7 @@ from pathlib import Path
 from threading import Lock
 from typing import Final, NamedTuple
 
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 
 NAME: Final = "copied"
 
@@ -36,7 +36,7 @@ def stamp_of(path: Path) -> Stamp:
     return Stamp(found.st_size, found.st_mtime_ns)
 
 
-class Copied:
+class UploadJournal:
     """Journal of one archive and one copy; the journal of another copy is ignored.
 
     Args:
@@ -58,17 +58,17 @@ class Copied:
                 self._stamps.pop(name, None)
                 if stamp:
                     self._stamps[name] = Stamp(*map(int, stamp))
-        with written(path) as file:
+        with open_durably(path) as file:
             rest = [json.dumps([name, *stamp]) for name, stamp in self._stamps.items()]
             file.write("".join(f"{line}\n" for line in [head, *rest]).encode())
         self._file = path.open("ab", buffering=0)
 
-    def all(self) -> dict[str, Stamp]:
+    def stamps(self) -> dict[str, Stamp]:
         """Return the names in the copy, each with its stamp at the upload; a snapshot."""
         with self._guard:
             return dict(self._stamps)
 
-    def of(self, name: str) -> Stamp | None:
+    def stamp(self, name: str) -> Stamp | None:
         """Return the stamp at a file's upload; None if it was not uploaded."""
         return self._stamps.get(name)
 
@@ -93,7 +93,7 @@ class Copied:
         self._file.close()
 
 
-def copy_of(root: Path) -> str | None:
+def last_copy_url(root: Path) -> str | None:
     """Return the URL of the last copy of an archive; None if it had none."""
     with suppress(OSError, ValueError, KeyError, TypeError), (root / NAME).open() as file:
         return str(json.loads(file.readline())["copy"])

@@ -1,9 +1,9 @@
 """Bucket replica of an archive: the same files under the same names.
 
-Files that an acknowledgement depends on (segments, keys, vehicle identities) are uploaded before it (`settle`). All
-others follow (`follow`): uploads first, then deletions, so that at any instant the copy holds every row at least once,
-like the folder. A start (`begin`) downloads what only the bucket has (everything onto an empty disk), and uploads what
-only the folder has. Only objects recorded in the journal are deleted.
+Files that an acknowledgement depends on (segments, keys, vehicle identities) are uploaded before it
+(`upload_segments`). All others follow (`sync`): uploads first, then deletions, so that at any instant the copy holds
+every row at least once, like the folder. A start (`begin`) downloads what only the bucket has (everything onto an empty
+disk), and uploads what only the folder has. Only objects recorded in the journal are deleted.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from typing import Final
 
 from fleet_service.archive import layout
 from fleet_service.archive.bucket import CopyError, ObjectBucket
-from fleet_service.archive.copied import Copied, Stamp, stamp_of
+from fleet_service.archive.copied import Stamp, UploadJournal, stamp_of
 from fleet_service.archive.files import sync_tree
 from fleet_service.archive.layout import CHECKPOINTS
 from fleet_service.archive.load import BAD
-from fleet_service.archive.terms import Fence, Term, fence_of, newest, put_fence
+from fleet_service.archive.terms import Fence, Term, fence_of, largest_epoch, put_fence
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 
 LOG: Final = "inbox/"
 KEYS: Final = "keys/"
@@ -38,14 +38,14 @@ _LAST: Final = "manifest.json"  # of a checkpoint: without it the folder is none
 _PRIVATE: Final = ("tried",)  # notes of this disk
 QUICK_S: Final = 5.0  # of one request that an acknowledgement waits for; the service's worker may wait as long
 SLOW_S: Final = 300.0  # of one that nobody waits for: a compacted file has tens of megabytes
-TURN_S: Final = 20.0  # of `settle`, which then says that it has come so far
+TURN_S: Final = 20.0  # of `upload_segments`, which then says that it has come so far
 BACK_OFF_S: Final = 0.5  # after the first failure; doubles
 MOST_BACK_OFF_S: Final = 8.0
 _AT_ONCE: Final = 8  # requests
 
 
-class Copy:
-    """Copy of one archive; call `settle` from one thread and `follow` from another.
+class BucketReplica:
+    """Copy of one archive; call `upload_segments` from one thread and `sync` from another.
 
     Args:
         root: of the archive.
@@ -57,13 +57,13 @@ class Copy:
         OSError: the journal cannot be read or written.
 
     Attributes:
-        failures: requests of `settle` that failed.
+        failures: requests of `upload_segments` that failed.
     """
 
     def __init__(self, root: Path, url: str, options: Mapping[str, str]) -> None:
         self._root, self._url = root, url
         self._quick, self._slow = ObjectBucket(url, options, QUICK_S), ObjectBucket(url, options, SLOW_S)
-        self._copied = Copied(root, url)
+        self._copied = UploadJournal(root, url)
         self._following = Lock()
         self._pool = ThreadPoolExecutor(_AT_ONCE, "copy")
         self.failures, self._in_a_row, self._not_before, self._error = 0, 0, 0.0, ""
@@ -77,7 +77,7 @@ class Copy:
         self._pool.shutdown(cancel_futures=True)
         self._copied.close()
 
-    def under(self, may: Callable[[], bool], alone: Callable[[], None]) -> None:
+    def attach_lease(self, may: Callable[[], bool], alone: Callable[[], None]) -> None:
         """Work under a lease from now on.
 
         Args:
@@ -143,9 +143,9 @@ class Copy:
         Raises:
             CopyError: the bucket cannot be listed.
         """
-        return max(newest(self._slow.sizes()), newest(self._files(FOLDERS)))
+        return max(largest_epoch(self._slow.sizes()), largest_epoch(self._files(FOLDERS)))
 
-    def get_ahead(self) -> None:
+    def prefetch(self) -> None:
         """Download for a standby, in advance, what a later `join` would, while another service owns the bucket.
 
         Raises:
@@ -175,7 +175,7 @@ class Copy:
         for name, stamp in self._files(FOLDERS).items():
             if there.get(name) != stamp.size:
                 (self._root / name).unlink()
-        for name in self._copied.all():
+        for name in self._copied.stamps():
             if not (self._root / name).exists():
                 self._copied.remove(name)
         return self._fetch(there)
@@ -185,7 +185,7 @@ class Copy:
         fence = fence_of(self._slow)
         return {name: size for name, size in there.items() if fence.passes(name)}
 
-    def settle(self, segments: Iterable[Path]) -> None:
+    def upload_segments(self, segments: Iterable[Path]) -> None:
         """Upload written segments and the keys; all are in the bucket when this returns.
 
         Raises:
@@ -196,9 +196,9 @@ class Copy:
         if time.monotonic() < self._not_before:
             raise CopyError(f"is tried again: {self._error}")
         try:
-            missing = [path for path in segments if self._copied.of(self._name(path)) is None]
+            missing = [path for path in segments if self._copied.stamp(self._name(path)) is None]
             own = self._files(("keys",))
-            keys = [self._root / name for name, stamp in own.items() if self._copied.of(name) != stamp]
+            keys = [self._root / name for name, stamp in own.items() if self._copied.stamp(name) != stamp]
             self._put_soon([*keys, *missing])
         except CopyError as error:
             self.failures += 1
@@ -208,9 +208,10 @@ class Copy:
             raise
         self._in_a_row, self._since = 0, None
 
-    def follow(self) -> int:
-        """Upload new and rewritten files, then delete removed ones; return the number of changed objects. Only `settle`
-        uploads the log.
+    def sync(self) -> int:
+        """Upload new and rewritten files, then delete removed ones; return the number of changed objects.
+
+        Only `upload_segments` uploads the log.
 
         Raises:
             CopyError: the work is incomplete; the next call continues.
@@ -239,7 +240,7 @@ class Copy:
         if not self._following.acquire(timeout=QUICK_S):
             raise CopyError("compacted files are being put")
         try:
-            known = self._copied.all()  # before the files: what comes meanwhile is not taken for gone
+            known = self._copied.stamps()  # before the files: what comes meanwhile is not taken for gone
             local = self._files(FOLDERS)
             new = [
                 name for name, stamp in local.items()
@@ -271,7 +272,7 @@ class Copy:
 
     def _put(self, path: Path, bucket: ObjectBucket) -> None:
         name, stamp = self._name(path), stamp_of(path)
-        if self._copied.of(name) is None and (name.startswith(LOG) or name.endswith(".key")):
+        if self._copied.stamp(name) is None and (name.startswith(LOG) or name.endswith(".key")):
             self._put_new(name, path.read_bytes(), bucket)
         elif name.startswith(KEYS):
             bucket.put(name, path.read_bytes())  # who the vehicles are grows meanwhile, and is then put again
@@ -306,10 +307,10 @@ class Copy:
     def _fetch(self, there: Mapping[str, int]) -> int:
         """Download what only the bucket has, and record which files of the folder it lacks."""
         local = self._files(FOLDERS)
-        for name in self._copied.all():
+        for name in self._copied.stamps():
             if name not in there or (name in local and local[name].size != there[name]):
                 self._copied.remove(name)
-        known = self._copied.all()
+        known = self._copied.stamps()
         whole = {name.rpartition("/")[0] for name in there if name.endswith(f"/{_LAST}")}
         wanted = [
             name for name in there
@@ -328,7 +329,7 @@ class Copy:
     def _get(self, name: str) -> None:
         path, secret = self._root / name, name.startswith(KEYS)
         path.parent.mkdir(mode=0o700 if secret else 0o777, parents=True, exist_ok=True)
-        with written(path, 0o600 if secret else None, named=False) as file:
+        with open_durably(path, 0o600 if secret else None, named=False) as file:
             for part in self._slow.parts(name):
                 file.write(part)
 
@@ -358,16 +359,16 @@ def _ours(name: str) -> bool:
     return folder in FOLDERS and bool(rest) and not hidden and not name.endswith(BAD) and rest[-1] not in _PRIVATE
 
 
-def copy_for(config: ServiceConfig, root: Path) -> Copy | None:
+def open_replica(config: ServiceConfig, root: Path) -> BucketReplica | None:
     """Return the copy of the settings, synchronised with the folder; None without one.
 
     Raises:
-        InputError, OSError: as for `Copy` and its `begin`.
+        InputError, OSError: as for `BucketReplica` and its `begin`.
     """
     wanted = config.archive
     if wanted.second is None:
         return None
-    copy = Copy(root, wanted.second, wanted.options)
+    copy = BucketReplica(root, wanted.second, wanted.options)
     try:
         copy.begin(config.name)
     except BaseException:

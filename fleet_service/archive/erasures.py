@@ -59,7 +59,7 @@ def span_of(month: str) -> Span:
     return Span((first - _EPOCH).days * DAY_NS, (following - _EPOCH).days * DAY_NS)
 
 
-def note(folder: Path, month: str, newest: int, pseudonym: str | None = None) -> None:
+def record_erasure(folder: Path, month: str, newest: int, pseudonym: str | None = None) -> None:
     """Refuse from now on measurements of a month, or of one vehicle in it, up to `newest` [ns], the newest in the
     archive. The record is durable when this returns.
 
@@ -79,14 +79,14 @@ def note(folder: Path, month: str, newest: int, pseudonym: str | None = None) ->
     sync_directory(folder)
 
 
-class Erased(NamedTuple):
+class ErasedData(NamedTuple):
     """Erased data: spans for all vehicles, and the end [ns] per pseudonym number."""
 
     months: list[Span]
     vehicles: dict[int, int]
 
 
-def read(folder: Path) -> Erased:
+def read(folder: Path) -> ErasedData:
     """Return the erased data recorded in the folder of the keys."""
     months, vehicles = list[Span](), dict[int, int]()
     for path in sorted(folder.glob("*.erased")):
@@ -97,10 +97,10 @@ def read(folder: Path) -> Erased:
             months.append(Span(span_of(month).begin, until))
         else:
             vehicles[number(pseudonym)] = max(until, vehicles.get(number(pseudonym), 0))
-    return Erased(months, vehicles)
+    return ErasedData(months, vehicles)
 
 
-def within(spans: Sequence[Span], time: IntArray) -> BoolArray:
+def in_spans(spans: Sequence[Span], time: IntArray) -> BoolArray:
     """Return which times (n,) [ns] lie in one of the spans."""
     out = np.zeros(len(time), bool)
     for begin, until in spans:

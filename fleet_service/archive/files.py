@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 from fleet_service.archive import version
 from schemas import tables
 from schemas.errors import InputError
-from schemas.runtime.durable import sync_directory, written
+from schemas.runtime.durable import open_durably, sync_directory
 
 ROW_GROUP: Final = 128 * 1024  # rows: 5 MB, which is what a query reads at the least
 
@@ -80,7 +80,7 @@ def write_table(
         "column_encoding": {name: "DELTA_BINARY_PACKED" for name in encoding.delta if name in names},
         "write_statistics": encoding.index, "write_page_index": encoding.index, "write_page_checksum": True,
     }  # fmt: skip
-    with written(path, named=named) as file, pq.ParquetWriter(file, table.schema, **options) as writer:
+    with open_durably(path, named=named) as file, pq.ParquetWriter(file, table.schema, **options) as writer:
         writer.write_table(table, ROW_GROUP)
         writer.add_key_value_metadata(version.footer(table.schema, footer))
 
@@ -105,7 +105,7 @@ def sync_tree(root: Path, folders: Iterable[Path]) -> None:
         sync_directory(folder)
 
 
-def lock(root: Path) -> BinaryIO:
+def lock_archive(root: Path) -> BinaryIO:
     """Lock the archive for this process; the lock is released when the file is closed or the process ends.
 
     Raises:
@@ -115,19 +115,19 @@ def lock(root: Path) -> BinaryIO:
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise _unusable(root, error) from error
-    return exclusive(root / "lock", f"{root} belongs to a running service", "stop it, or give another folder")
+    return lock_file(root / "lock", f"{root} belongs to a running service", "stop it, or give another folder")
 
 
-def held(root: Path) -> bool:
+def is_served(root: Path) -> bool:
     """Return True if a service runs on an archive."""
     try:
-        lock(root).close()
+        lock_archive(root).close()
     except InputError:
         return True
     return False
 
 
-def exclusive(path: Path, problem: str, fix: str) -> BinaryIO:
+def lock_file(path: Path, problem: str, fix: str) -> BinaryIO:
     """Lock a file for as long as the handle is open.
 
     Raises:

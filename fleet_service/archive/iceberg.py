@@ -1,7 +1,7 @@
 """Iceberg tables of the compacted files: registered without copying; the inbox is never registered.
 
 There is one registrar per table. Before retention and erasure remove or rewrite files, these files leave the tables
-(`let_go`), because a table that names a missing file cannot be read.
+(`unregister`), because a table that names a missing file cannot be read.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from typing import Any, Final, NamedTuple, TypeAlias
 import pyarrow as pa
 
 from fleet_service.archive import layout
-from fleet_service.archive.compaction import compacting
+from fleet_service.archive.compaction import hold_compaction_lock
 from fleet_service.archive.segments import SCHEMAS
 from schemas.errors import InputError
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 from schemas.wire import Kind
 
 Catalog: TypeAlias = Any  # of pyiceberg, which an archive without tables does not need
@@ -48,7 +48,7 @@ class Place(NamedTuple):
     at: str
 
 
-class Registered(NamedTuple):
+class RegistrationResult(NamedTuple):
     """Result: files added to the tables, files removed from them, and rows of the archive in them."""
 
     added: int
@@ -56,7 +56,7 @@ class Registered(NamedTuple):
     rows: int
 
 
-def register(root: Path, place: Place) -> Registered:
+def register(root: Path, place: Place) -> RegistrationResult:
     """Register the compacted files of an archive in the tables; a repeated call changes nothing.
 
     Files of other archives in the same tables stay.
@@ -65,19 +65,19 @@ def register(root: Path, place: Place) -> Registered:
         InputError: pyiceberg is not installed, the catalogue refuses, or a file cannot be read at `place.at`.
         OSError: the archive cannot be read or written.
     """
-    total = Registered(0, 0, 0)
-    with compacting(root):  # nobody removes or rewrites files meanwhile
+    total = RegistrationResult(0, 0, 0)
+    with hold_compaction_lock(root):  # nobody removes or rewrites files meanwhile
         _remember(root, place)
         with _said(place):
             catalog = _catalog(place)
             catalog.create_namespace_if_not_exists(place.namespace)
             for kind in Kind:
                 done = _brought_up(_table(catalog, place, kind), root, place, kind)
-                total = Registered(*map(sum, zip(total, done, strict=True)))
+                total = RegistrationResult(*map(sum, zip(total, done, strict=True)))
     return total
 
 
-def let_go(root: Path, paths: Sequence[Path]) -> None:
+def unregister(root: Path, paths: Sequence[Path]) -> None:
     """Remove files from the tables before they are removed or rewritten on disk.
 
     Raises:
@@ -121,7 +121,7 @@ def _remember(root: Path, place: Place) -> None:
         problem = f"this archive is registered at {before.catalog}, namespace {before.namespace}, files at {before.at}"
         raise InputError("catalog", problem, f"give these; or drop those tables, then remove {path}")
     if before is None:
-        with written(path) as file:
+        with open_durably(path) as file:
             file.write(json.dumps(place._asdict()).encode())
 
 
@@ -160,16 +160,16 @@ def _plain(schema: pa.Schema) -> pa.Schema:
     return pa.schema([field.with_nullable(True).remove_metadata() for field in schema])
 
 
-def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> Registered:
+def _brought_up(table: Table, root: Path, place: Place, kind: Kind) -> RegistrationResult:
     """Remove missing and changed files from a table and add new ones, in one commit."""
-    there = {_name(root, place, path): path for path in layout.compacted(root, kind)}
+    there = {_name(root, place, path): path for path in layout.compacted_files(root, kind)}
     mine = {name: file for name, file in _held(table).items() if name.startswith(_folder(place))}
     # one that was rewritten elsewhere is known by its size
     stale = [n for n, file in mine.items() if n not in there or there[n].stat().st_size != file.file_size_in_bytes]
     missing = sorted((there.keys() - mine.keys()) | (there.keys() & set(stale)))
     _commit(table, [mine[name] for name in stale], missing)
     now = _held(table.refresh())
-    return Registered(len(missing), len(stale), sum(f.record_count for n, f in now.items() if n in there))
+    return RegistrationResult(len(missing), len(stale), sum(f.record_count for n, f in now.items() if n in there))
 
 
 def _commit(table: Table, removed: list[Any], added: list[str]) -> None:

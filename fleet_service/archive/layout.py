@@ -66,7 +66,7 @@ class Partition(NamedTuple):
 MARKS: Final = ("inbox", "observations", "states", "keys", "rollup", "map")
 
 
-def insist_on_archive(root: Path) -> None:
+def require_archive(root: Path) -> None:
     """Raise unless a folder is an archive, because compaction would write into it.
 
     Raises:
@@ -98,7 +98,9 @@ def partition_of(path: Path) -> Partition:
     return Partition(day_of(path.parents[1]), grid.from_quadkey(path.parent.name.removeprefix("zone=q")))
 
 
-def compacted(root: Path, kind: Kind, since_day: int | None = None, until_day: int | None = None) -> Iterator[Path]:
+def compacted_files(
+    root: Path, kind: Kind, since_day: int | None = None, until_day: int | None = None
+) -> Iterator[Path]:
     """Yield the compacted files of a kind by date, zone and age; both days are included."""
     for folder in days(root, TABLES[kind], since_day, until_day):
         yield from sorted(folder.glob("zone=*/*.parquet"))
@@ -125,7 +127,7 @@ def with_term(name: str, term: int) -> str:
     return f"{_TERM.sub('', name)}.{term:010d}" if term else name
 
 
-def signed(name: str, term: int) -> str:
+def compacted_name(name: str, term: int) -> str:
     """Return the name of a compacted file from its newest segment and the term of the compacting service; 0 without
     terms."""
     shard, epoch, number = name.rsplit("-", 2)

@@ -17,9 +17,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_service.archive.between import Where, groups, those
+from fleet_service.archive.between import Where, filter_table, matching_row_groups
 from fleet_service.archive.segments import is_value
-from fleet_service.archive.version import DamagedError, Version, entries_of, judge, newer
+from fleet_service.archive.version import DamagedError, Version, entries_of, is_newer, judge
 from schemas import tables
 from schemas.errors import InputError
 
@@ -37,7 +37,7 @@ NEEDED: Final = frozenset(
 Damaged = Callable[[Path, str], None]
 
 
-def pass_over(path: Path, problem: str) -> None:
+def skip_damaged(path: Path, problem: str) -> None:
     """Leave a damaged file in place and log a warning; for readers."""
     log.warning("%s is damaged and passed over: %s", path, problem)
 
@@ -69,7 +69,7 @@ def load(
     where: Where | None = None,
     *,
     whole: bool = False,
-    damaged: Damaged = pass_over,
+    damaged: Damaged = skip_damaged,
 ) -> pa.Table | None:
     """Return the rows of one file; None if it is damaged.
 
@@ -97,8 +97,8 @@ def load(
     found = _content(path, read, damaged)
     if found is None:
         return None
-    table = conformed(found.table, schema if whole else known)
-    return (table if where is None else those(table, where)).select(known.names)
+    table = conform_columns(found.table, schema if whole else known)
+    return (table if where is None else filter_table(table, where)).select(known.names)
 
 
 def load_groups(
@@ -107,7 +107,7 @@ def load_groups(
     columns: Sequence[str],
     where: Where,
     take: Callable[[pa.Table], None],
-    damaged: Damaged = pass_over,
+    damaged: Damaged = skip_damaged,
 ) -> bool:
     """Read a file like `load`, passing the rows to `take` one row group at a time.
 
@@ -123,10 +123,10 @@ def load_groups(
         names = [name for name in columns if name in file.schema_arrow.names]
         own = [one for one in where if one.column in names]
         looked = list({one.column: None for one in own})
-        for group in groups(file.metadata, where):
-            if own and not any(those(part, own).num_rows for part in _batches(file, group, looked)):
+        for group in matching_row_groups(file.metadata, where):
+            if own and not any(filter_table(part, own).num_rows for part in _batches(file, group, looked)):
                 continue
-            parts = [those(conformed(part, known), where) for part in _batches(file, group, names)]
+            parts = [filter_table(conform_columns(part, known), where) for part in _batches(file, group, names)]
             if parts:  # none, of a file whose only vehicle was forgotten
                 take(pa.concat_tables(parts))
         return file.schema_arrow.empty_table().select(names)
@@ -145,11 +145,13 @@ def _some(file: pq.ParquetFile, names: list[str] | None, where: Where) -> pa.Tab
     """Return the row groups that may match, one after the other, filtered."""
     own = file.schema_arrow
     known = [one for one in where if one.column in own.names]
-    parts = [those(file.read_row_group(group, names), known) for group in groups(file.metadata, where)]
+    parts = [
+        filter_table(file.read_row_group(group, names), known) for group in matching_row_groups(file.metadata, where)
+    ]
     return pa.concat_tables(parts) if parts else own.empty_table().select(own.names if names is None else names)
 
 
-def content(path: Path, damaged: Damaged = pass_over) -> Content | None:
+def content(path: Path, damaged: Damaged = skip_damaged) -> Content | None:
     """Return everything in a file, unknown columns included; None if it is damaged.
 
     Raises:
@@ -164,7 +166,7 @@ def _content(
     try:
         with pq.ParquetFile(path, page_checksum_verification=True, buffer_size=buffer_bytes) as file:
             entries = entries_of(file.metadata.metadata)
-            if newer(entries):  # before it is read: it may be written in a way that is not known here
+            if is_newer(entries):  # before it is read: it may be written in a way that is not known here
                 judge(path, file.schema_arrow, entries)
             table = read(file)
             whole = table.num_columns == file.metadata.num_columns  # then its schema is at hand, in a third of the time
@@ -180,7 +182,7 @@ def _content(
         return None
 
 
-def conformed(table: pa.Table, schema: pa.Schema) -> pa.Table:
+def conform_columns(table: pa.Table, schema: pa.Schema) -> pa.Table:
     """Return the columns of `schema`: null if the table has none, cast if the type differs.
 
     Raises:

@@ -14,7 +14,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from fleet_service.archive.copies import Copy
+from fleet_service.archive.copies import BucketReplica
 from fleet_service.archive.layout import Cut
 from fleet_service.archive.segments import Rows, Writer
 from schemas.wire import Kind
@@ -41,7 +41,7 @@ class _Load(Generic[Batch]):
             self.waiting[kind] = self.waiting[kind] + waiting
         self.batches += other.batches
 
-    def write(self, writer: Writer, copy: Copy | None) -> None:
+    def write(self, writer: Writer, copy: BucketReplica | None) -> None:
         """Write each kind that is not written yet, then make all of it durable, in the bucket too."""
         for kind, waiting in self.waiting.items():
             if waiting:
@@ -50,7 +50,7 @@ class _Load(Generic[Batch]):
                 self.waiting[kind] = []
         writer.sync()
         if copy is not None:
-            copy.settle(self.segments)
+            copy.upload_segments(self.segments)
 
 
 class SegmentLog(Generic[Batch]):
@@ -63,7 +63,7 @@ class SegmentLog(Generic[Batch]):
         epoch: smallest epoch, from the lease.
     """
 
-    def __init__(self, root: Path, shard: str, copy: Copy | None = None, epoch: int = 0) -> None:
+    def __init__(self, root: Path, shard: str, copy: BucketReplica | None = None, epoch: int = 0) -> None:
         self._writer, self._copy = Writer(root, shard, epoch), copy
         self._next: _Load[Batch] = _Load()
         self._load: _Load[Batch] = _Load()  # what was handed over

@@ -16,7 +16,7 @@ FOLDERS: Final = (*TABLES.values(), "map", "rollup")
 _CHUNK: Final = 1 << 22
 
 
-def put(root: Path, uri: str, again: Collection[Path] = ()) -> int:
+def copy_new_files(root: Path, uri: str, again: Collection[Path] = ()) -> int:
     """Copy new and rewritten files; return their number.
 
     Files that were retired here stay in the mirror. A file appears under its name when it is complete. Files in `again`

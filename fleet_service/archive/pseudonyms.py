@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.numeric import IntArray
-from schemas.runtime.durable import sync_directory, written
+from schemas.runtime.durable import open_durably, sync_directory
 
 KEY_BYTES: Final = 32
 _DIGEST_BYTES: Final = 8  # 64 bits: a collision among 10⁶ vehicles has probability 3e-8
@@ -85,11 +85,11 @@ class Pseudonyms:
 
     def _key(self, month: str) -> bytes:
         if month not in self._keys:
-            self._keys[month] = kept_key(self.folder / f"{month}.key")
+            self._keys[month] = load_or_create_key(self.folder / f"{month}.key")
         return self._keys[month]
 
 
-def kept_key(path: Path) -> bytes:
+def load_or_create_key(path: Path) -> bytes:
     """Return a key from a file of mode 600; create it if it does not exist.
 
     Raises:
@@ -97,7 +97,7 @@ def kept_key(path: Path) -> bytes:
     """
     if not path.exists():
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with written(path, 0o600) as file:
+        with open_durably(path, 0o600) as file:
             key = secrets.token_bytes(KEY_BYTES)
             file.write(key + _check(key))
         sync_directory(path.parent.parent)  # else power loss forgets the key, and acknowledged batches with it

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from fleet_service.archive import layout, segments
 from fleet_service.archive.between import Where
 from fleet_service.archive.layout import Partition
-from fleet_service.archive.load import Damaged, load, load_groups, pass_over
+from fleet_service.archive.load import Damaged, load, load_groups, skip_damaged
 from fleet_service.archive.version import DamagedError, entries_of, judge
 from schemas import grid
 from schemas.numeric import BoolArray
@@ -55,7 +55,7 @@ def read(
     columns: Sequence[str] | None = None,
     where: Where | None = None,
     days: tuple[int | None, int | None] = (None, None),
-    damaged: Damaged = pass_over,
+    damaged: Damaged = skip_damaged,
 ) -> Iterator[pa.Table]:
     """Yield tables that together hold every row once; damaged files are skipped.
 
@@ -74,7 +74,7 @@ def read(
     yield from read_wanted(root, kind, Wanted(columns, where, days), damaged)
 
 
-def read_wanted(root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = pass_over) -> Iterator[pa.Table]:
+def read_wanted(root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = skip_damaged) -> Iterator[pa.Table]:
     """Yield tables like `read`, for a selection."""
     listing = Listing(root, kind, wanted, damaged)
     yield from listing.inbox()
@@ -91,21 +91,21 @@ class Listing:
         as of `read`.
     """
 
-    def __init__(self, root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = pass_over) -> None:
+    def __init__(self, root: Path, kind: Kind, wanted: Wanted, damaged: Damaged = skip_damaged) -> None:
         self.kind, self._wanted, self._damaged = kind, wanted, damaged
         self._schema = segments.SCHEMAS[kind]
         self._names = list(wanted.columns) if wanted.columns is not None else self._schema.names
         needed = list(dict.fromkeys([*self._names, layout.TIME[kind], "cell"]))
         self._fresh = _inbox(root, kind, wanted._replace(columns=needed), damaged)
-        files = list(layout.compacted(root, kind, *wanted.days))
-        self._done = compacted(files, {path.name for path, _ in self._fresh})
-        self.files = [path for path in near(files, wanted.box) if wanted.newer(path)]
+        files = list(layout.compacted_files(root, kind, *wanted.days))
+        self._done = compacted_partitions(files, {path.name for path, _ in self._fresh})
+        self.files = [path for path in files_near(files, wanted.box) if wanted.newer(path)]
 
     def inbox(self) -> Iterator[pa.Table]:
         """Yield the rows that no compacted file holds; call it once."""
         fresh, self._fresh = self._fresh, []
         for path, table in fresh:
-            yield without(table, self.kind, self._done.get(path.name, set())).select(self._names)
+            yield drop_compacted(table, self.kind, self._done.get(path.name, set())).select(self._names)
 
     def load_groups(self, path: Path, where: Where, take: Callable[[pa.Table], None]) -> bool:
         """Read a file like `load`, one row group at a time; if False, discard the rows taken."""
@@ -124,7 +124,7 @@ class Listing:
             return None
 
 
-def near(files: Sequence[Path], box: tuple[float, float, float, float] | None) -> list[Path]:
+def files_near(files: Sequence[Path], box: tuple[float, float, float, float] | None) -> list[Path]:
     """Return the compacted files of zones that touch a box [deg], or all."""
     if box is None or not files:
         return list(files)
@@ -149,7 +149,7 @@ def _inbox(root: Path, kind: Kind, wanted: Wanted, damaged: Damaged) -> list[tup
     raise OSError(f"the inbox of {root} changes faster than it can be read")
 
 
-def compacted(files: Iterable[Path], names: set[str]) -> dict[str, set[Partition]]:
+def compacted_partitions(files: Iterable[Path], names: set[str]) -> dict[str, set[Partition]]:
     """Return, by segment name, the partitions into which its rows are already compacted.
 
     A file is named by its newest segment, so older files need not be opened.
@@ -165,7 +165,7 @@ def compacted(files: Iterable[Path], names: set[str]) -> dict[str, set[Partition
     return done
 
 
-def without(table: pa.Table, kind: Kind, done: set[Partition]) -> pa.Table:
+def drop_compacted(table: pa.Table, kind: Kind, done: set[Partition]) -> pa.Table:
     """Return the rows that lie in none of the partitions."""
     if not done or not table.num_rows:
         return table

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from schemas import mugrid, tables
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 from schemas.tables import Field
 
 NAME: Final = "README.md"
@@ -76,5 +76,5 @@ def keep(root: Path) -> None:
     path, page = root / NAME, text().encode()
     there = path.read_bytes() if path.exists() else b""  # bytes: power loss may have left any
     if there != page and (not there.strip(b"\0") or there.startswith(_HEAD.splitlines()[0].encode())):
-        with written(path) as file:
+        with open_durably(path) as file:
             file.write(page)

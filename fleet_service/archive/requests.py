@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from schemas.errors import InputError
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 
 FOLDER: Final = "requests"
 _ANSWER: Final = ".answer.json"
@@ -34,7 +34,7 @@ class Erasure:
     vehicle: str | None = None
 
 
-def ask(root: Path, wanted: Erasure) -> Path:
+def write_request(root: Path, wanted: Erasure) -> Path:
     """Write a request; return its file.
 
     Raises:
@@ -43,7 +43,7 @@ def ask(root: Path, wanted: Erasure) -> Path:
     folder = root / FOLDER
     folder.mkdir(mode=0o700, exist_ok=True)
     path = folder / f"{time.time_ns()}-{secrets.token_hex(4)}.json"
-    with written(path, _SECRET) as file:
+    with open_durably(path, _SECRET) as file:
         file.write(json.dumps(asdict(wanted)).encode())
     owner = root.stat()
     for place in (folder, path):
@@ -69,7 +69,7 @@ def answer_to(question: Path) -> dict[str, Any] | None:
     return answer
 
 
-def waiting(root: Path) -> list[Path]:
+def open_requests(root: Path) -> list[Path]:
     """Return the requests without an answer, oldest first; remove answers that were not collected for a day."""
     for path in (root / FOLDER).glob(f"*{_ANSWER}"):
         if time.time() - path.stat().st_mtime > _KEPT_S:
@@ -98,7 +98,7 @@ def settle(question: Path, outcome: dict[str, Any] | InputError) -> None:
     """
     if isinstance(outcome, InputError):
         outcome = {"error": [outcome.field, outcome.problem, outcome.fix]}
-    with written(_answer_of(question), _SECRET) as file:
+    with open_durably(_answer_of(question), _SECRET) as file:
         file.write(json.dumps(outcome).encode())
     question.unlink()
 

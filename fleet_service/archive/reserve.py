@@ -13,7 +13,7 @@ NAME: Final = "reserve"
 _LEAST_FREE: Final = 4 * SIZE
 
 
-def keep(root: Path) -> None:
+def allocate(root: Path) -> None:
     """Allocate the reserve if there is plenty of room."""
     path = root / NAME
     with suppress(OSError):
@@ -22,7 +22,7 @@ def keep(root: Path) -> None:
                 os.posix_fallocate(file.fileno(), 0, SIZE)
 
 
-def give(root: Path) -> bool:
+def release(root: Path) -> bool:
     """Release the reserve if the disk is full; return True if it was released."""
     path = root / NAME
     if not path.exists() or shutil.disk_usage(root).free > SIZE:

@@ -18,9 +18,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_service.archive import erasures, iceberg, layout, reading, rollup, snapshots, witnesses
-from fleet_service.archive.between import Between, Where
-from fleet_service.archive.compaction import compact, compacting
-from fleet_service.archive.files import COMPACTED, MAP, lock, put_in_place
+from fleet_service.archive.between import ValueRange, Where
+from fleet_service.archive.compaction import compact, hold_compaction_lock
+from fleet_service.archive.files import COMPACTED, MAP, lock_archive, put_in_place
 from fleet_service.archive.layout import TABLES
 from fleet_service.archive.load import BAD, content, load
 from fleet_service.archive.pseudonyms import Pseudonyms, number
@@ -36,14 +36,14 @@ ANONYMOUS: Final = 5  # vehicles of a cell, as the settings that are shipped as 
 _KEYS: Final = "keys"
 
 
-class Retired(NamedTuple):
+class RetirementResult(NamedTuple):
     """Result: days whose raw rows were removed, and files."""
 
     days: int
     files: int
 
 
-def retire(root: Path, raw_days: int, today: date) -> Retired:
+def retire_rows(root: Path, raw_days: int, today: date) -> RetirementResult:
     """Remove rows measured more than `raw_days` before `today`, after their roll-ups are safe.
 
     Raises:
@@ -51,10 +51,10 @@ def retire(root: Path, raw_days: int, today: date) -> Retired:
         OSError: a file cannot be read, written or removed.
     """
     files = 0
-    with compacting(root):
+    with hold_compaction_lock(root):
         rollup.complete(root, until_day=_last_to_go(raw_days, today))
-        folders = due(root, raw_days, today)
-        iceberg.let_go(root, [path for folder in folders for path in folder.glob("*/*")])
+        folders = due_folders(root, raw_days, today)
+        iceberg.unregister(root, [path for folder in folders for path in folder.glob("*/*")])
         for folder in folders:
             for path in sorted(folder.glob("*/*"), reverse=True):
                 path.unlink()
@@ -63,11 +63,11 @@ def retire(root: Path, raw_days: int, today: date) -> Retired:
                 zone.rmdir()
             folder.rmdir()
             sync_directory(folder.parent)
-    return Retired(len(folders), files)
+    return RetirementResult(len(folders), files)
 
 
-def due(root: Path, raw_days: int, today: date) -> list[Path]:
-    """Return the folders of days whose raw rows `retire` removes.
+def due_folders(root: Path, raw_days: int, today: date) -> list[Path]:
+    """Return the folders of days whose raw rows `retire_rows` removes.
 
     Raises:
         InputError: too few days.
@@ -89,7 +89,7 @@ def forget_period(root: Path, month: str) -> None:
         InputError: there is no such key, or a service runs on the archive.
         OSError: a file cannot be read or written.
     """
-    with lock(root):
+    with lock_archive(root):
         key_of(root, month)
         begin, until = erasures.span_of(month)
         destroy_key(root, month, _newest(root, (begin // layout.DAY_NS, None), until=until))
@@ -104,7 +104,7 @@ def destroy_key(root: Path, month: str, newest: int) -> None:
         OSError: the disk is full or broken; the key may still exist.
     """
     key = key_of(root, month)
-    erasures.note(key.parent, month, newest)
+    erasures.record_erasure(key.parent, month, newest)
     witnesses.forget(key.parent, month)
     key.unlink()
     sync_directory(key.parent)
@@ -122,7 +122,7 @@ def _newest(root: Path, days: tuple[int, int | None], where: Where = (), until: 
     return newest
 
 
-class Forgotten(NamedTuple):
+class ErasureResult(NamedTuple):
     """Result of forgetting a vehicle: rows removed, files rewritten or removed."""
 
     rows: int
@@ -130,7 +130,7 @@ class Forgotten(NamedTuple):
     kept: str | None = None  # why the archive's copy holds it still
 
 
-def forget_vehicle(root: Path, vehicle: str, month: str) -> Forgotten:
+def forget_vehicle(root: Path, vehicle: str, month: str) -> ErasureResult:
     """Remove the rows of one vehicle in one month, and everything derived that could reveal them.
 
     That is lines of few vehicles in the month's snapshots, files set aside, and checkpoints. Roll-ups are computed
@@ -140,15 +140,15 @@ def forget_vehicle(root: Path, vehicle: str, month: str) -> Forgotten:
         InputError: the month's key does not exist, or a service runs on the archive (it has more in memory).
         OSError: a file cannot be read or written.
     """
-    with lock(root):
-        with erased(root, vehicle, month) as done:
+    with lock_archive(root):
+        with erase_files(root, vehicle, month) as done:
             pass
         forget_witness(root, vehicle, month)
     return done
 
 
 @contextmanager
-def erased(root: Path, vehicle: str, month: str) -> Iterator[Forgotten]:
+def erase_files(root: Path, vehicle: str, month: str) -> Iterator[ErasureResult]:
     """Do the file part of `forget_vehicle` while a service may write to the log; of new rows it removes only those that
     exist at the begin. Nothing is compacted before the block ends.
 
@@ -159,23 +159,23 @@ def erased(root: Path, vehicle: str, month: str) -> Iterator[Forgotten]:
     compact(root)
     begin, end = _days(month)
     pseudonym = _pseudonym(root, vehicle, month)
-    if (newest := _newest(root, (begin, end), [Between("vehicle", pseudonym, pseudonym)])) >= 0:
-        erasures.note(root / _KEYS, month, newest, pseudonym)
+    if (newest := _newest(root, (begin, end), [ValueRange("vehicle", pseudonym, pseudonym)])) >= 0:
+        erasures.record_erasure(root / _KEYS, month, newest, pseudonym)
     rows, files, cells = 0, [*root.rglob(f"*{BAD}")], set[int]()
-    with compacting(root):
+    with hold_compaction_lock(root):
         drop_checkpoints(root)  # what it reported is in them
         for damaged in files:  # nobody can tell what is in them
             damaged.unlink()
         for kind in Kind:
-            theirs = [path for path in layout.compacted(root, kind, begin, end) if _names(kind, path, pseudonym)]
-            iceberg.let_go(root, theirs)
+            theirs = [path for path in layout.compacted_files(root, kind, begin, end) if _names(kind, path, pseudonym)]
+            iceberg.unregister(root, theirs)
             for path in theirs:
                 if len(removed := _without(root, kind, path, pseudonym)):
                     rows, cells = rows + len(removed), cells.union(removed)
                     files += [path, rollup.part_of(path)] if kind is Kind.OBSERVATION else [path]
         for folder in layout.days(root, snapshots.TABLE, begin, end):
-            files += [path for path in sorted(folder.glob("*.parquet")) if _thinned(root, path, cells)]
-        yield Forgotten(rows, tuple(files))
+            files += [path for path in sorted(folder.glob("*.parquet")) if _thin_snapshot(root, path, cells)]
+        yield ErasureResult(rows, tuple(files))
 
 
 def forget_witness(root: Path, vehicle: str, month: str) -> None:
@@ -191,9 +191,9 @@ def _pseudonym(root: Path, vehicle: str, month: str) -> str:
     return Pseudonyms(root / _KEYS).of(vehicle, erasures.span_of(month).begin)
 
 
-def _thinned(root: Path, path: Path, cells: set[int]) -> bool:
+def _thin_snapshot(root: Path, path: Path, cells: set[int]) -> bool:
     """Remove lines of these cells with fewer than ANONYMOUS vehicles from a snapshot; return True if there were any."""
-    found = content(path, _unread)
+    found = content(path, _refuse_damaged)
     if found is None or not cells:
         return False
     lines = np.isin(found.table["cell"].to_numpy(), sorted(cells)) & (found.table["vehicles"].to_numpy() < ANONYMOUS)
@@ -213,7 +213,7 @@ def rows_of_vehicle(root: Path, vehicle: str, month: str) -> int:
     """
     key_of(root, month)
     pseudonym = _pseudonym(root, vehicle, month)
-    where = [Between("vehicle", pseudonym, pseudonym)]
+    where = [ValueRange("vehicle", pseudonym, pseudonym)]
     return sum(table.num_rows for kind in Kind for table in reading.read(root, kind, ["vehicle"], where, _days(month)))
 
 
@@ -230,13 +230,13 @@ def drop_checkpoints(root: Path) -> None:
 
 def _names(kind: Kind, path: Path, pseudonym: str) -> bool:
     """Return True if a file may hold rows of a vehicle."""
-    found = load(path, SCHEMAS[kind], ["vehicle"], damaged=_unread)
+    found = load(path, SCHEMAS[kind], ["vehicle"], damaged=_refuse_damaged)
     return found is not None and pseudonym in pc.unique(found["vehicle"]).to_pylist()
 
 
 def _without(root: Path, kind: Kind, path: Path, pseudonym: str) -> list[int]:
     """Remove the rows of a vehicle from a file; return their cells."""
-    found = content(path, _unread)
+    found = content(path, _refuse_damaged)
     if found is None or pseudonym not in pc.unique(found.table["vehicle"]).to_pylist():
         return []
     theirs = pc.equal(found.table["vehicle"], pa.scalar(pseudonym))
@@ -244,11 +244,11 @@ def _without(root: Path, kind: Kind, path: Path, pseudonym: str) -> list[int]:
         root, found.table.filter(pc.invert(theirs)), path, COMPACTED, {KEY: str(found.version), **found.entries}
     )
     if kind is Kind.OBSERVATION:
-        rollup.make(root, path)
+        rollup.make_part(root, path)
     return [int(cell) for cell in found.table["cell"].filter(theirs).to_numpy()]
 
 
-def _unread(path: Path, problem: str) -> None:
+def _refuse_damaged(path: Path, problem: str) -> None:
     """Raise for a damaged file, because it may hold rows to be forgotten."""
     raise InputError("archive", f"{path} is damaged ({problem})", "remove it or bring it back, then forget again")
 

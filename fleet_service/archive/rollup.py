@@ -46,35 +46,37 @@ def complete(root: Path, until_day: int | None = None) -> int:
         OSError: one cannot be read or written.
     """
     missing = [
-        path for path in layout.compacted(root, Kind.OBSERVATION, until_day=until_day) if not part_of(path).exists()
+        path
+        for path in layout.compacted_files(root, Kind.OBSERVATION, until_day=until_day)
+        if not part_of(path).exists()
     ]
     for path in missing:
-        make(root, path)
+        make_part(root, path)
     return len(missing)
 
 
-def make(root: Path, path: Path) -> None:
+def make_part(root: Path, path: Path) -> None:
     """Compute the part of one compacted file; replace an existing one.
 
     Raises:
         OSError: it cannot be read or written.
     """
-    table = computed(path, set_aside)
+    table = compute_part(path, set_aside)
     if table is not None:
         put_in_place(root, table, part_of(path), ROLLUP)
 
 
-def computed(path: Path, damaged: Damaged) -> pa.Table | None:
+def compute_part(path: Path, damaged: Damaged) -> pa.Table | None:
     """Return the part of one compacted file; None if it is damaged (then `damaged` is called).
 
     Raises:
         OSError: it cannot be read.
     """
     table = load(path, tables.OBSERVATION_ARCHIVE, _COLUMNS, damaged=damaged)
-    return None if table is None else rolled_up(table)
+    return None if table is None else roll_up(table)
 
 
-def rolled_up(table: pa.Table) -> pa.Table:
+def roll_up(table: pa.Table) -> pa.Table:
     """Return rows of observations as statistics per cell, sector and hour, sorted by them."""
     rows = segments.rows_of(table)
     hour = rows["leave_time"] // HOUR_NS

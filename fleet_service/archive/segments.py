@@ -65,7 +65,7 @@ class Writer:
             sync_directory(parent)
         self._unsynced: set[Path] = set()
         # Compacted rows are known by the names of their segments, so that these may not be used again either.
-        named = [path for kind in SCHEMAS for path in (*paths(root, kind), *layout.compacted(root, kind))]
+        named = [path for kind in SCHEMAS for path in (*paths(root, kind), *layout.compacted_files(root, kind))]
         used = [layout.age(path.name)[0] for path in named]
         self._epoch = max([epoch or int(time.time()), *(one + 1 for one in used)])
 
@@ -99,7 +99,7 @@ class Writer:
             self._unsynced.discard(inbox)
 
 
-def stepped(rows: Rows) -> Rows:
+def round_to_steps(rows: Rows) -> Rows:
     """Return rows with floats at multiples of their column's step and times in microseconds: the fusion uses what is
     stored."""
     out = {name: np.rint(c / _STEPS[name]) * _STEPS[name] if name in _STEPS else c for name, c in rows.items()}

@@ -20,7 +20,7 @@ from typing import Final, NamedTuple
 
 from fleet_service.archive import layout
 from fleet_service.archive.bucket import ObjectBucket
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 
 FOLDER: Final = "fence"
 NAME: Final = "term"
@@ -69,23 +69,23 @@ def fence_of(bucket: ObjectBucket) -> Fence:
     return Fence(int(document["epoch"]), frozenset(document["names"]))
 
 
-def newest(names: Iterable[str]) -> int:
+def largest_epoch(names: Iterable[str]) -> int:
     """Return the largest epoch in names, or 0."""
     return max((layout.term_of(name) or 0 for name in names), default=0)
 
 
-def of(root: Path) -> int:
+def read_epoch(root: Path) -> int:
     """Return the epoch of the service that has a folder; 0 without terms."""
     with suppress(OSError, ValueError):
         return int((root / NAME).read_text())
     return 0
 
 
-def note(root: Path, epoch: int) -> None:
+def write_epoch(root: Path, epoch: int) -> None:
     """Write this epoch into the names of files compacted from now on.
 
     Raises:
         OSError: it cannot be written.
     """
-    with written(root / NAME) as file:
+    with open_durably(root / NAME) as file:
         file.write(f"{epoch}\n".encode())

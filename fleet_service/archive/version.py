@@ -66,7 +66,7 @@ def entries_of(metadata: Mapping[bytes, bytes] | None) -> dict[str, str]:
     }
 
 
-def newer(entries: Mapping[str, str]) -> bool:
+def is_newer(entries: Mapping[str, str]) -> bool:
     """Return True if a file states a newer major version; a quick check, `judge` decides."""
     return entries.get(KEY, "0").partition(".")[0] > str(VERSION.major)
 
@@ -85,7 +85,7 @@ def judge(path: Path, schema: pa.Schema, entries: Mapping[str, str]) -> Version:
     others = {key: value for key, value in entries.items() if key != DIGEST}
     if entries.get(DIGEST) != digest(schema, others):
         raise DamagedError("columns are not those that were written")
-    found = parsed(entries[KEY])
+    found = parse_version(entries[KEY])
     if found.major > VERSION.major:
         raise InputError(
             "archive", f"{path} is of version {found}, and this GripMap reads {VERSION.major}.x", "use a newer GripMap"
@@ -93,7 +93,7 @@ def judge(path: Path, schema: pa.Schema, entries: Mapping[str, str]) -> Version:
     return found
 
 
-def parsed(text: str) -> Version:
+def parse_version(text: str) -> Version:
     """Return a version from its text."""
     major, minor = text.split(".")
     return Version(int(major), int(minor))

@@ -24,9 +24,9 @@ from typing import Final
 import numpy as np
 
 from fleet_service.archive import layout, terms
-from fleet_service.archive.pseudonyms import kept_key
+from fleet_service.archive.pseudonyms import load_or_create_key
 from schemas.numeric import IntArray
-from schemas.runtime.durable import sync_directory, written
+from schemas.runtime.durable import open_durably, sync_directory
 
 ENDING: Final = ".witnesses"
 _KEY: Final = "witness.key"
@@ -35,7 +35,7 @@ _SECRET: Final = 0o600
 _MONTH: Final = re.compile(r"(\d{4}-\d{2})(\.\d{10})?")
 
 
-class Witnesses:
+class VehicleIds:
     """Numbers of vehicles.
 
     Args:
@@ -43,19 +43,19 @@ class Witnesses:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder, self._term = folder, terms.of(folder.parent)
+        self._folder, self._term = folder, terms.read_epoch(folder.parent)
         self._key: bytes | None = None
         self._known: set[int] | None = None
         self._unsynced: set[Path] = set()
 
-    def of(self, vehicle: str, month: str, pseudonym: int) -> int:
+    def id_of(self, vehicle: str, month: str, pseudonym: int) -> int:
         """Return the number of a vehicle, which has this pseudonym in this month (2026-01); durable after `sync`.
 
         Raises:
             OSError: the key can neither be read nor written, or the line cannot be written.
         """
         if self._key is None or self._known is None:
-            self._key = kept_key(self._folder / _KEY)
+            self._key = load_or_create_key(self._folder / _KEY)
             self._known = set(read(self._folder))
         number = int.from_bytes(blake2b(vehicle.encode(), key=self._key, digest_size=8).digest(), signed=True)
         if pseudonym not in self._known:
@@ -88,7 +88,7 @@ def read(folder: Path) -> dict[int, int]:
     return {pseudonym: number for path in _files(folder) for pseudonym, number in _whole(path.read_bytes())}
 
 
-def mend(folder: Path) -> int:
+def remove_damaged_lines(folder: Path) -> int:
     """Remove damaged lines, and text that is no line, if the disk allows it; return their number.
 
     Raises:
@@ -100,7 +100,7 @@ def mend(folder: Path) -> int:
         good = b"".join(_line(*both) for both in _whole(data))
         if len(good) < len(data):
             damaged += -(-(len(data) - len(good)) // _LINE)
-            with suppress(OSError), written(path, _SECRET) as file:
+            with suppress(OSError), open_durably(path, _SECRET) as file:
                 file.write(good)
     return damaged
 
@@ -136,7 +136,7 @@ def forget(folder: Path, month: str, pseudonym: int | None = None) -> None:
             continue
         data = path.read_bytes()
         lines = [data[at : at + _LINE] for at in range(0, len(data), _LINE)]
-        with written(path, _SECRET) as file:
+        with open_durably(path, _SECRET) as file:
             file.write(b"".join(line for line in lines if int.from_bytes(line[:8], signed=True) != pseudonym))
 
 

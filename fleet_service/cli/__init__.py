@@ -14,7 +14,7 @@ from contextlib import nullcontext
 from typing import Final
 
 from fleet_service.app import UNUSED
-from schemas.runtime import commandline, talk
+from schemas.runtime import commandline, progress_messages
 from schemas.runtime.commandline import Command
 
 BAD_INPUT: Final = commandline.BAD_INPUT
@@ -67,15 +67,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         the exit code; 2 after a one-line error that names the field and the fix.
     """
-    given = commandline.joined(sys.argv[1:] if argv is None else argv)
+    given = commandline.join_negative_numbers(sys.argv[1:] if argv is None else argv)
     chosen = next((argument for argument in given if not argument.startswith("-")), None)
     if argv is None and chosen == "run":
         from schemas.runtime.process import limit_memory
 
         limit_memory(*UNUSED)
-    talk.speak(quiet=commandline.wants_quiet(given))
-    with nullcontext() if chosen is None or chosen in LIVE else talk.busy(chosen):  # what it loads takes a second
+    progress_messages.enable_messages(quiet=commandline.wants_quiet(given))
+    with (
+        nullcontext() if chosen is None or chosen in LIVE else progress_messages.show_status(chosen)
+    ):  # what it loads takes a second
         arguments = commandline.parser_of(*LINE, chosen).parse_args(given)
         if arguments.verbose:
             logging.basicConfig(level=logging.DEBUG, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
-        return commandline.guarded(lambda: int(arguments.run(arguments)))
+        return commandline.run_guarded(lambda: int(arguments.run(arguments)))

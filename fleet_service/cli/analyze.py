@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Final
 
 from fleet_service.analytics.options import Options
-from fleet_service.analytics.questions import Question, known, question_of
-from fleet_service.cli.common import add_part, compacted_first, span
+from fleet_service.analytics.questions import Question, known_questions, question_of
+from fleet_service.cli.common import add_part, compact_first, span
 from schemas import mugrid
 from schemas.config import moment
 from schemas.errors import InputError
-from schemas.runtime import commandline, talk
+from schemas.runtime import commandline, progress_messages
 
 ENDINGS: Final = (".parquet", ".geo.parquet", ".geojson", ".csv", ".png", ".svg", ".pdf", ".html")
 # which questions an option is for; to the others it would be one that is passed over in silence
@@ -28,8 +28,8 @@ UNITS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.description = "; ".join(f"{question.name}: {question.about}" for question in known().values())
-    parser.add_argument("question", metavar="NAME", help=" | ".join(known()))
+    parser.description = "; ".join(f"{question.name}: {question.about}" for question in known_questions().values())
+    parser.add_argument("question", metavar="NAME", help=" | ".join(known_questions()))
     parser.add_argument(
         "--archive",
         metavar="DIR",
@@ -56,8 +56,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask, print the answer, and write it on request."""
-    question = _checked(arguments)
-    talk.doing(f"{question.name}: loading DuckDB and Ibis")
+    question = _checked_question(arguments)
+    progress_messages.set_status(f"{question.name}: loading DuckDB and Ibis")
     from fleet_service.analytics import engines, output
     from fleet_service.archive.export import Extract
     from schemas import query
@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
     bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
     part = Extract(*span(arguments), bbox)
     if not arguments.as_it_lies:
-        compacted_first(arguments.archive)
+        compact_first(arguments.archive)
     engine = engines.QueryEngine(arguments.engine, arguments.archive, part, progress=False)
     at = None if arguments.at is None else moment(arguments.at, "at")
     vehicles = USUAL_VEHICLES if arguments.min_vehicles is None else arguments.min_vehicles
@@ -94,11 +94,11 @@ def _seconds(text: str | None) -> float | None:
     return float(found[1]) * UNITS[found[2]]
 
 
-def _checked(arguments: argparse.Namespace) -> Question:
+def _checked_question(arguments: argparse.Namespace) -> Question:
     """Return the question, after all checks that need no computation."""
     question = question_of(arguments.question)
     if arguments.out is not None:
-        commandline.ending("out", commandline.out_folder("out", arguments.out), ENDINGS)
+        commandline.ending_of("out", commandline.out_folder("out", arguments.out), ENDINGS)
         if question.colour is None and arguments.out.name.endswith((".html", ".geojson", ".geo.parquet")):
             raise InputError("out", f"the answer of {question.name} has no place", "write .parquet, .csv or .png")
     for name, takers in FOR.items():
@@ -114,4 +114,4 @@ def _checked(arguments: argparse.Namespace) -> Question:
 
 
 def _report(line: str) -> None:
-    talk.say(line)
+    progress_messages.report(line)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from schemas.config import moment
 from schemas.errors import InputError
-from schemas.runtime import talk
+from schemas.runtime import progress_messages
 
 if TYPE_CHECKING:
     from fleet_service.client.datex import Supplier
@@ -80,11 +80,11 @@ def add_dry_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--yes", action="store_true", help="do not ask for confirmation")
 
 
-def confirmed(arguments: argparse.Namespace, what: str) -> bool:
+def confirm(arguments: argparse.Namespace, what: str) -> bool:
     """Ask for confirmation on a terminal; return True without a terminal."""
     if arguments.yes or not sys.stdin.isatty():
         return True
-    talk.hush()
+    progress_messages.stop_status()
     print(f"{what}. This cannot be undone. Go on? [y/N] ", end="", file=sys.stderr, flush=True)
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 
@@ -115,9 +115,9 @@ def on_archive(arguments: argparse.Namespace, command: Callable[[argparse.Namesp
     Raises:
         InputError: there is no such archive, or it cannot be read or written.
     """
-    from fleet_service.archive.layout import insist_on_archive
+    from fleet_service.archive.layout import require_archive
 
-    insist_on_archive(arguments.archive)
+    require_archive(arguments.archive)
     try:
         done = command(arguments)
         print(json.dumps({"command": arguments.command, **done.values}) if arguments.json else done.line)
@@ -126,7 +126,7 @@ def on_archive(arguments: argparse.Namespace, command: Callable[[argparse.Namesp
     return 0
 
 
-def compacted_first(root: Path) -> None:
+def compact_first(root: Path) -> None:
     """Compact waiting segments so that they count; if that is impossible, print how much is left out.
 
     Raises:
@@ -136,13 +136,13 @@ def compacted_first(root: Path) -> None:
     from fleet_service.archive.compaction import compact
     from schemas.wire import Kind
 
-    layout.insist_on_archive(root)
+    layout.require_archive(root)
     waiting = len(segments.paths(root, Kind.OBSERVATION))
     if not waiting:
         return
-    talk.doing(f"compacting {waiting} segments of the log")
+    progress_messages.set_status(f"compacting {waiting} segments of the log")
     try:
         done = compact(root)
-        talk.say(f"compacted first: {done.rows:,} rows of {done.segments} segments")
+        progress_messages.report(f"compacted first: {done.rows:,} rows of {done.segments} segments")
     except (OSError, InputError) as error:
         print(f"warning: {waiting} segments of the log are not counted: {error}", file=sys.stderr)

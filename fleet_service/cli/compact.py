@@ -36,6 +36,6 @@ def _compact(arguments: argparse.Namespace) -> ArchiveReport:
     summary = f"{done.rows} rows of {done.segments} segments moved into {done.files} files, {parts} rolled up"
     values: dict[str, object] = {"rows": done.rows, "segments": done.segments, "files": done.files, "rolled_up": parts}
     if arguments.to is not None:
-        put = mirror.put(arguments.archive, arguments.to)
+        put = mirror.copy_new_files(arguments.archive, arguments.to)
         summary, values = f"{summary}, {put} put", {**values, "put": put}
     return ArchiveReport(summary, values)

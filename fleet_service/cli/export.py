@@ -22,7 +22,7 @@ from fleet_service.cli.common import (
     supplier_of,
 )
 from schemas.errors import InputError
-from schemas.runtime import commandline, talk
+from schemas.runtime import commandline, progress_messages
 from schemas.thresholds import NS
 
 ENDINGS: Final = (".parquet", ".geojson", ".csv")
@@ -106,7 +106,7 @@ def _datex(arguments: argparse.Namespace) -> int:
     from fleet_service.client.datex_feed import DatexFeed, DatexFile, publish
     from fleet_service.client.map_client import settings
 
-    commandline.ending("out", commandline.out_folder("out", arguments.out), (".xml",))
+    commandline.ending_of("out", commandline.out_folder("out", arguments.out), (".xml",))
     feed = DatexFeed(DatexFile(supplier_of(arguments), arguments.out, lambda line: print(line, flush=True)))
     publish(settings(arguments.connect, arguments.config), feed, stop_on_signals() if arguments.follow else None)
     return 0
@@ -116,7 +116,7 @@ def _export(arguments: argparse.Namespace) -> ArchiveReport:
     from fleet_service.archive import export
     from schemas import query
 
-    commandline.ending("out", commandline.out_folder("out", arguments.out), ENDINGS)
+    commandline.ending_of("out", commandline.out_folder("out", arguments.out), ENDINGS)
     if arguments.min_vehicles < 1:
         raise InputError("min-vehicles", f"{arguments.min_vehicles} is below 1", "give a whole number from 1")
     bbox = query.parse({} if arguments.bbox is None else {"bbox": arguments.bbox}).bbox
@@ -125,7 +125,7 @@ def _export(arguments: argparse.Namespace) -> ArchiveReport:
     if arguments.what == "map" and not arguments.snapshot:
         from fleet_service.analytics.past_map import map_at
 
-        talk.doing("replaying the archive")
+        progress_messages.set_status("replaying the archive")
         table = map_at(arguments.archive, part)
         as_of = _text(part.until)
     else:
@@ -133,7 +133,7 @@ def _export(arguments: argparse.Namespace) -> ArchiveReport:
         if arguments.what == "map":
             as_of = _text(export.snapshot_time(arguments.archive, part))
     if arguments.what == "map":
-        table = export.seen_by(table, arguments.min_vehicles)
+        table = export.with_vehicles(table, arguments.min_vehicles)
     export.write(table, arguments.out)
     line = f"{table.num_rows} rows in {arguments.out}" + (f": the map as of {as_of}" if as_of else "")
     return ArchiveReport(

@@ -24,7 +24,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     if not re.fullmatch(REGION_PATTERN, arguments.region):
         raise InputError("region", f"{arguments.region!r} is none", "give chunks of 4, 3 and 3 digits, or * for all")
-    with map_client.joined(map_client.settings(arguments.connect, arguments.config)) as session:
+    with map_client.open_connected(map_client.settings(arguments.connect, arguments.config)) as session:
         moved = hand_over(session, arguments.region, arguments.to, print)
     if moved is None:
         print(f"{arguments.to} serves {arguments.region} already")

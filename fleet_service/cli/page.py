@@ -51,9 +51,9 @@ def run(arguments: argparse.Namespace) -> int:
         fix = "pip install 'gripmap[page]'"
         raise InputError("page", f"the package {error.name} is missing", fix) from error
     if arguments.archive is not None:
-        from fleet_service.archive.layout import insist_on_archive
+        from fleet_service.archive.layout import require_archive
 
-        insist_on_archive(arguments.archive)
+        require_archive(arguments.archive)
     settings = server.PageSettings(
         connection=map_client.settings(arguments.connect, arguments.config), host=arguments.host, port=arguments.port,
         names=arguments.name, archive=arguments.archive, metrics=arguments.metrics, overlay=arguments.overlay,
@@ -71,5 +71,5 @@ def _publication(arguments: argparse.Namespace) -> DatexFile | None:
         return None
     from fleet_service.client.datex_feed import DatexFile
 
-    commandline.ending("datex", commandline.out_folder("datex", arguments.datex), (".xml",))
+    commandline.ending_of("datex", commandline.out_folder("datex", arguments.datex), (".xml",))
     return DatexFile(supplier_of(arguments), arguments.datex, lambda line: print(line, flush=True))

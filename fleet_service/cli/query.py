@@ -61,7 +61,7 @@ def _form(out: Path | None, given: str | None) -> str | None:
     commandline.out_folder("out", out)
     if not out.suffix:
         return given
-    form = FORMS[commandline.ending("out", out, tuple(FORMS))]
+    form = FORMS[commandline.ending_of("out", out, tuple(FORMS))]
     if given not in (None, form):
         raise InputError("format", f"{given} does not go into {out.name}", f"leave --format out: it is {form}")
     return form

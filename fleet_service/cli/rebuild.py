@@ -6,9 +6,9 @@ import argparse
 import time
 from pathlib import Path
 
-from fleet_service.cli.common import ArchiveReport, add_archive, compacted_first, on_archive
+from fleet_service.cli.common import ArchiveReport, add_archive, compact_first, on_archive
 from schemas.config import moment
-from schemas.runtime import talk
+from schemas.runtime import progress_messages
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,13 +28,13 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _rebuild(arguments: argparse.Namespace) -> ArchiveReport:
-    from fleet_service.analytics.rebuilding import Rebuild, insist_on_empty, rebuild
+    from fleet_service.analytics.rebuilding import Rebuild, rebuild, require_empty
 
     until = time.time_ns() if arguments.until is None else moment(arguments.until, "to")
-    insist_on_empty(arguments.out)
+    require_empty(arguments.out)
     if not arguments.as_it_lies:
-        compacted_first(arguments.archive)
-    talk.doing("replaying the archive by zone")
+        compact_first(arguments.archive)
+    progress_messages.set_status("replaying the archive by zone")
     done = list(rebuild(Rebuild(arguments.archive.resolve(), arguments.out.resolve(), until), arguments.engine))
     cells, parts = sum(one.cells for one in done), sum(one.parts for one in done)
     line = f"{len(done)} zones in {arguments.out}: {cells} cells of the map, {parts} files rolled up"

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING
 
 from fleet_service.cli.common import stop_on_signals
 from schemas.errors import InputError
-from schemas.runtime import talk
-from schemas.runtime.process import end_now, line_logger, log_as
+from schemas.runtime import progress_messages
+from schemas.runtime.process import force_exit, line_logger, log_as
 
 if TYPE_CHECKING:
     from fleet_service.app.service import Service
-    from fleet_service.shards.holding import Holding
+    from fleet_service.shards.holding import Ownership
     from schemas.config import ServiceConfig
 
 PRIVATE = 0o027  # where persons drove is for the service and its group alone, whatever the mask was
@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the service."""
-    with talk.busy("loading"):
+    with progress_messages.show_status("loading"):
         from fleet_service.app.precompile import warm_up
         from fleet_service.app.service import Service
         from schemas.config import ServiceConfig, load
@@ -67,13 +67,13 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         log_line = line_logger(config.log, sys.stdout, service=config.name)
         if config.standby:
-            with talk.busy("compiling"):
+            with progress_messages.show_status("compiling"):
                 warm_up()  # compiled when it is needed
-        holding = _waited(config, root, stop, log_line)
+        holding = _open_archive(config, root, stop, log_line)
         if holding is None:
             return 0
         try:
-            with talk.busy("starting"):
+            with progress_messages.show_status("starting"):
                 service = Service(config, root, log_line, holding)
         except BaseException:
             holding.close()
@@ -85,24 +85,24 @@ def run(arguments: argparse.Namespace) -> int:
     gc.collect()
     gc.freeze()  # what came from the archive stays: looking through it takes longer than an alert may
     stopped = threading.Event()
-    threading.Thread(target=_leave_at_last, args=(stop, stopped, service, log_line), daemon=True).start()
+    threading.Thread(target=_force_exit_when_stuck, args=(stop, stopped, service, log_line), daemon=True).start()
     service.run(stop)
     stopped.set()
     return service.exit_code if holding.lease is not None else 0
 
 
-def _waited(
+def _open_archive(
     config: ServiceConfig, root: Path, stop: threading.Event, log_line: Callable[[str], None]
-) -> Holding | None:  # fmt: skip
+) -> Ownership | None:  # fmt: skip
     """Open the archive once it is available; None if stopped before. A standby serves its metrics while it waits."""
-    from fleet_service.app.metrics import of_standby
-    from fleet_service.shards.holding import hold
-    from fleet_service.shards.serving import standing_by
+    from fleet_service.app.metrics import standby_metrics
+    from fleet_service.shards.holding import acquire
+    from fleet_service.shards.serving import standby_signs
     from schemas.runtime import watchdog
-    from schemas.runtime.metrics import serving
+    from schemas.runtime.metrics import serve_metrics
 
     if not config.standby:
-        return hold(config, root, stop, log_line)
+        return acquire(config, root, stop, log_line)
     latest = [""]
 
     def say(line: str) -> None:
@@ -110,16 +110,16 @@ def _waited(
         log_line(f"{line}, {address}" if address else line)
 
     with (
-        serving(
-            config.metrics_host, config.metrics_port, lambda: of_standby(config),
+        serve_metrics(
+            config.metrics_host, config.metrics_port, lambda: standby_metrics(config),
             lambda: [line for line in latest if "cannot" in line],
         ) as address,
-        standing_by(config, stop, watchdog.patient()) as signs,
+        standby_signs(config, stop, watchdog.notify_waiting()) as signs,
     ):  # fmt: skip
-        return None if stop.is_set() else hold(config, root, stop, say, signs)
+        return None if stop.is_set() else acquire(config, root, stop, say, signs)
 
 
-def _leave_at_last(
+def _force_exit_when_stuck(
     stop: threading.Event, stopped: threading.Event, service: Service, log_line: Callable[[str], None]
 ) -> None:
     """End a service whose shutdown hangs, on a frozen router or a long compaction.
@@ -135,7 +135,7 @@ def _leave_at_last(
             traceback.print_exception(service.failure)
         code = service.exit_code
         if code == 0:
-            freeing = threading.Thread(target=service.engine.holding.give_free, daemon=True)
+            freeing = threading.Thread(target=service.engine.holding.release, daemon=True)
             freeing.start()
             freeing.join(FREEING_S)
-        end_now(code)
+        force_exit(code)

@@ -23,7 +23,7 @@ def run(arguments: argparse.Namespace) -> int:
     from fleet_service.client.webhook import Webhook
 
     stop = stop_on_signals()
-    wishes = watching.Wishes(arguments.bbox, only_alerts=arguments.alerts, as_json=arguments.json)
+    wishes = watching.WatchOptions(arguments.bbox, only_alerts=arguments.alerts, as_json=arguments.json)
     settings = map_client.settings(arguments.connect, arguments.config)
     if arguments.webhook is None:
         watching.watch(settings, wishes, stop, _say)

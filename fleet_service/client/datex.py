@@ -91,7 +91,7 @@ def publication(
         known = alert.id if alert.id in old else _same_place(alert, old, written)
         record = _record(alert, known or alert.id, now)
         if known is not None:
-            record = _versioned(record, old[known])
+            record = _next_version(record, old[known])
         written.add(record.get("id", ""))
         root.append(_situation(supplier, record))
     for name, record in old.items():
@@ -100,7 +100,7 @@ def publication(
         place = (
             float(child.text or "nan") for child in _found(record, "sit:locationReference/loc:coordinatesForDisplay")
         )
-        ended = _ended(record, now) if _has_ended(record) or is_heard(*place) else record
+        ended = _end_record(record, now) if _has_ended(record) or is_heard(*place) else record
         if ended is not None:
             root.append(_situation(supplier, ended))
     ET.indent(root)
@@ -167,7 +167,7 @@ def _location(alert: StretchAlert) -> ET.Element:
     return place
 
 
-def _versioned(record: ET.Element, old: ET.Element) -> ET.Element:
+def _next_version(record: ET.Element, old: ET.Element) -> ET.Element:
     """Return a record as the next version of an old one; the old one if nothing but times has changed."""
     for tag in ("sit:situationRecordCreationTime", "sit:validity/com:validityTimeSpecification/com:overallStartTime"):
         _found(record, tag).text = _found(old, tag).text
@@ -183,7 +183,7 @@ def _versioned(record: ET.Element, old: ET.Element) -> ET.Element:
     return record
 
 
-def _ended(record: ET.Element, now: int) -> ET.Element | None:
+def _end_record(record: ET.Element, now: int) -> ET.Element | None:
     """Return a record with its end; None if the end was published long enough."""
     period = _found(record, "sit:validity/com:validityTimeSpecification")
     end = period.find("com:overallEndTime", _SPACES)

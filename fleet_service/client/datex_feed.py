@@ -11,14 +11,14 @@ from typing import Final
 import zenoh
 
 from fleet_service.client.datex import Supplier, publication, same_but_for_time
-from fleet_service.client.map_client import is_place_served, is_served, joined
+from fleet_service.client.map_client import is_place_served, is_served, open_connected
 from fleet_service.client.stretches import StretchAlert, Stretches
 from fleet_service.client.watching import GATHER_S, standing_alerts
 from schemas import grid, keys, query, wire
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
 from schemas.runtime import commandline
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 
 REFRESH_S: Final = 60.0  # between two looks at all that stands, and at the most between two times of publication
 
@@ -63,7 +63,7 @@ class DatexFile:
         if not changed and not self.is_due:
             return
         self.document, self._written = new, time.monotonic()
-        with commandline.writing(self._path), written(self._path) as file:
+        with commandline.report_write_errors(self._path), open_durably(self._path) as file:
             file.write(new)
         if changed:
             self._say(f"{len(standing)} slippery stretches in {self._path}")
@@ -124,7 +124,7 @@ def publish(connection: ZenohSettings, feed: DatexFeed, stop: threading.Event | 
     Raises:
         InputError: no router, or no service answers at the start: an absent service does not mean a dry road.
     """
-    with joined(connection) as session:
+    with open_connected(connection) as session:
         session.declare_subscriber(f"{keys.ROOT}/alert/**", lambda sample: _take(feed, sample))
         if not is_served(session, query.parse({})):
             raise InputError("connect", "no service answers for the map", "start one; its silence ends no situation")

@@ -73,22 +73,22 @@ def ask(connection: ZenohSettings, parameters: Mapping[str, str]) -> Answer:
         InputError: the query is refused, here or by a service, or no router answers.
     """
     asked = query.parse(parameters)
-    with joined(connection) as session, tokens.watched(session) as services:
-        before = services.here
+    with open_connected(connection) as session, tokens.track_tokens(session) as services:
+        before = services.active
         payloads = sorted(replies(session, EVERYWHERE, parameters))
         time.sleep(FALLS_S)
-        after = services.asked(session)  # who came meanwhile may not have been asked
+        after = services.refresh(session)  # who came meanwhile may not have been asked
         # and who went may have been asked in place of who followed it, even if it is back
-        withdrawn = {token.region for token in services.fell | (before - after)}
+        withdrawn = {token.region for token in services.ever_lost | (before - after)}
         stayed = {token.region for token in before & after}
         whole = {one for one in stayed if not any(regions.overlap(one, region) for region in withdrawn)}
         declared = bool(before | after)
         served = bool(payloads) or (bool(whole) if declared else is_served(session, asked))
-        if not declared and services.asked(session):  # it came while it was looked for
+        if not declared and services.refresh(session):  # it came while it was looked for
             declared, served = True, bool(payloads)
         elif not declared and served and not payloads:  # likewise, and its token is on the way; or it has none
             payloads = sorted(replies(session, EVERYWHERE, parameters))
-    answer = replace(_joined(asked, [payload for _, payload in payloads]), served=served)
+    answer = replace(_join_replies(asked, [payload for _, payload in payloads]), served=served)
     if not declared:  # services of a former version, or an access list of one
         return answer
     tiles = {regions.region_of(tile) for key, _ in payloads if (tile := keys.parse(key).quadint) is not None}
@@ -158,7 +158,7 @@ def is_place_served(session: zenoh.Session, latitude: float, longitude: float) -
     return True
 
 
-def joined(connection: ZenohSettings) -> zenoh.Session:
+def open_connected(connection: ZenohSettings) -> zenoh.Session:
     """Return a session that is connected to a router.
 
     Raises:
@@ -170,7 +170,7 @@ def joined(connection: ZenohSettings) -> zenoh.Session:
         raise InputError("connect", f"no router at {connection.connect}", "start one, or name its endpoint") from error
 
 
-def _joined(asked: query.MapQuery, payloads: list[bytes]) -> Answer:
+def _join_replies(asked: query.MapQuery, payloads: list[bytes]) -> Answer:
     """Join replies into one answer; along a route in driving order."""
     rank = regions.Rank(asked.route) if asked.route else None
     if asked.format is Format.ARROW:
@@ -202,7 +202,7 @@ def write(answer: Answer, path: Path) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    with commandline.writing(path):
+    with commandline.report_write_errors(path):
         if answer.table is None:
             path.write_text(json.dumps(answer.document))
         else:

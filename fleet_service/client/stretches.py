@@ -135,7 +135,7 @@ class Stretches:
     def _groups(self) -> dict[str, list[Alert]]:
         """Return the standing alerts by stretch."""
         alerts = sorted(self._standing.values(), key=lambda one: (one.time, one.cell, one.sector))
-        label = linked(np.array([one.cell for one in alerts], np.int64))
+        label = link_cells(np.array([one.cell for one in alerts], np.int64))
         parts: list[list[Alert]] = [[] for _ in range(int(label.max(initial=-1)) + 1)]
         for one, k in zip(alerts, label.tolist(), strict=True):
             parts[k].append(one)
@@ -164,7 +164,7 @@ class Stretches:
         )  # fmt: skip
 
 
-def linked(cell: IntArray) -> IntArray:
+def link_cells(cell: IntArray) -> IntArray:
     """Return the stretch number of each cell, (n,): cells at most LINK_CELLS apart belong together."""
     if not len(cell):
         return np.zeros(0, np.int64)

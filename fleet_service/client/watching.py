@@ -20,7 +20,7 @@ from schemas.wire.tile import decode_tile
 GATHER_S: Final = 0.3  # for which alerts of neighbouring cells are gathered into one
 
 
-class Wishes(NamedTuple):
+class WatchOptions(NamedTuple):
     """Selection of what to watch.
 
     Attributes:
@@ -36,7 +36,7 @@ class Wishes(NamedTuple):
 
 def watch(
     connection: ZenohSettings,
-    wishes: Wishes,
+    wishes: WatchOptions,
     stop: threading.Event,
     say: Callable[[str], None],
     hear: Callable[[StretchAlert], None] = lambda _: None,
@@ -78,17 +78,17 @@ def watch(
 
     def tell_services() -> None:
         nonlocal away
-        here = {token.region for token in services.here}
-        left = {token.region for token in services.withdrawn} - here
+        here = {token.region for token in services.active}
+        left = {token.region for token in services.lost} - here
         now = set(regions.unserved(asked, here)) if asked.bbox else left
-        if now != away and (here or services.withdrawn):
+        if now != away and (here or services.lost):
             _say_regions(say, now - away, away - now, as_json=wishes.as_json)
             away = now
 
     session = zenoh_session.open_session(connection, stop)
     if session is None:
         return
-    with session, tokens.watched(session) as services:
+    with session, tokens.track_tokens(session) as services:
         if not wishes.only_alerts:
             session.declare_subscriber(f"{keys.ROOT}/map/**", changed)
         session.declare_subscriber(f"{keys.ROOT}/alert/**", alerted)

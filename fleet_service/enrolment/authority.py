@@ -20,7 +20,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from schemas.errors import InputError
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 
 SKEW: Final = timedelta(minutes=10)  # clocks of vehicles may be behind the authority's
 Key = ec.EllipticCurvePrivateKey
@@ -48,7 +48,7 @@ def pem(certificate: x509.Certificate) -> bytes:
 
 def write(path: Path, data: bytes, mode: int) -> None:
     """Replace a file atomically; its mode is never wider than `mode`."""
-    with written(path, mode) as file:
+    with open_durably(path, mode) as file:
         file.write(data)
 
 
@@ -135,7 +135,7 @@ def alternatives(name: str, hosts: Sequence[str]) -> list[x509.GeneralName]:
     return found
 
 
-def signed(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
+def is_signed_by(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
     """Return True if the authority issued the certificate."""
     try:
         certificate.verify_directly_issued_by(authority)

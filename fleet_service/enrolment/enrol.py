@@ -37,7 +37,7 @@ class Terms:
 
 
 @dataclass
-class Done:
+class EnrolmentResult:
     """Names by result."""
 
     made: list[str] = field(default_factory=list)
@@ -63,7 +63,7 @@ class Registry:
         for inner in (self._authority, self._revoked):
             inner.mkdir(mode=PRIVATE, exist_ok=True)
 
-    def enrol(self, fleet: Enrolment, step: Step | None = None) -> Done:
+    def enrol(self, fleet: Enrolment, step: Step | None = None) -> EnrolmentResult:
         """Bring certificates and router configurations up to date.
 
         Args:
@@ -74,7 +74,7 @@ class Registry:
             InputError: a file is damaged, a name was revoked, or a step is out of order.
         """
         signer = self._signer(step)
-        done = Done()
+        done = EnrolmentResult()
         for name in fleet.names:
             hosts = fleet.routers[name].hosts if name in fleet.routers else []
             if self._good(name, hosts, signer.certificate):
@@ -127,7 +127,7 @@ class Registry:
         names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         soon = self._now + timedelta(days=self._terms.renew_days)
         return (
-            ca.signed(found, signer)
+            ca.is_signed_by(found, signer)
             and found.not_valid_after_utc > soon
             and list(names) == ca.alternatives(name, hosts)
         )
@@ -135,7 +135,7 @@ class Registry:
     def _refuse_revoked(self, name: str, signer: x509.Certificate) -> None:
         """Refuse a revoked name: the access list knows names, so a lost certificate would be valid again."""
         lost = ca.read_certificate(self._revoked / f"{name}.pem")
-        if lost is None or lost.not_valid_after_utc < self._now or not ca.signed(lost, signer):
+        if lost is None or lost.not_valid_after_utc < self._now or not ca.is_signed_by(lost, signer):
             return
         until = f"{lost.not_valid_after_utc:%Y-%m-%d}"
         raise InputError(
@@ -156,7 +156,7 @@ class Registry:
             found = ca.read_certificate(path)
         except InputError:
             return False
-        return found is not None and any(ca.signed(found, signer) for signer in signers)
+        return found is not None and any(ca.is_signed_by(found, signer) for signer in signers)
 
     def _revoke(self, gone: list[str]) -> list[str]:
         """Move certificates and keys of removed names to `revoked/`."""

@@ -26,18 +26,18 @@ class Acks:
             lambda: defaultdict(list)
         )
 
-    def durable(self, batches: Iterable[BatchId]) -> None:
+    def record_durable(self, batches: Iterable[BatchId]) -> None:
         """Record that batches are on disk."""
         durable = self._durable
         for stream, seq in batches:
             durable[stream].append(seq)
 
-    def late(self, batches: Iterable[BatchId]) -> None:
+    def record_late(self, batches: Iterable[BatchId]) -> None:
         """Record that batches arrived after the map had moved on; sent with those of them that are durable."""
         for stream, seq in batches:
             self._late[stream].add(seq)
 
-    def rejected(self, vehicle: str, batch: Head, row: int, reason: str) -> None:
+    def record_rejected(self, vehicle: str, batch: Head, row: int, reason: str) -> None:
         """Record that a batch was rejected."""
         self._rejected[vehicle][batch.boot, batch.kind, batch.region].append((batch.seq, row, reason))
 

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from fleet_service.ingest.grouping import grouped, largest_of
+from fleet_service.ingest.grouping import group_rows, largest_of
 from schemas.numeric import BoolArray, IntArray
 from schemas.wire import Kind
 
@@ -170,7 +170,7 @@ class SequenceTrackers:
         """Record archived rows (n,) of one kind, in any order; `time` [ns] of each record."""
         if not len(seq):
             return
-        group, first = grouped(vehicle, boot, region)
+        group, first = group_rows(vehicle, boot, region)
         streams = [
             self[one, start, kind, where]
             for one, start, where in zip(*(column[first].tolist() for column in (vehicle, boot, region)), strict=True)

@@ -12,7 +12,7 @@ Int32Array = NDArray[np.int32]
 
 
 @compiled
-def grouped(a: IntArray, b: IntArray, c: IntArray) -> tuple[Int32Array, IntArray]:
+def group_rows(a: IntArray, b: IntArray, c: IntArray) -> tuple[Int32Array, IntArray]:
     """Return the group of each row (n,), in order of first appearance, and the first row of each group (k,)."""
     places = 2 * len(a) + 1
     table = np.full(places, -1, np.int32)

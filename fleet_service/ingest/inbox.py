@@ -21,8 +21,8 @@ import zenoh
 from fleet_service.archive import erasures
 from fleet_service.archive.layout import DAY_NS, FIRST_TIME, MAP_DAYS, TIME
 from fleet_service.archive.pseudonyms import Pseudonyms, number, texts
-from fleet_service.archive.segments import Rows, stepped
-from fleet_service.archive.witnesses import Witnesses
+from fleet_service.archive.segments import Rows, round_to_steps
+from fleet_service.archive.witnesses import VehicleIds
 from fleet_service.ingest import validation
 from fleet_service.ingest.acks import Acks
 from fleet_service.ingest.budgets import STREAMS_AT_ONCE, STREAMS_PER_HOUR, Bucket
@@ -138,7 +138,7 @@ class BatchIntake:
 
     def __init__(self, streams: SequenceTrackers, pseudonyms: Pseudonyms, counts: Counter[str], acks: Acks) -> None:
         self._streams, self._pseudonyms, self._counts, self._acks = streams, pseudonyms, counts, acks
-        self._witnesses = Witnesses(pseudonyms.folder)
+        self._witnesses = VehicleIds(pseudonyms.folder)
         self._erased = erasures.read(pseudonyms.folder)
         self._budget = Bucket(STREAMS_AT_ONCE, STREAMS_PER_HOUR)
         self._pending: set[BatchId] = set()  # accepted, not yet on disk
@@ -167,10 +167,10 @@ class BatchIntake:
         """
         self._witnesses.sync()
 
-    def settled(self, batches: Sequence[BatchId]) -> None:
+    def acknowledge(self, batches: Sequence[BatchId]) -> None:
         """Acknowledge batches whose rows are on disk."""
         self._pending.difference_update(batches)
-        self._acks.durable(batches)
+        self._acks.record_durable(batches)
 
     def _accept(self, kind: Kind, messages: list[Message], clock: Clock) -> AcceptedBatches:
         found_owners = [validation.owner_of(message.key) for message in messages]
@@ -191,7 +191,7 @@ class BatchIntake:
             else:
                 self._refuse(str(owners[place].name), found.heads.at(place), rules[broken[place]])
         good = broken < 0
-        for place in np.flatnonzero(good & self._forgotten(owners, time)).tolist():
+        for place in np.flatnonzero(good & self._is_erased(owners, time)).tolist():
             good[place] = False
             self._refuse(str(owners[place].name), found.heads.at(place), validation.ERASED)
         new = self._new(kind, found.heads, time, good)
@@ -211,9 +211,9 @@ class BatchIntake:
             for name in old:
                 del known[name]
 
-    def _forgotten(self, owners: Sequence[Parsed], time: IntArray) -> BoolArray:
+    def _is_erased(self, owners: Sequence[Parsed], time: IntArray) -> BoolArray:
         """Return which batches (n,) belong to an erased time, of all vehicles or of theirs."""
-        out = erasures.within(self._erased.months, time)
+        out = erasures.in_spans(self._erased.months, time)
         if self._erased.vehicles:
             for place in np.flatnonzero(~out).tolist():
                 with suppress(OSError):  # without its month's key it is not let in either
@@ -242,7 +242,7 @@ class BatchIntake:
             if stream.accepted(seq):
                 again += 1
                 if batch not in pending:
-                    self._acks.durable([batch])
+                    self._acks.record_durable([batch])
             elif batch in out:
                 again += 1
             else:
@@ -258,7 +258,7 @@ class BatchIntake:
         try:
             pseudonym = number(self._pseudonyms.of(vehicle, time))
             boot_pseudonym = self._pseudonyms.boot(vehicle, boot, time)
-            witness = self._witnesses.of(vehicle, self._pseudonyms.month(time), pseudonym)
+            witness = self._witnesses.id_of(vehicle, self._pseudonyms.month(time), pseudonym)
         except OSError:
             self._counts["key_failures"] += 1
             return None
@@ -273,7 +273,7 @@ class BatchIntake:
         return stream
 
     def _rows(self, kind: Kind, new: dict[BatchId, int], found: Decoded, clock: Clock) -> AcceptedBatches:
-        batches, (rows, heads, sizes) = list(new), _chosen(found, list(new.values()))
+        batches, (rows, heads, sizes) = list(new), _select_batches(found, list(new.values()))
         rows["region"] = np.repeat(heads.region, sizes)
         broken, rules = validation.check_rows(kind, rows, rows["region"], clock)
         rows["row"] = np.arange(len(rows["region"]), dtype=np.int32)
@@ -299,11 +299,11 @@ class BatchIntake:
             rows = {name: column[good[owner]] for name, column in rows.items()}
             batches, heads, sizes = list(compress(batches, good)), heads.take(good), sizes[good]
         self._pending.update(batches)
-        return AcceptedBatches(batches, _named(kind, batches, heads, rows, sizes, clock))
+        return AcceptedBatches(batches, _with_identity(kind, batches, heads, rows, sizes, clock))
 
     def _refuse(self, vehicle: str, head: Head, refusal: Refusal) -> None:
         if refusal.rule != "vehicle":  # else the name in the batch is not the sender's, and nor is the stream
-            self._acks.rejected(vehicle, head, refusal.row, refusal.reason)
+            self._acks.record_rejected(vehicle, head, refusal.row, refusal.reason)
         self._count(refusal.rule)
 
     def _refuse_unusable(self, kind: Kind, owner: Parsed, message: Message, error: InputError) -> None:
@@ -312,7 +312,9 @@ class BatchIntake:
         head = head_of(kind, message.payload, message.encoding)
         named = head is not None and head.vehicle == owner.name and head.region in (0, owner.quadint)
         if head is not None and named and head.boot >= 0 and head.seq >= 1 and owner.quadint is not None:
-            self._acks.rejected(head.vehicle, head._replace(region=owner.quadint), validation.BATCH, str(error)[:150])
+            self._acks.record_rejected(
+                head.vehicle, head._replace(region=owner.quadint), validation.BATCH, str(error)[:150]
+            )
         self._count(error.field)
 
     def _count(self, rule: str, times: int = 1) -> None:
@@ -326,7 +328,7 @@ def _newest(time: IntArray, sizes: IntArray) -> IntArray:
     return np.asarray(newest // US_STEP * US_STEP)
 
 
-def _chosen(found: Decoded, indices: list[int]) -> tuple[Rows, Heads, IntArray]:
+def _select_batches(found: Decoded, indices: list[int]) -> tuple[Rows, Heads, IntArray]:
     """Return rows, heads and sizes of the batches at these ascending positions."""
     rows: Rows = {**found.columns, "with_likelihood": found.with_likelihood}
     if len(indices) == len(found.sizes):
@@ -337,7 +339,7 @@ def _chosen(found: Decoded, indices: list[int]) -> tuple[Rows, Heads, IntArray]:
     return {name: column[mine] for name, column in rows.items()}, found.heads.take(kept), found.sizes[kept]
 
 
-def _named(kind: Kind, batches: list[BatchId], heads: Heads, rows: Rows, sizes: IntArray, clock: Clock) -> Rows:
+def _with_identity(kind: Kind, batches: list[BatchId], heads: Heads, rows: Rows, sizes: IntArray, clock: Clock) -> Rows:
     """Return rows with the identity of their batches, for the archive."""
     numbers = np.array([stream.key[0] for stream, _ in batches], np.int64)
     identity = {
@@ -350,4 +352,4 @@ def _named(kind: Kind, batches: list[BatchId], heads: Heads, rows: Rows, sizes: 
     rows["received_at"] = np.full(len(rows["row"]), clock.now, np.int64)
     if kind is Kind.STATE:
         rows["cell"] = cell_of(rows["latitude"], rows["longitude"])
-    return stepped(rows)
+    return round_to_steps(rows)

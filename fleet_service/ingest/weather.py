@@ -2,7 +2,8 @@
 
     weather/NAME-TIME.parquet     reports as received, with the time from which the map used them
 
-Each file is written when reports arrive. `gather` joins the files of a day, so that a start and a past map read as many
+Each file is written when reports arrive. `join_daily_files` joins the files of a day, so that a start and a past map
+read as many
 files as there are days. A report that is read twice, because of a power loss in between, is identical and changes
 nothing.
 
@@ -25,7 +26,7 @@ import pyarrow.parquet as pq
 from fleet_service.archive import terms
 from fleet_service.archive.files import SEGMENT, write_table
 from fleet_service.archive.layout import DAY_NS, with_term
-from fleet_service.archive.load import Damaged, load, pass_over
+from fleet_service.archive.load import Damaged, load, skip_damaged
 from fleet_service.archive.segments import nanoseconds
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.weather import VALID_NS, Reports
@@ -63,7 +64,7 @@ class WeatherInbox:
 
     def __init__(self, root: Path, name: str, fusion: Fusion, counts: Counter[str]) -> None:
         self._folder, self.fusion, self._counts = root / FOLDER, fusion, counts
-        self._name = with_term(name, terms.of(root))
+        self._name = with_term(name, terms.read_epoch(root))
         self._waiting: deque[WeatherMessage] = deque(maxlen=WAITING)
         self._last = 0
 
@@ -137,11 +138,11 @@ def _reports(table: pa.Table) -> Reports:
     return Reports(table["region"].to_numpy(), acts, air, road, water, np.array(prior).reshape(-1, mugrid.BINS))
 
 
-def archived(
+def archived_reports(
     root: Path,
     received_until: int | None = None,
     known: Collection[str] = (),
-    damaged: Damaged = pass_over,
+    damaged: Damaged = skip_damaged,
 ) -> Reports:
     """Return every report that a map used, in order of receipt up to a time [ns], from files whose names are not
     `known`.
@@ -172,7 +173,7 @@ def files(root: Path) -> list[Path]:
     return sorted((root / FOLDER).glob("*.parquet"), key=lambda path: path.stem[-_DIGITS:])
 
 
-def gather(root: Path, damaged: Damaged = pass_over) -> int:
+def join_daily_files(root: Path, damaged: Damaged = skip_damaged) -> int:
     """Join the reports of each day into its newest file; return the number of removed files.
 
     Raises:
@@ -180,7 +181,7 @@ def gather(root: Path, damaged: Damaged = pass_over) -> int:
         OSError: a file cannot be read or written; nothing is lost.
     """
     days: dict[int, list[Path]] = {}
-    term = terms.of(root)
+    term = terms.read_epoch(root)
     for path in files(root):
         days.setdefault(_day(path), []).append(path)
     saved = 0

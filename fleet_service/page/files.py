@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 from starlette.requests import Request
 from starlette.responses import Response
 
-from fleet_service.page.joined import joined
+from fleet_service.page.joined import bundle_modules
 
 LEVEL: Final = 9
 ENGLISH: Final = "texts.en.json"
@@ -35,7 +35,7 @@ class Files:
     def __init__(self, folder: Path) -> None:
         plain = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
         modules = {name.removesuffix(".js"): text.decode() for name, text in plain.items() if name.endswith(".js")}
-        plain[SCRIPT] = joined(modules, "main").encode()
+        plain[SCRIPT] = bundle_modules(modules, "main").encode()
         self._files = {name: _packed(name, text) for name, text in plain.items()}
 
     def texts(self, accepted: str) -> str:

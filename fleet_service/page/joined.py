@@ -18,7 +18,7 @@ _EXPORT: Final = re.compile(r"^export (?=(?:async )?function |class |const )", r
 _OTHER: Final = re.compile(r"^(?:import|export)\b.*$", re.MULTILINE)
 
 
-def joined(modules: Mapping[str, str], main: str) -> str:
+def bundle_modules(modules: Mapping[str, str], main: str) -> str:
     """Return one script that does what `main` does.
 
     Args:

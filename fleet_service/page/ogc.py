@@ -19,7 +19,7 @@ from fleet_service.client import map_client
 from fleet_service.page import asked, features
 from fleet_service.page.features import COLLECTION, GEOJSON, FeatureQuestion
 from fleet_service.page.reader import Reader
-from fleet_service.page.world import HeldWorld
+from fleet_service.page.world import MapMirror
 from schemas import grid, keys
 from schemas.tables import MAP_SCHEMA
 from schemas.thresholds import NS
@@ -35,7 +35,7 @@ class FeatureRoutes:
         reader: queries cells.
     """
 
-    def __init__(self, world: HeldWorld, reader: Reader) -> None:
+    def __init__(self, world: MapMirror, reader: Reader) -> None:
         self._world, self._reader = world, reader
 
     def paths(self) -> dict[str, Callable[[Request], Awaitable[Response]]]:
@@ -72,7 +72,7 @@ class FeatureRoutes:
     async def items(self, request: Request) -> Response:
         """Return features ordered by place, from `after` on; `next` continues there, whatever changes meanwhile."""
         question = asked.features(request, time.time_ns())
-        if not self._reader.served:
+        if not self._reader.is_served:
             message = "no service answers for the map; that is no empty map\n"
             return PlainTextResponse(message, 503, headers={"Retry-After": "10"})
         return await run_in_threadpool(self._items, request, question)

@@ -18,7 +18,7 @@ import zenoh
 
 from fleet_service.client import map_client
 from fleet_service.client.watching import standing_alerts
-from fleet_service.page.world import HeldWorld, box_of
+from fleet_service.page.world import MapMirror, box_of
 from schemas import grid, keys, regions, tables, wire
 from schemas.config import ZenohSettings
 from schemas.errors import InputError, WireError
@@ -41,7 +41,7 @@ class Reader:
         world: receives the data.
     """
 
-    def __init__(self, connection: ZenohSettings, world: HeldWorld) -> None:
+    def __init__(self, connection: ZenohSettings, world: MapMirror) -> None:
         self._connection, self._world = connection, world
         self._session: zenoh.Session | None = None
         self._queriers: dict[int, Any] = {}
@@ -56,7 +56,7 @@ class Reader:
         session = zenoh_session.open_session(self._connection, stop)
         if session is None:
             return
-        with session, tokens.watched(session) as services:
+        with session, tokens.track_tokens(session) as services:
             self._session = session
             session.declare_subscriber(map_client.EVERYWHERE, self._tile)
             session.declare_subscriber(f"{keys.ROOT}/alert/**", self._alert)
@@ -75,15 +75,15 @@ class Reader:
             self._session = None
 
     @property
-    def connected(self) -> bool:
+    def is_connected(self) -> bool:
         """True if a router is connected."""
         session = self._session
         return session is not None and bool(list(session.info.routers_zid()))
 
     @property
-    def served(self) -> bool:
+    def is_served(self) -> bool:
         """True if any service answers."""
-        return self._served and self.connected
+        return self._served and self.is_connected
 
     def is_heard(self, latitude: float, longitude: float) -> bool:
         """Return True if a service answers for a place [deg]."""
@@ -100,12 +100,12 @@ class Reader:
             for region, since in self._fallen.copy().items()
         ]  # fmt: skip
 
-    def _note_fallen(self, services: tokens.Watched) -> None:
+    def _note_fallen(self, services: tokens.PresenceTracker) -> None:
         """Record regions that lost their service and have no known cell; others are found through their cells."""
-        here = {token.region for token in services.here}
+        here = {token.region for token in services.active}
         known = [keys.chunks(region, grid.REGION_ZOOM) for region in self._queriers]
         fallen = {
-            token.region for token in services.withdrawn
+            token.region for token in services.lost
             if token.region.startswith(tuple("0123"))
             and not any(regions.covers(one, token.region) for one in here)
             and not any(regions.overlap(one, token.region) for one in known)
@@ -199,7 +199,7 @@ class Reader:
         if self._names["shard"] or any(self._answers(region) for region in self._queriers):
             return True
         session = self._session
-        if session is None or not self.connected:
+        if session is None or not self.is_connected:
             return False
         if self._anything is None:
             self._anything = session.declare_querier(f"{keys.ROOT}/map/*/*/*/*")

@@ -89,7 +89,7 @@ def _steps(rounding: Callable[[FloatArray], FloatArray], column: pa.ChunkedArray
     return np.where(np.isfinite(value), whole, NO_NUMBER).astype(np.uint8)
 
 
-def worst(records: Records, level: int) -> Records:
+def aggregate_worst(records: Records, level: int) -> Records:
     """Return records of cells (n,) aggregated to their ancestors at `level`, 14 to 21, all headings together.
 
     An ancestor has the minimum of each quantile of the measured cells below it, and so the largest P(slippery): no cell
@@ -117,7 +117,7 @@ def worst(records: Records, level: int) -> Records:
     return found
 
 
-def changed(before: Records, after: Records) -> Records:
+def changed_records(before: Records, after: Records) -> Records:
     """Return the records that turn `before` into `after`, both by place."""
     places = np.union1d(before["place"], after["place"])
     old, new = (np.zeros(len(places), RECORD) for _ in range(2))

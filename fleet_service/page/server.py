@@ -24,7 +24,7 @@ from fleet_service.page.health import ServiceHealth
 from fleet_service.page.moments import Moments
 from fleet_service.page.reader import Reader
 from fleet_service.page.watchers import MOST, Watchers
-from fleet_service.page.world import HeldWorld
+from fleet_service.page.world import MapMirror
 from schemas.config import ZenohSettings
 from schemas.errors import InputError
 
@@ -69,12 +69,12 @@ def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None
         InputError: the port is in use.
     """
     listening = _listen(settings.host, settings.port)
-    world = HeldWorld()
+    world = MapMirror()
     reader = Reader(settings.connection, world)
 
     def state() -> dict[str, Any]:
         away = [region for region in reader.regions() if not region["served"]]
-        return {"router": reader.connected, "served": reader.served, "away": away}
+        return {"router": reader.is_connected, "served": reader.is_served, "away": away}
 
     watchers = Watchers(world, state, settings.most)
     sources = web.Sources(
@@ -85,14 +85,16 @@ def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None
 
     @contextlib.asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:
-        async with web.pushing(watchers):
+        async with web.push_changes(watchers):
             yield
 
     app = web.application(sources, hosts, lifespan)
     listener = threading.Thread(target=reader.run, args=(stop,), name="reader", daemon=True)
     listener.start()
     if settings.datex is not None:
-        threading.Thread(target=keep_up, args=(settings.datex, world, reader, stop), name="datex", daemon=True).start()
+        threading.Thread(
+            target=update_publication, args=(settings.datex, world, reader, stop), name="datex", daemon=True
+        ).start()
     try:
         asyncio.run(_serve(app, listening, stop, watchers, say))
     finally:
@@ -100,11 +102,11 @@ def run(settings: PageSettings, stop: threading.Event, say: Callable[[str], None
         listener.join(LEAVE_S)
 
 
-def keep_up(file: DatexFile, world: HeldWorld, reader: Reader, stop: threading.Event) -> None:
+def update_publication(file: DatexFile, world: MapMirror, reader: Reader, stop: threading.Event) -> None:
     """Keep a publication current with the received alerts until `stop` is set."""
     seen = -1
     while not stop.wait(GATHER_S):
-        if not reader.served or (world.alerts_heard == seen and not file.is_due):
+        if not reader.is_served or (world.alerts_heard == seen and not file.is_due):
             continue  # where no service speaks nothing ends, and the publication's time says how old it is
         seen = world.alerts_heard
         try:

@@ -15,7 +15,7 @@ from collections.abc import AsyncIterator, Callable
 from typing import Any, Final, NamedTuple
 
 from fleet_service.page.records import CELL_LEVEL, TileBlock
-from fleet_service.page.world import HeldWorld, box_of
+from fleet_service.page.world import MapMirror, box_of
 from schemas import grid
 
 FLUSH_S: Final = 0.1  # changes of so long are one event
@@ -51,7 +51,7 @@ class Watchers:
         most: maximum number of watchers.
     """
 
-    def __init__(self, world: HeldWorld, state: Callable[[], dict[str, Any]], most: int = MOST) -> None:
+    def __init__(self, world: MapMirror, state: Callable[[], dict[str, Any]], most: int = MOST) -> None:
         self._world, self._state, self._most = world, state, most
         self._watchers: set[_OpenPage] = set()
         self.reloads = 0

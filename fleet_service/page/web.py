@@ -28,7 +28,7 @@ from fleet_service.page.moments import Moments
 from fleet_service.page.ogc import FeatureRoutes
 from fleet_service.page.reader import Reader
 from fleet_service.page.watchers import TooManyWatchersError, Watchers
-from fleet_service.page.world import HeldWorld
+from fleet_service.page.world import MapMirror
 from schemas import grid, keys
 from schemas.errors import InputError, WireError
 from schemas.thresholds import NS, REACTION_S
@@ -40,7 +40,7 @@ BLOCKS: Final = "application/vnd.gripmap.blocks"
 class Sources(NamedTuple):
     """Data sources of the routes."""
 
-    world: HeldWorld
+    world: MapMirror
     reader: Reader
     moments: Moments
     health: ServiceHealth
@@ -198,7 +198,7 @@ class Routes:
         reader, watchers = self._of.reader, self._of.watchers
         return JSONResponse({
             "services": services, "names": reader.names("shard"), "vehicles": len(reader.names("alive")),
-            "regions": reader.regions(), "router": reader.connected,
+            "regions": reader.regions(), "router": reader.is_connected,
             "watchers": len(watchers), "reloads": watchers.reloads,
         })  # fmt: skip
 
@@ -273,7 +273,7 @@ def origin(address: str) -> str:
 
 
 @contextlib.asynccontextmanager
-async def pushing(watchers: Watchers) -> AsyncIterator[None]:
+async def push_changes(watchers: Watchers) -> AsyncIterator[None]:
     """Push changes while the block runs; then end all streams."""
     import asyncio
 

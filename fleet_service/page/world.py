@@ -20,7 +20,7 @@ _EMPTY: Final = np.zeros(0, records.RECORD)
 
 
 @dataclass
-class HeldTile:
+class MirroredTile:
     """Tile: its records, number of changes, time of receipt [s since 1970], cached blocks."""
 
     cells: Records = field(default_factory=lambda: _EMPTY)
@@ -34,12 +34,12 @@ class _Before(NamedTuple):
     version: int
 
 
-class HeldWorld:
+class MapMirror:
     """All received tiles and alerts; thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._tiles: dict[int, HeldTile] = {}
+        self._tiles: dict[int, MirroredTile] = {}
         self._before: dict[int, _Before] = {}  # of the tiles that changed since `changes` was asked
         self._stretches = Stretches()
         self._alerts_changed = False
@@ -51,7 +51,7 @@ class HeldWorld:
         cells = records.of_table(table)
         with self._lock:
             self.heard = now
-            held = self._tiles.setdefault(tile, HeldTile())
+            held = self._tiles.setdefault(tile, MirroredTile())
             held.heard = now
             if np.array_equal(held.cells, cells):
                 return
@@ -79,7 +79,7 @@ class HeldWorld:
             found = []
             for tile, (cells, version) in before.items():
                 held = self._tiles[tile]
-                delta = records.changed(cells, held.cells)
+                delta = records.changed_records(cells, held.cells)
                 block = TileBlock(tile, records.CELL_LEVEL, held.version, version, held.heard, delta)
                 found.append(block)
             return found
@@ -141,7 +141,7 @@ class HeldWorld:
 
 def block_at(level: int, tile: int, cells: Records, version: int, moment: float) -> bytes:
     """Return a complete tile at a level as bytes."""
-    seen = cells if level == records.CELL_LEVEL else records.worst(cells, level)
+    seen = cells if level == records.CELL_LEVEL else records.aggregate_worst(cells, level)
     return TileBlock(tile, level, version, 0, moment, seen).encoded()
 
 

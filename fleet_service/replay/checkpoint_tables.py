@@ -24,18 +24,18 @@ def tables_of(fusion: Fusion) -> dict[str, pa.Table]:
     each."""
     out = {}
     for name, columns in image_of(fusion).items():
-        arrays = [_listed(column) for column in columns.values()]
+        arrays = [_to_list(column) for column in columns.values()]
         fields = [pa.field(key, a.type) for key, a in zip(columns, arrays, strict=True)]
         out[name] = pa.Table.from_arrays(arrays, schema=pa.schema(fields, {_KEY: VERSION.encode()}))
     return out
 
 
-def _listed(column: NDArray[Any]) -> pa.Array[Any]:
+def _to_list(column: NDArray[Any]) -> pa.Array[Any]:
     """Return one list that holds a column."""
     return pa.LargeListArray.from_arrays(pa.array([0, len(column)], pa.int64()), pa.array(column))
 
 
-def _unlisted(column: pa.ChunkedArray[Any]) -> NDArray[Any]:
+def _from_list(column: pa.ChunkedArray[Any]) -> NDArray[Any]:
     """Return the column that a list holds; a view if Arrow's own conversion would import another library."""
     whole = column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()  # which copies what is one piece
     values = cast("pa.LargeListArray[Any]", whole).flatten()
@@ -54,7 +54,7 @@ def fusion_from(tables: dict[str, pa.Table], lateness_s: float) -> Fusion:
     versions = {(table.schema.metadata or {}).get(_KEY, b"").decode() for table in tables.values()}
     if versions != {VERSION}:
         raise InputError("checkpoint", f"is not of version {VERSION}", "replay the archive instead")
-    image = {name: {key: _unlisted(table[key]) for key in table.column_names} for name, table in tables.items()}
+    image = {name: {key: _from_list(table[key]) for key in table.column_names} for name, table in tables.items()}
     try:
         return fusion_of(image, lateness_s)
     except (KeyError, ValueError) as error:

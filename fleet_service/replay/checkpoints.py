@@ -24,7 +24,7 @@ import pyarrow as pa
 from fleet_service.archive.layout import CHECKPOINTS, Cut
 from fleet_service.archive.version import KEY, VERSION
 from schemas.errors import InputError
-from schemas.runtime.durable import sync_directory, written
+from schemas.runtime.durable import open_durably, sync_directory
 
 KEPT: Final = 2  # the newest, and the one before, should the newest be damaged
 TRIES: Final = 4  # a service that is killed again and again, by whatever, begins from the log at last
@@ -59,12 +59,12 @@ def save(root: Path, taken: Taken) -> Path:
     shutil.rmtree(draft, ignore_errors=True)
     draft.mkdir(parents=True)
     for name, table in taken.tables.items():
-        with written(draft / f"{name}.arrow", named=False) as file:
+        with open_durably(draft / f"{name}.arrow", named=False) as file:
             metadata = {**(table.schema.metadata or {}), KEY.encode(): str(VERSION).encode()}
             with pa.ipc.new_file(file, table.schema.with_metadata(metadata)) as writer:
                 writer.write_table(table.replace_schema_metadata(metadata))
     content = {"files": {file.name: digest(file) for file in sorted(draft.iterdir())}, "weather": list(taken.weather)}
-    with written(draft / _MANIFEST, named=False) as file:
+    with open_durably(draft / _MANIFEST, named=False) as file:
         file.write(json.dumps({"content": content, "digest": _digest_of(content)}).encode())
     sync_directory(draft)
     shutil.rmtree(path, ignore_errors=True)
@@ -107,12 +107,12 @@ def load(path: Path) -> Taken:
 
 
 def begin(path: Path) -> None:
-    """Record that a service begins from a checkpoint; `survived` removes the record."""
+    """Record that a service begins from a checkpoint; `mark_survived` removes the record."""
     with suppress(OSError):  # a full disk does not keep a service from its start
         (path / _TRIED).write_text(str(_tries(path) + 1))
 
 
-def survived(root: Path) -> None:
+def mark_survived(root: Path) -> None:
     """Record that the service runs well with its checkpoint."""
     for path in _folders(root):
         (path / _TRIED).unlink(missing_ok=True)

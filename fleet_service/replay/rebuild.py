@@ -14,15 +14,15 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fleet_service.archive import layout, reading, segments, witnesses
-from fleet_service.archive.between import Between, groups, those
-from fleet_service.archive.load import Damaged, pass_over
+from fleet_service.archive.between import ValueRange, filter_table, matching_row_groups
+from fleet_service.archive.load import Damaged, skip_damaged
 from fleet_service.archive.pseudonyms import number
 from fleet_service.fusion import Fusion, Observations, Updated, observations_of
 from fleet_service.fusion.constants import EPOCH_NS
 from fleet_service.fusion.fuse import Before
 from fleet_service.fusion.standing import ERRORS, UNKNOWN
 from fleet_service.ingest.dedup import SequenceTrackers
-from fleet_service.ingest.weather import archived
+from fleet_service.ingest.weather import archived_reports
 from schemas import grid
 from schemas.errors import InputError
 from schemas.numeric import BoolArray, IntArray
@@ -54,7 +54,7 @@ class Begin(NamedTuple):
 
 
 def restore_streams(
-    root: Path, streams: SequenceTrackers, begin: Begin = Begin(), damaged: Damaged = pass_over  # noqa: B008 immutable
+    root: Path, streams: SequenceTrackers, begin: Begin = Begin(), damaged: Damaged = skip_damaged  # noqa: B008 immutable
 ) -> None:  # fmt: skip
     """Record every archived batch as admitted, file by file.
 
@@ -104,13 +104,13 @@ class Since(NamedTuple):
         west, south, east, north = self.box
         return west - 2 * MARGIN_DEG, south - 2 * MARGIN_DEG, east + 2 * MARGIN_DEG, north + 2 * MARGIN_DEG
 
-    def where(self) -> list[Between] | None:
+    def where(self) -> list[ValueRange] | None:
         """Return the row filters; None for all rows."""
-        found = [] if self.until is None else [Between("received_at", most=self.until // US_STEP)]
+        found = [] if self.until is None else [ValueRange("received_at", most=self.until // US_STEP)]
         if self.box is not None:
             west, south, east, north = self.box
-            found.append(Between("longitude", west - MARGIN_DEG, east + MARGIN_DEG))
-            found.append(Between("latitude", south - MARGIN_DEG, north + MARGIN_DEG))
+            found.append(ValueRange("longitude", west - MARGIN_DEG, east + MARGIN_DEG))
+            found.append(ValueRange("latitude", south - MARGIN_DEG, north + MARGIN_DEG))
         return found or None
 
 
@@ -126,18 +126,18 @@ def too_much() -> InputError:
     return InputError("at", "would have to read too much of the archive", "narrow bbox")
 
 
-def weathered(root: Path, lateness_s: float, until: int) -> Fusion:
+def fusion_with_weather(root: Path, lateness_s: float, until: int) -> Fusion:
     """Return a fusion with the weather received until a moment [ns], and no observation yet.
 
     Raises:
         OSError: the archive cannot be read.
     """
     fusion = Fusion(lateness_s)
-    fusion.update_weather(archived(root, received_until=until))
+    fusion.update_weather(archived_reports(root, received_until=until))
     return fusion
 
 
-def past(
+def past_fusion(
     root: Path, lateness_s: float, until: int, box: Box | None = None, most: int | None = None,
     listener: Callable[[Fusion], Heard] | None = None,
 ) -> Fusion:  # fmt: skip
@@ -149,7 +149,7 @@ def past(
         InputError: there are more rows than `most`.
         OSError: the archive cannot be read.
     """
-    fusion = weathered(root, lateness_s, until)
+    fusion = fusion_with_weather(root, lateness_s, until)
     begin = Begin(until // layout.DAY_NS - layout.MAP_DAYS)
     wanted, heard = Since(begin, until=until, box=box, most=most), nobody if listener is None else listener(fusion)
     for _ in replay(root, fusion, wanted, heard=heard):
@@ -170,7 +170,7 @@ def replay(
     root: Path,
     fusion: Fusion,
     since: Since = Since(),  # noqa: B008 immutable
-    damaged: Damaged = pass_over,
+    damaged: Damaged = skip_damaged,
     heard: Heard = nobody,
 ) -> Iterator[Updated]:
     """Replay the archive into `fusion` in order of time, with the weights that were used; yield once per epoch.
@@ -200,12 +200,12 @@ def replay(
             rows = {name: column[new] for name, column in rows.items()}
         o, before = observations_of(rows, witnesses.numbers_of(known, rows["vehicle"])), _before(rows)
         end = int(segments.nanoseconds(table["leave_time"]).max(initial=0)) // EPOCH_NS
-        o, before = _joined([*waiting, (o, before)])
+        o, before = _join_parts([*waiting, (o, before)])
         epoch = (o.time + before.late_by) // EPOCH_NS
-        waiting = [_taken(o, before, epoch > end)]
-        yield from _fused(fusion, *_taken(o, before, epoch <= end), heard)
+        waiting = [_select_rows(o, before, epoch > end)]
+        yield from _fuse_epochs(fusion, *_select_rows(o, before, epoch <= end), heard)
     if waiting:
-        yield from _fused(fusion, *waiting[0], heard)
+        yield from _fuse_epochs(fusion, *waiting[0], heard)
 
 
 def _before(rows: segments.Rows) -> Before:
@@ -215,7 +215,7 @@ def _before(rows: segments.Rows) -> Before:
     return Before(rows["late"].astype(bool), rows["late_by"], rows["weight"], error)
 
 
-def _joined(parts: list[tuple[Observations, Before]]) -> tuple[Observations, Before]:
+def _join_parts(parts: list[tuple[Observations, Before]]) -> tuple[Observations, Before]:
     """Return parts joined in order."""
     of = Observations(
         **{f.name: np.concatenate([getattr(o, f.name) for o, _ in parts]) for f in fields(Observations)}
@@ -227,20 +227,20 @@ def _joined(parts: list[tuple[Observations, Before]]) -> tuple[Observations, Bef
     )  # fmt: skip
 
 
-def _taken(o: Observations, before: Before, rows: BoolArray | IntArray | slice) -> tuple[Observations, Before]:
+def _select_rows(o: Observations, before: Before, rows: BoolArray | IntArray | slice) -> tuple[Observations, Before]:
     """Return a selection of rows."""
     return o.take(rows), Before(before.late[rows], before.late_by[rows], before.weight[rows], before.error[rows])
 
 
-def _fused(fusion: Fusion, o: Observations, before: Before, heard: Heard) -> Iterator[Updated]:
+def _fuse_epochs(fusion: Fusion, o: Observations, before: Before, heard: Heard) -> Iterator[Updated]:
     """Fuse rows epoch by epoch, by the time at which they were fused originally."""
     time = o.time + before.late_by
     order = np.argsort(time, kind="stable")
-    o, before = _taken(o, before, order)
+    o, before = _select_rows(o, before, order)
     borders = np.flatnonzero(np.diff(time[order] // EPOCH_NS)) + 1
     for start, stop in pairwise([0, *borders.tolist(), len(order)]):
         if start < stop:
-            taken, used = _taken(o, before, slice(start, stop))
+            taken, used = _select_rows(o, before, slice(start, stop))
             updated = fusion.update(taken, used)
             heard(taken)
             yield updated
@@ -286,11 +286,11 @@ def _parts(listing: reading.Listing, most: int | None) -> Iterator[_Held]:
         mine = None if inbox is None else inbox.slice(begin, end - begin)
         rows = end - begin + sum(_rows_of(path) for path in files[day])
         for low, high in pairwise(_borders(day * layout.DAY_NS, (day + 1) * layout.DAY_NS, rows, PART_ROWS)):
-            within = [Between(name, low // US_STEP, high // US_STEP - 1)] if high - low < layout.DAY_NS else []
+            within = [ValueRange(name, low // US_STEP, high // US_STEP - 1)] if high - low < layout.DAY_NS else []
             borders = _borders(low, high, rows * (high - low) // layout.DAY_NS, CHUNK_ROWS)
             held = _Held(name, borders)
             if mine is not None:
-                held.take(those(mine, within))
+                held.take(filter_table(mine, within))
                 held.keep()
             for path in files[day]:
                 if listing.load_groups(path, within, held.take):
@@ -321,7 +321,7 @@ class _Held:
         """Add rows to those that `keep` or `forget` decides on."""
         time = segments.nanoseconds(table[self._name])
         order = np.argsort(time, kind="stable")
-        table, places = _numbered(table).take(order), np.searchsorted(time[order], self._borders).tolist()
+        table, places = _with_numbers(table).take(order), np.searchsorted(time[order], self._borders).tolist()
         for k, (start, stop) in enumerate(pairwise(places)):
             if stop > start:
                 sink = pa.BufferOutputStream()
@@ -356,7 +356,7 @@ def _borders(low: int, high: int, rows: int, most: int) -> list[int]:
     return [low + int(part) * EPOCH_NS for part in np.linspace(0, epochs, parts + 1)]
 
 
-def _numbered(table: pa.Table) -> pa.Table:
+def _with_numbers(table: pa.Table) -> pa.Table:
     """Return a table with numbers for pseudonyms, which takes less than half the memory."""
     at = table.column_names.index("vehicle")
     return table.set_column(at, "vehicle", pa.array(numbers(table["vehicle"])))
@@ -370,7 +370,7 @@ def rows_near(root: Path, until: int, box: Box | None, most: int) -> int:
     """
     last = until // layout.DAY_NS + 1
     found = sum(path.stat().st_size for path in segments.paths(root, Kind.OBSERVATION)) // SEGMENT_ROW_BYTES
-    for path in layout.compacted(root, Kind.OBSERVATION, last - layout.MAP_DAYS - 1, last):
+    for path in layout.compacted_files(root, Kind.OBSERVATION, last - layout.MAP_DAYS - 1, last):
         if found > most:
             break
         zone = grid.bounds(np.array([layout.partition_of(path).zone]), grid.ZONE_ZOOM)
@@ -386,4 +386,4 @@ def _rows_of(path: Path, box: Box | None = None) -> int:
     except (OSError, pa.ArrowInvalid):
         return 0
     near = Since(box=box).where() or []
-    return sum(int(footer.row_group(group).num_rows) for group in groups(footer, near))
+    return sum(int(footer.row_group(group).num_rows) for group in matching_row_groups(footer, near))

@@ -47,7 +47,7 @@ class Restart(NamedTuple):
     beside: dict[str, dict[str, IntArray]]
 
 
-def restart(root: Path, lateness_s: float, beside: Sequence[str] = ()) -> Restart:
+def load_restart(root: Path, lateness_s: float, beside: Sequence[str] = ()) -> Restart:
     """Begin from the archive in a folder; `beside` names additional tables that the service stored with those of
     `image_of`."""
     refused = 0

@@ -43,12 +43,12 @@ class Alerts:
         self._standing: dict[int, Alert] = {}
 
     @property
-    def raised(self) -> set[int]:
+    def slots(self) -> set[int]:
         """Return the slots under alert."""
         return set(self._standing)
 
     @property
-    def standing(self) -> list[Alert]:
+    def standing_alerts(self) -> list[Alert]:
         """Return the standing alerts as they were raised."""
         return list(self._standing.values())
 
@@ -59,12 +59,12 @@ class Alerts:
         )
         self._standing |= {slot: alert for slot, alert in zip(slots.tolist(), standing, strict=True) if slot >= 0}
 
-    def renumbered(self, place: IntArray) -> None:
+    def renumber(self, place: IntArray) -> None:
         """Update slots after the fusion renumbered them; `place` is the new number of each. No slot under alert is
         removed."""
         self._standing = {int(place[slot]): alert for slot, alert in self._standing.items()}
 
-    def updated(self, slots: IntArray) -> list[Alert]:
+    def update(self, slots: IntArray) -> list[Alert]:
         """Return the alerts that updated cells raise or clear."""
         time, slippery = self._fusion.live.time[slots], self._fusion.slippery(slots)
         standing = np.isin(slots, np.fromiter(self._standing, np.int64, len(self._standing)))
@@ -76,7 +76,7 @@ class Alerts:
         believed = self._fusion.believed(slots[likely]) @ SLIPPERY_SHARE
         for k, probability in zip(likely.tolist(), believed.tolist(), strict=True):
             slot, when = int(slots[k]), int(time[k])
-            if probability > RAISE_ABOVE and self._corroborated(slot, ICE, when):
+            if probability > RAISE_ABOVE and self._is_corroborated(slot, ICE, when):
                 self._standing[slot] = self._alert(
                     slot, when, True, f"P(mu < {SLIPPERY_MU}) = {probability:.2f} > {RAISE_ABOVE}"
                 )
@@ -85,10 +85,10 @@ class Alerts:
         return out + [
             self._clear(int(slots[k]), int(time[k]), "later visits found grip")
             for k in gripping
-            if self._corroborated(int(slots[k]), GRIP, int(time[k]))
+            if self._is_corroborated(int(slots[k]), GRIP, int(time[k]))
         ]
 
-    def _corroborated(self, slot: int, side: int, time: int) -> bool:
+    def _is_corroborated(self, slot: int, side: int, time: int) -> bool:
         """Return True if one side has enough corroborating sources: as many as the other within the hour, within
         limits.
 
@@ -99,7 +99,7 @@ class Alerts:
         found, _ = self._fusion.sources(slots, side, np.maximum(last, hour) if side == GRIP else hour)
         return bool(found[0] >= np.clip(against[0], LEAST_SOURCES, MOST_ICE if side == ICE else SOURCES))
 
-    def faded(self, now: int) -> list[Alert]:
+    def expire(self, now: int) -> list[Alert]:
         """Return the alerts that expire by `now` [ns]: the belief fell below one half, and no source reported within
         the hour."""
         slots = np.array(sorted(self._standing), np.int64)

@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from fleet_service.fusion import Fusion
 from fleet_service.fusion.belief import SLIPPERY_SHARE, quantiles
-from fleet_service.serve.view import LOWER, UPPER, CellView, measured, view
+from fleet_service.serve.view import LOWER, UPPER, CellView, is_measured, view
 from schemas import grid, tables
 from schemas.numeric import IntArray
 from schemas.query import Format
@@ -28,7 +28,7 @@ def batch_of(cells: CellView, now: int) -> pa.RecordBatch:
     latitude, longitude = grid.centre(cells.cell)
     west, south, east, north = grid.bounds(cells.cell)
     lower, middle, upper = quantiles(cells.belief, (LOWER, 0.5, UPPER))
-    basis = np.where(cells.imputed, _BORROWED, measured(lower, upper, cells.values))
+    basis = np.where(cells.imputed, _BORROWED, is_measured(lower, upper, cells.values))
     columns: dict[str, Any] = {
         "cell": cells.cell, "sector": cells.sector, "mu": pa.array(middle, mask=basis == _BOUND), "mu_lower": lower,
         "mu_upper": upper, "p_slippery": cells.belief @ SLIPPERY_SHARE, "basis": _BASES.take(basis.astype(np.int8)),

@@ -32,7 +32,7 @@ class MapState:
         self._changed: dict[int, int] = {}
         self.change = 0  # how often anything changed
 
-    def changed(self, slots: IntArray) -> None:
+    def mark_changed(self, slots: IntArray) -> None:
         """Record cells that were updated."""
         self._index()
         self.change += 1
@@ -67,7 +67,7 @@ class MapState:
         """Return the number of slots of a tile."""
         return sum(map(len, self._slots.get(tile, ())))
 
-    def renumbered(self) -> None:
+    def rebuild(self) -> None:
         """Rebuild the tiles after the fusion renumbered its slots."""
         self._slots.clear()
         self._indexed = 0

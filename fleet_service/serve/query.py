@@ -39,8 +39,8 @@ def answer(
             if route is None and query.basis is None:
                 shown = cache.shown(tile, now)
             else:
-                shown = _viewed(cache, tile, query, route, now)
-            payload = _encoded(shown, _rows(shown, query), query.format, tile)
+                shown = _view_tile(cache, tile, query, route, now)
+            payload = _encode_tile(shown, _rows(shown, query), query.format, tile)
             if payload is not None:
                 yield tile, payload
 
@@ -74,7 +74,7 @@ def _tiles(cache: TileCache, query: MapQuery, route: IntArray | None, only: int 
     return [int(tile) for tile in tiles]
 
 
-def _viewed(cache: TileCache, tile: int, query: MapQuery, route: IntArray | None, now: int) -> ShownTile:
+def _view_tile(cache: TileCache, tile: int, query: MapQuery, route: IntArray | None, now: int) -> ShownTile:
     """View and impute the cells of one tile that may match; along a route in its order."""
     with cache.guard:
         fusion, slots = cache.state.fusion, cache.state.slots(tile)
@@ -109,7 +109,7 @@ def _rows(shown: ShownTile, query: MapQuery) -> slice | BoolArray:
     return np.asarray(keep)
 
 
-def _encoded(shown: ShownTile, rows: slice | BoolArray, form: Format, tile: int) -> bytes | None:
+def _encode_tile(shown: ShownTile, rows: slice | BoolArray, form: Format, tile: int) -> bytes | None:
     """Encode the selected cells of a tile; None if there are none."""
     if isinstance(rows, slice):
         count = max(rows.stop - rows.start, 0)

@@ -58,7 +58,7 @@ class Answering(NamedTuple):
 
 
 @dataclass(order=True)
-class _Heavy:
+class _QueuedQuery:
     """Expensive query that waits or is partly answered.
 
     Attributes:
@@ -80,7 +80,7 @@ class _Answered:
     whole: bool = True
 
 
-class _Light:
+class _TokenBucket:
     """Token bucket for cheap answers."""
 
     def __init__(self) -> None:
@@ -109,8 +109,8 @@ class MapQueryable:
     def __init__(self, answering: Answering, counts: Counter[str]) -> None:
         self._answering, self._counts = answering, counts
         self._past = threading.Lock()
-        self._heavy: list[_Heavy] = []  # a heap
-        self._light = _Light()
+        self._heavy: list[_QueuedQuery] = []  # a heap
+        self._light = _TokenBucket()
         self._worker: threading.Thread | None = None
         self._busy_since: float | None = None  # with one tile of a heavy answer
         self._some = threading.Condition()
@@ -154,7 +154,7 @@ class MapQueryable:
         self._counts["heavy_queries"] += 1
         with self._some:
             rank = time.monotonic() + cost / PER_S
-            heapq.heappush(self._heavy, _Heavy(rank, self._counts["heavy_queries"], request, wanted))
+            heapq.heappush(self._heavy, _QueuedQuery(rank, self._counts["heavy_queries"], request, wanted))
             dropped = max(self._heavy) if len(self._heavy) > WAITING else None
             if dropped is not None:
                 self._heavy.remove(dropped)
@@ -182,7 +182,7 @@ class MapQueryable:
                     heapq.heappush(self._heavy, first)
             time.sleep(min(REST * (time.monotonic() - began), LONGEST_REST_S))
 
-    def _goes_on(self, heavy: _Heavy) -> bool:
+    def _goes_on(self, heavy: _QueuedQuery) -> bool:
         """Answer with one more tile; return True if there may be others."""
         request = heavy.request
         with self._answered(request) as answered:

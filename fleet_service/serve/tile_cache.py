@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from fleet_service.serve.encode import arrow_stream, batch_of
 from fleet_service.serve.map_state import MapState
-from fleet_service.serve.view import CellView, coarse, view
+from fleet_service.serve.view import CellView, coarsen, view
 from fleet_service.serve.visitors import Visitors
 from schemas import grid
 from schemas.numeric import IntArray
@@ -98,7 +98,7 @@ class TileCache:
     def seen(self, slots: IntArray, now: int) -> CellView:
         """Return the cells of slots as readers see them: coarse if more than one vehicle makes a cell public."""
         cells = view(self.state.fusion, slots, now)
-        return coarse(cells) if self._least > 1 else cells
+        return coarsen(cells) if self._least > 1 else cells
 
     def public(self, slots: IntArray, now: int) -> IntArray:
         """Return the slots that are public at `now` [ns]."""

@@ -58,7 +58,7 @@ def view(fusion: Fusion, slots: IntArray, now: int) -> CellView:
     )  # fmt: skip
 
 
-def coarse(cells: CellView) -> CellView:
+def coarsen(cells: CellView) -> CellView:
     """Return the cells as readers see them with privacy on: no single passage shows in a time or a count."""
     steps = COUNT_STEPS
     counts = [
@@ -74,7 +74,7 @@ def joined(*views: CellView) -> CellView:
     return CellView(*(np.concatenate(columns) for columns in zip(*views, strict=True)))
 
 
-def measured(lower: FloatArray, upper: FloatArray, values: Float32Array) -> BoolArray:
+def is_measured(lower: FloatArray, upper: FloatArray, values: Float32Array) -> BoolArray:
     """Return True for beliefs that rest on a value and not only on bounds, (k,).
 
     Args:

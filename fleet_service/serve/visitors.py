@@ -25,7 +25,7 @@ class Visitors:
     """Vehicles of each slot of a fusion, each as one bit of 64 in each part of the window.
 
     Args:
-        fusion: owner of the slots; it must receive observations before they are passed to `heard`.
+        fusion: owner of the slots; it must receive observations before they are passed to `add`.
     """
 
     def __init__(self, fusion: Fusion) -> None:
@@ -33,7 +33,7 @@ class Visitors:
         self._bits: NDArray[np.uint64] = np.zeros((0, PARTS), np.uint64)
         self._part = 0  # the newest that was heard of
 
-    def heard(self, o: Observations) -> None:
+    def add(self, o: Observations) -> None:
         """Record which vehicles were in which cells."""
         self._grow()
         part = o.time // PART_NS
@@ -52,7 +52,7 @@ class Visitors:
         within = self._bits[slots, : max(PARTS - ago, 0)]
         return np.asarray(np.bitwise_count(np.bitwise_or.reduce(within, axis=1)), np.int64)
 
-    def renumbered(self, place: IntArray) -> None:
+    def renumber(self, place: IntArray) -> None:
         """Update slots after the fusion renumbered them; `place` is the new number, -1 for removed ones."""
         stay = np.flatnonzero(place >= 0)
         longer = np.zeros((len(place), PARTS), np.uint64)

@@ -12,8 +12,8 @@ from typing import BinaryIO, Final
 
 from fleet_service.archive import compaction, terms
 from fleet_service.archive.bucket import CopyError, ObjectBucket
-from fleet_service.archive.copies import FOLDERS, Copy, copy_for
-from fleet_service.archive.files import lock
+from fleet_service.archive.copies import FOLDERS, BucketReplica, open_replica
+from fleet_service.archive.files import lock_archive
 from fleet_service.shards.lease import Lease, Standby, forget_holder, holder_of
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
@@ -22,7 +22,7 @@ AGAIN_S: Final = 1.0  # between two tries to reach the bucket
 REQUESTS: Final = 4  # of a lease that fit into its time
 
 
-class Holding:
+class Ownership:
     """Exclusive ownership of an archive folder and its bucket copy; call `close`.
 
     Attributes:
@@ -32,7 +32,7 @@ class Holding:
         leaves: True once everything is ready for the hand-over.
     """
 
-    def __init__(self, lock_file: BinaryIO, copy: Copy | None, lease: Lease | None = None) -> None:
+    def __init__(self, lock_file: BinaryIO, copy: BucketReplica | None, lease: Lease | None = None) -> None:
         self._lock_file, self.copy, self.lease = lock_file, copy, lease
         self.to, self.leaves = "", False
 
@@ -61,46 +61,46 @@ class Holding:
         """Return the names of this and earlier holders; empty without a lease."""
         return () if self.lease is None else (*self.lease.former, self.lease.service)
 
-    def give_up(self) -> None:
+    def mark_lost(self) -> None:
         """Record that another service has taken over, as its tokens show."""
         if self.lease is not None:
             self.lease.lost = True
 
-    def give_free(self) -> None:
+    def release(self) -> None:
         """Release the lease; nothing is acknowledged afterwards."""
         if self.lease is not None:
-            self.lease.end(self.to if self.leaves else "")
+            self.lease.release(self.to if self.leaves else "")
 
     def close(self) -> None:
         """Release lease and lock."""
-        self.give_free()
+        self.release()
         if self.copy is not None:
             self.copy.close()
         self._lock_file.close()
 
 
-def alone(config: ServiceConfig, root: Path) -> Holding:
+def open_exclusive(config: ServiceConfig, root: Path) -> Ownership:
     """Open an archive without a lease.
 
     Raises:
         InputError: another service holds it, or its copy cannot be used.
         OSError: the folder cannot be read or written.
     """
-    lock_file = lock(root)
+    lock_file = lock_archive(root)
     try:
         forget_holder(root)
-        return Holding(lock_file, copy_for(config, root))
+        return Ownership(lock_file, open_replica(config, root))
     except BaseException:
         lock_file.close()
         raise
 
 
-Signs = tuple[Callable[[], bool], Callable[[str], bool], Callable[[], None]]  # as of `serving.standing_by`
+Signs = tuple[Callable[[], bool], Callable[[str], bool], Callable[[], None]]  # as of `serving.standby_signs`
 
 
-def hold(
+def acquire(
     config: ServiceConfig, root: Path, stop: threading.Event, say: Callable[[str], None], signs: Signs | None = None
-) -> Holding | None:
+) -> Ownership | None:
     """Open an archive with the lease of its copy, if it has one; None if stopped.
 
     Args:
@@ -120,8 +120,8 @@ def hold(
     if url is None:
         if signs is not None:
             raise InputError("standby", "needs archive.copy", "name the bucket of the service that it is to follow")
-        return alone(config, root)
-    lock_file = lock(root)
+        return open_exclusive(config, root)
+    lock_file = lock_archive(root)
     try:
         holding = _leased(config, root, stop, say, signs, lock_file)
     except BaseException:
@@ -135,27 +135,27 @@ def hold(
 def _leased(
     config: ServiceConfig, root: Path, stop: threading.Event, say: Callable[[str], None], signs: Signs | None,
     lock_file: BinaryIO,
-) -> Holding | None:  # fmt: skip
+) -> Ownership | None:  # fmt: skip
     url, options = str(config.archive.second), config.archive.options
     empty = not any((root / folder).exists() for folder in FOLDERS)
     holder, known = holder_of(root, url)
     lease = Lease(holder, ObjectBucket(url, options, config.lease_s / REQUESTS), config.name, config.lease_s)
-    copy = Copy(root, url, options)
+    copy = BucketReplica(root, url, options)
     mirrors = empty or known
-    standby = None if signs is None else Standby(*signs, copy.get_ahead if mirrors else lambda: None)
+    standby = None if signs is None else Standby(*signs, copy.prefetch if mirrors else lambda: None)
     try:
         while lease.wait(stop, say, copy.epoch, standby):
             lease.keep()
             if lease.succeeds and not mirrors:
                 raise InputError("archive.path", f"{root} is no archive of {url}", "give the service an empty folder")
-            copy.under(partial(_fresh, lease), lease.alone)
-            if _joined(config, root, copy, lease, stop, say):
-                terms.note(root, lease.term.epoch)
-                return Holding(lock_file, copy, lease)
-            lease.end()
+            copy.attach_lease(partial(_fresh, lease), lease.assert_not_superseded)
+            if _sync_folder(config, root, copy, lease, stop, say):
+                terms.write_epoch(root, lease.term.epoch)
+                return Ownership(lock_file, copy, lease)
+            lease.release()
             if not lease.lost:
                 break
-            lease = lease.again()
+            lease = lease.retry()
     except CopyError as error:
         _leave(lease, copy)
         fix = "see that it is reached, and endpoint, region and credentials; start again, nothing is lost"
@@ -171,20 +171,25 @@ def _fresh(lease: Lease) -> bool:
     return lease.fresh
 
 
-def _leave(lease: Lease, copy: Copy) -> None:
-    lease.end()
+def _leave(lease: Lease, copy: BucketReplica) -> None:
+    lease.release()
     copy.close()
 
 
-def _joined(
-    config: ServiceConfig, root: Path, copy: Copy, lease: Lease, stop: threading.Event, say: Callable[[str], None]
-) -> bool:  # fmt: skip
+def _sync_folder(
+    config: ServiceConfig,
+    root: Path,
+    copy: BucketReplica,
+    lease: Lease,
+    stop: threading.Event,
+    say: Callable[[str], None],
+) -> bool:
     """Synchronise the folder with the copy; False if stopped, or if another service has the lease. A standby retries
     while the bucket is away."""
     logged = ""
     while not stop.is_set():
         try:
-            with _still(root) if lease.succeeds else nullcontext():
+            with _wait_for_compaction(root) if lease.succeeds else nullcontext():
                 copy.join(None if config.standby else config.name, lease.term, succeeds=lease.succeeds)
         except (CopyError, _BusyError) as error:
             if lease.lost:
@@ -204,10 +209,10 @@ class _BusyError(Exception):
     """Another process works in the folder."""
 
 
-def _still(root: Path) -> BinaryIO:
+def _wait_for_compaction(root: Path) -> BinaryIO:
     """Wait until no compaction of the folder's former service is running: it may have read rows that do not count any
     more."""
     try:
-        return compaction.alone(root)
+        return compaction.lock_compacted(root)
     except InputError as error:
         raise _BusyError(str(error)) from error

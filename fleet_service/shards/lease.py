@@ -20,7 +20,7 @@ Why nothing is doubled. The files that count are one set, which B reads complete
 that A archived and did not acknowledge is known to B and acknowledged again. Rows of A outside this set are sent again
 and admitted once. A's folder is synchronised with the bucket before A serves again.
 
-A machine that was suspended finds its lease expired (`elapsed`).
+A machine that was suspended finds its lease expired (`elapsed_seconds`).
 
 Not covered: a machine whose elapsed-time clock runs at less than half the speed of another's, or stops while it is
 migrated between hosts, and a bucket without read-after-write consistency.
@@ -43,7 +43,7 @@ from fleet_service.archive import terms
 from fleet_service.archive.bucket import CopyError, ObjectBucket
 from fleet_service.archive.terms import Term
 from schemas.errors import InputError
-from schemas.runtime.durable import written
+from schemas.runtime.durable import open_durably
 
 log = logging.getLogger(__name__)
 FOLDER: Final = "lease"
@@ -55,7 +55,7 @@ _BOOTTIME: Final[int | None] = getattr(time, "CLOCK_BOOTTIME", None)
 LOOK_S: Final = 0.25  # between two looks of who waits
 
 
-class Held(NamedTuple):
+class LeaseRecord(NamedTuple):
     """Lease as stored in the bucket.
 
     Attributes:
@@ -97,7 +97,7 @@ class Standby(NamedTuple):
 
 
 class Lease:
-    """Lease of one archive's copy; `wait` for it, `keep` it, `end` it.
+    """Lease of one archive's copy; `wait` for it, `keep` it, `release` it.
 
     Args:
         holder: identity of this folder, see `holder_of`; this process has it locked, so no other start of it runs.
@@ -114,7 +114,7 @@ class Lease:
 
     def __init__(self, holder: str, bucket: ObjectBucket, service: str, lease_s: float) -> None:
         self._holder, self._bucket, self.service, self._lease_s = holder, bucket, service, lease_s
-        self._mine: Held | None = None
+        self._mine: LeaseRecord | None = None
         self._renewed, self._stop = 0.0, threading.Event()
         self._thread: threading.Thread | None = None
         self.lost, self.succeeds = False, False
@@ -133,14 +133,14 @@ class Lease:
     @property
     def left_s(self) -> float:
         """Return how long the content of the bucket may be acknowledged without a renewal [s]; 0 or less: not now."""
-        return 0.0 if self.lost or self._mine is None else self._lease_s / 2 - (elapsed() - self._renewed)
+        return 0.0 if self.lost or self._mine is None else self._lease_s / 2 - (elapsed_seconds() - self._renewed)
 
     @property
     def fresh(self) -> bool:
         """Return True if the content of the bucket may be acknowledged now."""
         return self.left_s > 0.0
 
-    def alone(self) -> None:
+    def assert_not_superseded(self) -> None:
         """Check that no other service has taken over. A later successor then finds everything uploaded until now.
 
         Raises:
@@ -166,7 +166,7 @@ class Lease:
             InputError: a live service has it, and this one is no standby.
             CopyError: the bucket cannot be reached, and this one is no standby.
         """
-        seen: Held | None = None
+        seen: LeaseRecord | None = None
         since, ahead, logged, stood = time.monotonic(), 0.0, "", False
         while not stop.is_set():
             line = ""
@@ -183,7 +183,9 @@ class Lease:
                 stands = standby is not None and found is not None and standby.stands(found.service)
                 stale_s = self._lease_s * (HINT if stood and not stands else 1.0)
                 stood = stood or stands
-                free = found is None or (found.to in ("", self.service) and (found.released or self._had(found)))
+                free = found is None or (
+                    found.to in ("", self.service) and (found.released or self._was_held_here(found))
+                )
                 if free or time.monotonic() - since >= stale_s:
                     if (standby is None or standby.may()) and self._take(found, epoch, stop):
                         return True
@@ -208,7 +210,7 @@ class Lease:
         self._thread = threading.Thread(target=self._keep, name="lease", daemon=True)
         self._thread.start()
 
-    def end(self, to: str = "") -> None:
+    def release(self, to: str = "") -> None:
         """Release it if it is still held, for a named service or for any; nothing is acknowledged afterwards."""
         self._stop.set()
         if self._thread is not None:
@@ -220,7 +222,7 @@ class Lease:
             except CopyError as error:
                 log.warning("the lease runs out by itself: %s", error)
 
-    def again(self) -> Lease:
+    def retry(self) -> Lease:
         """Return a new lease to wait for, after this one was lost."""
         return Lease(self._holder, self._bucket, self.service, self._lease_s)
 
@@ -232,11 +234,11 @@ class Lease:
         """
         if self._mine is None or self.lost:
             return
-        began = elapsed()
+        began = elapsed_seconds()
         turn = self._mine._replace(turn=self._mine.turn + 1)
         self._bucket.put(turn.name, turn.content)
         self._mine = turn
-        self.alone()
+        self.assert_not_superseded()
         self._renewed = began
 
     def _keep(self) -> None:
@@ -249,22 +251,22 @@ class Lease:
             if self.lost:
                 return
 
-    def _had(self, found: Held) -> bool:
+    def _was_held_here(self, found: LeaseRecord) -> bool:
         """Return True if an earlier start of this folder held the lease."""
         return found.holder == self._holder
 
-    def _newest(self) -> Held | None:
+    def _newest(self) -> LeaseRecord | None:
         names = [name for name in self._bucket.names(FOLDER) if name.endswith(".json")]
         content = self._bucket.get(max(names)) if names else None
         return None if content is None else _read(max(names), content)
 
-    def _take(self, found: Held | None, known: Callable[[], int], stop: threading.Event) -> bool:
+    def _take(self, found: LeaseRecord | None, known: Callable[[], int], stop: threading.Event) -> bool:
         """Create the next number; False if another service was faster."""
         number = 1 if found is None else found.number + 1
         epoch = max(int(time.time()), known() + 1, 0 if found is None else found.epoch + 1)
         before = () if found is None else tuple(dict.fromkeys((*found.before, found.service)))
-        mine = Held(number, self._holder, self.service, epoch, 0, released=False, before=before)
-        began = elapsed()
+        mine = LeaseRecord(number, self._holder, self.service, epoch, 0, released=False, before=before)
+        began = elapsed_seconds()
         if not self._bucket.make(mine.name, mine.content):
             return False
         self._mine, self._renewed = mine, began
@@ -274,7 +276,7 @@ class Lease:
         return True
 
 
-def elapsed() -> float:
+def elapsed_seconds() -> float:
     """Return elapsed seconds, including suspended time where the system counts it (Linux)."""
     return time.monotonic() if _BOOTTIME is None else time.clock_gettime(_BOOTTIME)
 
@@ -292,7 +294,7 @@ def holder_of(root: Path, url: str) -> tuple[str, bool]:
             identity = json.loads(path.read_bytes())
     if not place.items() <= identity.items() or "holder" not in identity:
         known, identity = identity.get("copy") == url, {**place, "holder": secrets.token_hex(8)}
-        with written(path) as file:
+        with open_durably(path) as file:
             file.write(json.dumps(identity).encode())
         return str(identity["holder"]), known
     return str(identity["holder"]), True
@@ -309,6 +311,6 @@ def forget_holder(root: Path) -> None:
     (root / terms.NAME).unlink(missing_ok=True)
 
 
-def _read(name: str, content: bytes) -> Held:
+def _read(name: str, content: bytes) -> LeaseRecord:
     record: dict[str, Any] = json.loads(content)
-    return Held(int(Path(name).stem), **{**record, "before": tuple(record.get("before", ()))})
+    return LeaseRecord(int(Path(name).stem), **{**record, "before": tuple(record.get("before", ()))})

@@ -26,14 +26,14 @@ LOOK_S: Final = 0.05
 FIX: Final = "start it with --standby, the same settings and a name of its own"
 
 
-class Moved(NamedTuple):
+class HandoverResult(NamedTuple):
     """Result: the service that left, and how long the region had no service [s]."""
 
     service: str
     pause_s: float
 
 
-def asked(query: zenoh.Query, session: zenoh.Session, served: Sequence[str]) -> str | None:
+def answer_request(query: zenoh.Query, session: zenoh.Session, served: Sequence[str]) -> str | None:
     """Answer a hand-over request; return the target, or None if it is impossible.
 
     Args:
@@ -43,7 +43,7 @@ def asked(query: zenoh.Query, session: zenoh.Session, served: Sequence[str]) -> 
     """
     with query:
         to = str(query.parameters).removeprefix("to=")
-        waiting = {token.region for token in tokens.standing(session, keys.WAITS) if token.service == to}
+        waiting = {token.region for token in tokens.active_tokens(session, keys.WAITS) if token.service == to}
         if re.fullmatch(NAME_PATTERN, to) is None or waiting != set(served):
             other = f"stands by for {', '.join(sorted(waiting))}" if waiting else f"no {to[:63]!r} stands by"
             query.reply_err(f"to: {other}, not for {', '.join(served)}; {FIX}".encode())
@@ -52,7 +52,7 @@ def asked(query: zenoh.Query, session: zenoh.Session, served: Sequence[str]) -> 
         return to
 
 
-def hand_over(session: zenoh.Session, region: str, to: str, say: Callable[[str], None]) -> Moved | None:
+def hand_over(session: zenoh.Session, region: str, to: str, say: Callable[[str], None]) -> HandoverResult | None:
     """Make a region's service hand over; None if the target serves the region already.
 
     Args:
@@ -64,27 +64,27 @@ def hand_over(session: zenoh.Session, region: str, to: str, say: Callable[[str],
     Raises:
         InputError: the region has no service, the standby does not wait, or it did not take over.
     """
-    with tokens.watched(session) as there:
+    with tokens.track_tokens(session) as there:
         service = _server(there, region)
         if service is None:
             raise InputError("region", f"nobody serves {region}", "see `fleet-service watch`")
         if service == to:
             return None
-        say(f"{service} hands over {_ask(session, service, to)}")
+        say(f"{service} hands over {_request_handover(session, service, to)}")
         end, absent_since = time.monotonic() + MOVED_S, 0.0
         while (now := _server(there, region)) != to:
             absent_since = absent_since or (time.monotonic() if now is None else 0.0)
             if time.monotonic() > end or now not in (None, service):
                 raise InputError("to", f"{to} does not serve {region}, but {now or 'nobody'} does", "see their logs")
             time.sleep(LOOK_S)
-        return Moved(service, time.monotonic() - (absent_since or time.monotonic()))
+        return HandoverResult(service, time.monotonic() - (absent_since or time.monotonic()))
 
 
-def _server(there: tokens.Watched, region: str) -> str | None:
-    return next((token.service for token in there.here if regions.covers(token.region, region)), None)
+def _server(there: tokens.PresenceTracker, region: str) -> str | None:
+    return next((token.service for token in there.active if regions.covers(token.region, region)), None)
 
 
-def _ask(session: zenoh.Session, service: str, to: str) -> str:
+def _request_handover(session: zenoh.Session, service: str, to: str) -> str:
     """Request the hand-over; return the regions that move."""
     for reply in session.get(f"{keys.shard_key(service)}?to={to}", timeout=ANSWER_S):
         if reply.ok is not None:

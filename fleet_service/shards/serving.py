@@ -12,7 +12,7 @@ import zenoh
 
 from schemas.config import ServiceConfig
 from schemas.errors import InputError
-from schemas.keys import CLAIMS, SERVES, WAITS, Served
+from schemas.keys import CLAIMS, SERVES, WAITS, ServiceToken
 from schemas.regions import overlap
 from schemas.runtime import tokens, zenoh_session
 
@@ -22,9 +22,9 @@ _TRIES: Final = 5  # of services that start at the same moment
 
 
 @contextmanager
-def claimed(
+def claim_regions(
     session: zenoh.Session, name: str, regions: Sequence[str], stop: threading.Event, former: Collection[str] = ()
-) -> Iterator[frozenset[Served]]:
+) -> Iterator[frozenset[ServiceToken]]:
     """Claim regions exclusively until the block ends.
 
     Args:
@@ -37,13 +37,13 @@ def claimed(
     Raises:
         InputError: another service has one of the regions.
     """
-    mine = frozenset(Served(region, name, secrets.token_hex(4)) for region in regions)
+    mine = frozenset(ServiceToken(region, name, secrets.token_hex(4)) for region in regions)
     with _standing(_claimed(session, mine, stop, former)):
         yield mine
 
 
 @contextmanager
-def serving(session: zenoh.Session, mine: frozenset[Served]) -> Iterator[None]:
+def announce_regions(session: zenoh.Session, mine: frozenset[ServiceToken]) -> Iterator[None]:
     """Announce that regions are served while the block runs. The queryables must answer before and after the block: an
     empty answer of a served region means that nothing is known there."""
     with _standing(_declared(session, mine, SERVES)):
@@ -60,25 +60,27 @@ def _standing(held: list[zenoh.LivelinessToken]) -> Iterator[None]:
 
 
 @contextmanager
-def successors(session: zenoh.Session, mine: frozenset[Served]) -> Iterator[Callable[[], bool]]:
+def watch_successors(session: zenoh.Session, mine: frozenset[ServiceToken]) -> Iterator[Callable[[], bool]]:
     """Yield a function that returns True if another service took these regions since the block began. A service that is
     cut off from its bucket learns so that it was replaced, and stops serving outdated data."""
-    with tokens.watched(session) as there:
-        before = there.here
-        yield lambda: bool(rivals(mine, there.here - before))
+    with tokens.track_tokens(session) as there:
+        before = there.active
+        yield lambda: bool(rival_tokens(mine, there.active - before))
 
 
-def rivals(mine: frozenset[Served], there: set[Served], former: Collection[str] = ()) -> list[Served]:
+def rival_tokens(
+    mine: frozenset[ServiceToken], there: set[ServiceToken], former: Collection[str] = ()
+) -> list[ServiceToken]:
     """Return the tokens of other services for the same regions, except those of `former` services."""
     others = (one for one in there - mine if one.service not in former)
     return sorted(one for one in others if any(overlap(one.region, own.region) for own in mine))
 
 
 def _claimed(
-    session: zenoh.Session, mine: frozenset[Served], stop: threading.Event, former: Collection[str]
+    session: zenoh.Session, mine: frozenset[ServiceToken], stop: threading.Event, former: Collection[str]
 ) -> list[zenoh.LivelinessToken]:  # fmt: skip
-    def others_there() -> list[Served]:
-        return rivals(mine, tokens.standing(session) | tokens.standing(session, CLAIMS), former)
+    def others_there() -> list[ServiceToken]:
+        return rival_tokens(mine, tokens.active_tokens(session) | tokens.active_tokens(session, CLAIMS), former)
 
     for _ in range(_TRIES):
         waited = 0.0
@@ -98,12 +100,12 @@ def _claimed(
     raise InputError("regions", "others start for them at the same time", "start one service for each region")
 
 
-def _declared(session: zenoh.Session, mine: frozenset[Served], root: str) -> list[zenoh.LivelinessToken]:
-    return [session.liveliness().declare_token(token.below(root)) for token in sorted(mine)]
+def _declared(session: zenoh.Session, mine: frozenset[ServiceToken], root: str) -> list[zenoh.LivelinessToken]:
+    return [session.liveliness().declare_token(token.key_under(root)) for token in sorted(mine)]
 
 
 @contextmanager
-def standing_by(
+def standby_signs(
     config: ServiceConfig, stop: threading.Event, alive: Callable[[], None] = lambda: None
 ) -> Iterator[tuple[Callable[[], bool], Callable[[str], bool], Callable[[], None]] | None]:
     """Yield the signs of a standby: whether it reaches a router, whether a service's token is active, and `alive`. None
@@ -112,10 +114,10 @@ def standing_by(
     if session is None:
         yield None
         return
-    waits = frozenset(Served(region, config.name, secrets.token_hex(4)) for region in config.regions)
-    with session, tokens.watched(session) as there, _standing(_declared(session, waits, WAITS)):
+    waits = frozenset(ServiceToken(region, config.name, secrets.token_hex(4)) for region in config.regions)
+    with session, tokens.track_tokens(session) as there, _standing(_declared(session, waits, WAITS)):
         yield (
             lambda: bool(list(session.info.routers_zid())),
-            lambda name: any(one.service == name for one in there.here),
+            lambda name: any(one.service == name for one in there.active),
             alive,
         )

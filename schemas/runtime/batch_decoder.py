@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from schemas import mugrid
 from schemas.errors import WireError
 from schemas.numeric import BoolArray, IntArray
-from schemas.runtime.protobuf_scan import NUMBERS, TEXTS, Walked, gather, walk
+from schemas.runtime.protobuf_scan import NUMBERS, TEXTS, ScannedFields, gather, walk
 from schemas.wire import ENCODING, MAX_BYTES, PLAIN, Columns, Kind, column_types
 from schemas.wire.batches import ABSENT, LIKELIHOOD, Decoded, Heads, PresentColumns, complete, message_of
 
@@ -32,7 +32,7 @@ def decode_many(kind: Kind, payloads: Sequence[tuple[bytes, str]]) -> Decoded:
     if not walked.understood.all():
         for index in np.flatnonzero(~walked.understood).tolist():
             try:
-                plain[index] = _plainly(kind, *payloads[index])
+                plain[index] = _reencode(kind, *payloads[index])
             except WireError as error:
                 errors.append((index, error))
         wrong = {index for index, _ in errors}
@@ -43,12 +43,12 @@ def decode_many(kind: Kind, payloads: Sequence[tuple[bytes, str]]) -> Decoded:
     return complete(Decoded(indices, fields.heads(), *fields.columns(), errors), fields.sent())
 
 
-def _walked(kind: Kind, messages: list[bytes], strict: bool) -> tuple[NDArray[np.uint8], Walked]:
+def _walked(kind: Kind, messages: list[bytes], strict: bool) -> tuple[NDArray[np.uint8], ScannedFields]:
     data = np.frombuffer(b"".join(messages), np.uint8)
     return data, walk(kind, data, np.cumsum(np.fromiter(map(len, messages), np.int64, len(messages))), strict)
 
 
-def _plainly(kind: Kind, payload: bytes, encoding: str) -> bytes:
+def _reencode(kind: Kind, payload: bytes, encoding: str) -> bytes:
     """Return a message as our own encoder writes it.
 
     Raises:
@@ -65,7 +65,7 @@ class _Fields(NamedTuple):
 
     kind: Kind
     data: NDArray[np.uint8]
-    walked: Walked
+    walked: ScannedFields
 
     @property
     def sizes(self) -> IntArray:

@@ -47,7 +47,7 @@ def parser_of(prog: str, description: str, commands: Iterable[Command], *chosen:
     return parser
 
 
-def joined(argv: Sequence[str]) -> list[str]:
+def join_negative_numbers(argv: Sequence[str]) -> list[str]:
     """Rewrite `--bbox -0.5,51,…` as `--bbox=-0.5,51,…`, because argparse takes a leading minus for an option."""
     out: list[str] = []
     for word in argv:
@@ -97,7 +97,7 @@ def version() -> str:
         return "unknown (not installed)"
 
 
-def guarded(run: Callable[[], int]) -> int:
+def run_guarded(run: Callable[[], int]) -> int:
     """Run a command; misuse, Ctrl-C and a closed output pipe end it with at most one line.
 
     Returns:
@@ -132,7 +132,7 @@ def out_folder(field: str, path: Path) -> Path:
 
 
 @contextmanager
-def writing(path: Path) -> Iterator[None]:
+def report_write_errors(path: Path) -> Iterator[None]:
     """Turn errors of writing the `--out` file inside this block into input errors.
 
     Raises:
@@ -144,7 +144,7 @@ def writing(path: Path) -> Iterator[None]:
         raise InputError("out", f"cannot write {path} ({error.strerror})", "name a file you may write") from error
 
 
-def ending(field: str, path: Path, known: Sequence[str]) -> str:
+def ending_of(field: str, path: Path, known: Sequence[str]) -> str:
     """Return the ending of a path, which selects the format; the longest match wins.
 
     Raises:
@@ -156,7 +156,7 @@ def ending(field: str, path: Path, known: Sequence[str]) -> str:
     return max(fits, key=len)
 
 
-def not_an_input(field: str, out: Path, inputs: Sequence[Path]) -> None:
+def refuse_input_path(field: str, out: Path, inputs: Sequence[Path]) -> None:
     """Refuse to overwrite an input file.
 
     Raises:

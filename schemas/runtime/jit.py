@@ -18,7 +18,7 @@ from numba.core.caching import FunctionCache
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from schemas.runtime import talk
+from schemas.runtime import progress_messages
 
 
 class _Told(event.Listener):
@@ -26,8 +26,8 @@ class _Told(event.Listener):
 
     def on_start(self, event: event.Event) -> None:
         """Report the first compilation of the process."""
-        talk.say_once(talk.COMPILING)
-        talk.doing(f"compiling {event.data['dispatcher'].__name__}")
+        progress_messages.report_once(progress_messages.COMPILING)
+        progress_messages.set_status(f"compiling {event.data['dispatcher'].__name__}")
 
     def on_end(self, event: event.Event) -> None:
         """Do nothing."""

@@ -41,7 +41,7 @@ Troubles = Callable[[], Sequence[str]]
 
 
 @contextmanager
-def serving(host: str, port: int | None, read: Read, troubles: Troubles) -> Iterator[str | None]:
+def serve_metrics(host: str, port: int | None, read: Read, troubles: Troubles) -> Iterator[str | None]:
     """Serve while the block runs; yields the address, or None if `port` is None. Port 0 selects a free port.
 
     Args:

@@ -25,20 +25,20 @@ QUESTIONS: Final = "gripmap.questions"
 
 
 @cache
-def found(group: str) -> dict[str, EntryPoint]:
+def entry_points_of(group: str) -> dict[str, EntryPoint]:
     """Return the entry points of a group by name."""
     return {point.name: point for point in entry_points(group=group)}
 
 
-def loaded(group: str, name: str) -> Any:  # noqa: ANN401 whatever stands behind it
+def load_entry_point(group: str, name: str) -> Any:  # noqa: ANN401 whatever stands behind it
     """Import the object behind a name.
 
     Raises:
         InputError: it cannot be imported.
     """
     try:
-        return found(group)[name].load()
+        return entry_points_of(group)[name].load()
     except (ImportError, AttributeError) as error:
         field = group.rpartition(".")[2].removesuffix("s")
-        where = found(group)[name].value
+        where = entry_points_of(group)[name].value
         raise InputError(field, f"{name!r} cannot be loaded from {where} ({error})", "mend or remove it") from error

@@ -20,12 +20,12 @@ _MMAP_THRESHOLD: Final = -3  # M_MMAP_THRESHOLD of glibc's malloc.h
 _LARGE: Final = 4 << 20  # bytes; a turn's own arrays are smaller
 
 
-class Line(str):
+class LogLine(str):
     """Log line with its values by name, for the JSON form."""
 
     __slots__ = ("values",)
 
-    def __new__(cls, text: str, **values: object) -> Line:
+    def __new__(cls, text: str, **values: object) -> LogLine:
         """Create a line from text for people and values for programs."""
         line = super().__new__(cls, text)
         line.values = values
@@ -58,7 +58,7 @@ def trim_memory() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def end_now(code: int) -> NoReturn:
+def force_exit(code: int) -> NoReturn:
     """End the process with an exit code although a thread hangs; call it after closing files.
 
     Threads stop at once. Printed text is flushed.
@@ -69,7 +69,7 @@ def end_now(code: int) -> NoReturn:
     os._exit(code)
 
 
-def leave(code: int) -> NoReturn:
+def exit_fast(code: int) -> NoReturn:
     """Exit without interpreter teardown.
 
     Unloading hundreds of LLVM modules takes about five seconds, and a Zenoh callback during teardown aborts the
@@ -77,7 +77,7 @@ def leave(code: int) -> NoReturn:
     """
     threading._shutdown()  # type: ignore[attr-defined] # no public way
     atexit._run_exitfuncs()
-    end_now(code)
+    force_exit(code)
 
 
 class _Without(MetaPathFinder):
@@ -106,7 +106,7 @@ def line_logger(form: Form, stream: TextIO, **who: object) -> Callable[[str], No
 
     def as_json(line: str) -> None:
         event = line.partition(":")[0] if ":" in line else line.partition(" ")[0]
-        values = line.values if isinstance(line, Line) else {}
+        values = line.values if isinstance(line, LogLine) else {}
         print_line(_record("info", **{"event": event, "message": str(line), **who, **values}), stream)
 
     return text if form == "text" else as_json

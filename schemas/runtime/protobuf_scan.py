@@ -33,7 +33,7 @@ _TEXT: Final = len(NUMBERS)  # roles: numbers, texts, columns
 _COLUMN: Final = _TEXT + len(TEXTS)
 
 
-class Walked(NamedTuple):
+class ScannedFields(NamedTuple):
     """Positions of the fields of k messages in their bytes.
 
     Attributes:
@@ -69,7 +69,7 @@ class _Scan(NamedTuple):
     data: ByteArray
     layout: _Layout
     strict: bool
-    out: Walked
+    out: ScannedFields
 
 
 @cache
@@ -86,7 +86,7 @@ def _layout(kind: Kind) -> _Layout:
     )  # fmt: skip
 
 
-def walk(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True) -> Walked:
+def walk(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True) -> ScannedFields:
     """Scan messages that follow each other in `data`.
 
     Args:
@@ -97,7 +97,7 @@ def walk(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True) -> Wa
     """
     layout, k = _layout(kind), len(ends)
     columns = len(layout.widths)
-    out = Walked(
+    out = ScannedFields(
         np.zeros(k, bool), np.zeros((k, len(NUMBERS)), np.int64), np.zeros((k, len(TEXTS), 2), np.int64),
         np.zeros((k, columns), np.int64), np.zeros((k, columns), np.int64), np.zeros(k, np.int64),
     )  # fmt: skip
@@ -106,7 +106,7 @@ def walk(kind: Kind, data: ByteArray, ends: IntArray, strict: bool = True) -> Wa
     return out
 
 
-def gather(data: ByteArray, walked: Walked, column: int, kind: Kind, into: NDArray[Any]) -> None:
+def gather(data: ByteArray, walked: ScannedFields, column: int, kind: Kind, into: NDArray[Any]) -> None:
     """Copy a column of all messages, one after the other, into an array (n, …) that is filled with the default
     value."""
     width, each = int(_layout(kind).widths[column]), int(_layout(kind).per_record[column])

@@ -22,7 +22,7 @@ RecordArray: TypeAlias = NDArray[np.void]
 R_co = TypeVar("R_co", covariant=True)
 
 
-class Nothing:
+class EmptyRecord:
     """Record without fields."""
 
     unused: bool

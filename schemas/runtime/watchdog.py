@@ -17,15 +17,16 @@ LONG_S: Final = 900.0  # a start may take as long, see TimeoutStartSec of the un
 _at_work = threading.Event()
 
 
-def alive() -> None:
+def notify_alive() -> None:
     """Notify the service manager that the process is ready and working; do nothing without a service manager."""
     _at_work.set()
     _tell()
 
 
-def patient(most_s: float = LONG_S) -> Callable[[], None]:
-    """Notify the service manager that a process is ready and waiting, as a standby does, until `alive` is called. A
-    thread sends the signals, because a waiting process may be busy for long.
+def notify_waiting(most_s: float = LONG_S) -> Callable[[], None]:
+    """Notify the service manager that a process is ready and waiting, until `notify_alive` is called.
+
+    A thread sends the signals, because a waiting process may be busy for long.
 
     Returns:
         a function to call repeatedly; `most_s` seconds after its last call the signals stop.

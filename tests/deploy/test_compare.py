@@ -61,7 +61,7 @@ def test_the_truth_is_the_friction_after_the_change_where_there_is_one() -> None
 def test_a_cell_without_a_truth_is_left_out() -> None:
     found = compare.compare(tile([7, 99], 0.1, 0.4), visits(("a", 11, 7, 0.2, 0.1)), 10 * S)
     assert found.cells["cell"].to_pylist() == [7]
-    assert found.covered.tolist() == [True]
+    assert found.is_covered.tolist() == [True]
 
 
 def test_passes_count_excited_drives_over_the_patch_until_its_alert() -> None:

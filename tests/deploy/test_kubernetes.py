@@ -160,7 +160,7 @@ def test_what_the_pods_start_works_together_and_leaves_in_time(overlay: str, tmp
         wanted = sorted({pod.name.rpartition("-")[0] for pod in services})
         until(lambda: sorted(serving()) == wanted, 120.0)
         with reader(running) as session:
-            until(lambda: len({token.region for token in tokens.standing(session)}) == sum(
+            until(lambda: len({token.region for token in tokens.active_tokens(session)}) == sum(
                 len(json.loads(settings(running, f"{name}-0"))["regions"]) if overlay == "three-regions" else 1
                 for name in wanted
             ))  # fmt: skip

@@ -178,7 +178,7 @@ def test_run_drives_with_the_source_of_another_distribution(
         "blocks = lambda address: read_log(pathlib.Path(address)).blocks(time.time_ns(), 10)\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(plugins, "found", plugins.found.__wrapped__)  # what is installed was looked up before
+    monkeypatch.setattr(plugins, "entry_points_of", plugins.entry_points_of.__wrapped__)  # the cache was filled before
     source = ["--source", f"theirs:{drive / 'log.parquet'}", "--vehicle", str(drive / "vehicle.json")]
     words = ["run", *source, "--estimator", "ckf", "--duration", "1", *config(tmp_path, router)]
     assert main([*words, "--name", "car-three"]) == 0

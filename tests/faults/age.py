@@ -22,7 +22,7 @@ import numpy as np
 
 from fleet_service.analytics import synthetic
 from fleet_service.analytics.synthetic import LATITUDE, LONGITUDE, START_NS, SyntheticFleet
-from fleet_service.app.past import LOOKED_ROWS, PastQuery, box_of, encoded
+from fleet_service.app.past import LOOKED_ROWS, PastQuery, box_of, encode_question
 from fleet_service.archive import layout
 from fleet_service.archive.layout import CHECKPOINTS, DAY_NS, MAP_DAYS
 from fleet_service.archive.segments import SCHEMAS, Writer
@@ -146,7 +146,7 @@ def _asked(root: Path) -> bytes:
     """The question about the past, which the service would let through."""
     question = PastQuery(query.parse({"bbox": NEAR}), START_NS + (DAYS - 1) * DAY_NS, 120.0, None)
     assert 0 < rows_near(root, question.at, box_of(question), LOOKED_ROWS) <= LOOKED_ROWS
-    return encoded(question)
+    return encode_question(question)
 
 
 def _measured(what: str, root: Path, asked: bytes = b"") -> dict[str, float]:

@@ -253,7 +253,7 @@ def reader_overhears(ground: Ground) -> bool:
 @attempt
 def foreign_liveliness_token(ground: Ground) -> bool:
     session = ground.open(ROGUE, ROUTERS[1])
-    false = keys.Served("1202/310/*", ROGUE, "1f").key
+    false = keys.ServiceToken("1202/310/*", ROGUE, "1f").key
     foreign = (keys.alive_key(HONEST), keys.shard_key(ROGUE), f"{keys.ROOT}/alive/{ROGUE}/more", false)
     places = (*foreign, keys.alive_key(ROGUE))
     tokens = [session.liveliness().declare_token(place) for place in places]

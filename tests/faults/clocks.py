@@ -20,7 +20,7 @@ import pyarrow as pa
 from fleet_service.app.clock import SteadyClock
 from fleet_service.app.engine import Engine
 from fleet_service.app.jobs import archive_jobs
-from fleet_service.app.service import take
+from fleet_service.app.service import ingest_messages
 from fleet_service.archive import reading
 from fleet_service.archive.compaction import compact
 from fleet_service.ingest.inbox import Message
@@ -103,7 +103,9 @@ def _one(root: Path, case: Case, found: Found, seconds: int) -> None:
             seq += 1
             found.sent += VEHICLES
             for again in (max(seq - 5, 1), seq):
-                take(engine, clock, [_message(v, again, machine.true - (seq - again) * NS) for v in range(VEHICLES)])
+                ingest_messages(
+                    engine, clock, [_message(v, again, machine.true - (seq - again) * NS) for v in range(VEHICLES)]
+                )
             engine.flush()
             if clock.moment().sure:
                 engine.fade_alerts(clock.now())

@@ -286,7 +286,7 @@ class Machines:
     def hand_over(self, router: ZenohSettings) -> Host:
         """The service gives its region to the one that waits, and has left then; returns it."""
         former, to = self.serving, self.waiting[0].root.parent.name
-        with map_client.joined(router) as session:
+        with map_client.open_connected(router) as session:
             assert moving.hand_over(session, "*/*/*", to, lambda _: None) is not None
         self._taken()
         assert former.part.wait(PATIENCE_S) == 0

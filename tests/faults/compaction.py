@@ -83,7 +83,7 @@ class Reading:
 
 def outside(root: Path) -> Iterable[pa.Table]:
     """What a tool that knows nothing of us reads: the compacted files alone, as they are listed at one moment."""
-    for path in list(layout.compacted(root, Kind.OBSERVATION)):
+    for path in list(layout.compacted_files(root, Kind.OBSERVATION)):
         yield pq.read_table(path, columns=["seq", "row"], partitioning=None)
 
 

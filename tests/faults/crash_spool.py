@@ -83,7 +83,7 @@ def _problems(path: Path, image: Files, owed: set[int], known: dict[int, bytes])
     Path(f"{path}-wal").write_bytes(image.log)
     Path(f"{path}-shm").unlink(missing_ok=True)
     again = Outbox(path, boot=6, capacity_bytes=CAPACITY)
-    there = {batch.seq: batch.payload for batch in again.held()}
+    there = {batch.seq: batch.payload for batch in again.held_batches()}
     again.close()
     found = [f"batch {seq} is lost" for seq in owed - there.keys()]
     return found + [

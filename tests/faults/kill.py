@@ -22,7 +22,7 @@ from fleet_service.analytics import synthetic
 from fleet_service.app.engine import Engine
 from fleet_service.archive import layout
 from fleet_service.archive.compaction import compact
-from fleet_service.archive.retention import LEAST_DAYS, drop_checkpoints, due
+from fleet_service.archive.retention import LEAST_DAYS, drop_checkpoints, due_folders
 from fleet_service.serve.encode import cell_table
 from schemas.config import ServiceConfig
 from schemas.runtime.figures import Figure
@@ -102,7 +102,7 @@ def begin_with_old_rows(archive: Path) -> None:
 
 def old_days(archive: Path) -> list[Path]:
     """Days that retention removes."""
-    return due(archive, LEAST_DAYS, datetime.now(UTC).date())
+    return due_folders(archive, LEAST_DAYS, datetime.now(UTC).date())
 
 
 def _done(archive: Path) -> frozenset[str]:

@@ -59,9 +59,11 @@ QUESTIONS: Final = {
 }
 
 
-def known() -> dict[str, Question]:
+def known_questions() -> dict[str, Question]:
     """Return all questions by name, those of plug-ins too."""
-    others = {name: plugins.loaded(plugins.QUESTIONS, name) for name in plugins.found(plugins.QUESTIONS)}
+    others = {
+        name: plugins.load_entry_point(plugins.QUESTIONS, name) for name in plugins.entry_points_of(plugins.QUESTIONS)
+    }
     return others | QUESTIONS
 
 
@@ -71,7 +73,7 @@ def question_of(name: str) -> Question:
     Raises:
         InputError: there is no question of that name.
     """
-    found = known().get(name)
+    found = known_questions().get(name)
     if found is None:
-        raise InputError("question", f"{name!r} is none", f"use one of {', '.join(known())}")
+        raise InputError("question", f"{name!r} is none", f"use one of {', '.join(known_questions())}")
     return found

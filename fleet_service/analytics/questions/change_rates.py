@@ -100,7 +100,7 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
         for one in names:
             part = counted.filter(pc.equal(counted[column], pa.scalar(one)))
             if (pc.sum(part["pairs"]).as_py() or 0) >= LEAST_PAIRS:
-                rows.append({"by": by, "class": _named(one), **_fitted(part)})
+                rows.append({"by": by, "class": _named(one), **_fit_class(part)})
     return pa.Table.from_pylist(rows, schema=SCHEMA)
 
 
@@ -117,7 +117,7 @@ def _named(one: str | int) -> str:
     return one if isinstance(one, str) else f"{one * HOURS:02}-{(one + 1) * HOURS:02}"
 
 
-def _fitted(counted: pa.Table) -> dict[str, float | int | None]:
+def _fit_class(counted: pa.Table) -> dict[str, float | int | None]:
     """Return the rate of a class, with the interval of days drawn with replacement."""
     columns = {name: counted[name].to_numpy().astype(float) for name in ("pairs", "unlike", "slippery", "seconds")}
     days, day = np.unique(counted["day"].to_numpy(zero_copy_only=False), return_inverse=True)

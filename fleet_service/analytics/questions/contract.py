@@ -139,7 +139,7 @@ def _judged(found: pa.Table, roads: pa.Table, seen: pa.Table, span: tuple[int, i
     about = {(row["link"], row["direction"]): row
              for row in roads.group_by(["link", "direction"], use_threads=False).aggregate(
                  [("name", "first"), ("length_m", "first")]).to_pylist()}  # fmt: skip
-    share = _measured(roads, seen)
+    share = _measured_share(roads, seen)
     rows = found.to_pylist()
     names = [(str(row["link"]), str(row["direction"]), int(row["piece"]), int(row["slot"])) for row in rows]
     number = {key: k for k, key in enumerate(sorted(set(names)))}
@@ -174,7 +174,7 @@ def _judged(found: pa.Table, roads: pa.Table, seen: pa.Table, span: tuple[int, i
     return pa.Table.from_pylist(out, schema=pa.schema(_ROW))
 
 
-def _measured(roads: pa.Table, seen: pa.Table) -> dict[tuple[str, str], float]:
+def _measured_share(roads: pa.Table, seen: pa.Table) -> dict[tuple[str, str], float]:
     """Return the share of each link's length that lies in cells with a value."""
     rows = roads.join(seen, ["cell", "sector"], join_type="inner").sort_by("from_m")
     total: dict[tuple[str, str], float] = {}

@@ -13,7 +13,7 @@ from fleet_service.analytics.options import Options
 from fleet_service.analytics.past_map import visited_cells
 from fleet_service.archive import layout
 from fleet_service.fusion import Fusion
-from fleet_service.replay.rebuild import Since, replay, weathered
+from fleet_service.replay.rebuild import Since, fusion_with_weather, replay
 from schemas import tables
 from schemas.errors import InputError
 from schemas.thresholds import NS
@@ -34,7 +34,7 @@ def ask(engine: QueryEngine, options: Options) -> pa.Table:
         raise InputError("step", f"{options.step_s:g} s is no step", "give the seconds between two frames, e.g. 600")
     at = options.at if options.at is not None else engine.part.until
     last = at if options.step_s is None else max(at, engine.part.until)
-    fusion = weathered(engine.root, options.lateness_s, last)
+    fusion = fusion_with_weather(engine.root, options.lateness_s, last)
     if options.step_s is None:
         rows = 0
         for updated in replay(engine.root, fusion, Since(until=at, box=engine.part.bbox)):

@@ -44,7 +44,7 @@ class _Marks(NamedTuple):
     yaw: FloatArray
 
 
-def joined(network: RoadNetwork) -> pa.Table:
+def join_roads(network: RoadNetwork) -> pa.Table:
     """Return one row per cell and sector on a link; the reference "Columns of the ten questions" explains the
     columns."""
     lengths, marks = _marks(network.links)

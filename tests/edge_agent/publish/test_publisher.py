@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from edge_agent.app.live_loop import Progress
-from edge_agent.app.metrics import troubles
+from edge_agent.app.metrics import health_problems
 from edge_agent.observe.observation_builder import RecordBlock
 from edge_agent.publish.batching import Batcher
 from edge_agent.publish.outbox import Outbox
@@ -205,18 +205,18 @@ def test_a_service_that_tells_its_time_shows_that_the_clock_is_off(
     service.wait(lambda batches: rows(batches, Kind.OBSERVATION) == len(observations.vehicle))
     mine = next(b for b in service.batches if b.vehicle == "car-a")
     settled = StreamAck(mine.boot, mine.kind, mine.region, ((mine.seq, mine.seq),), late=((mine.seq, mine.seq),))
-    assert troubles(publisher, Progress()) == []
+    assert health_problems(publisher, Progress()) == []
     with caplog.at_level(logging.WARNING):
         service.put_ack("car-a", encode_ack("car-a", [settled], time.time_ns() + 130 * NS))
         until(lambda: publisher.counts.late[mine.kind] == 1)
     until(lambda: abs(publisher.clock_behind_s - 130.0) < 10.0)
-    assert any("clock" in trouble for trouble in troubles(publisher, Progress()))
+    assert any("clock" in trouble for trouble in health_problems(publisher, Progress()))
     assert "behind the service's" in caplog.text
     service.put_ack("car-a", encode_ack("car-a", [settled], time.time_ns()))
     until(lambda: abs(publisher.clock_behind_s) < 10.0)
     service.put_ack("car-a", encode_ack("car-a", [settled]))  # of a version that does not tell
     until(lambda: publisher.counts.late[mine.kind] == 3)
-    assert troubles(publisher, Progress()) == []
+    assert health_problems(publisher, Progress()) == []
     publisher.close(within_s=0.1)
 
 

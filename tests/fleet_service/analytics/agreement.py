@@ -7,9 +7,9 @@ from typing import Literal, TypeAlias
 import numpy as np
 import pyarrow as pa
 
-from fleet_service.analytics.output import ordered
+from fleet_service.analytics.output import order_rows
 from fleet_service.analytics.questions import Question
-from fleet_service.analytics.roads.join import joined
+from fleet_service.analytics.roads.join import join_roads
 from fleet_service.analytics.roads.network import DirectedLink, RoadNetwork
 from schemas import grid
 from schemas.numeric import IntArray
@@ -27,7 +27,7 @@ def differs(one: pa.Table, other: pa.Table, question: Question) -> str | None:
     by: list[tuple[str, Literal["ascending", "descending"]]] = [
         (name, "ascending") for name in keys if name in one.schema.names
     ]
-    one, other = (ordered(table, question) for table in (one, other))
+    one, other = (order_rows(table, question) for table in (one, other))
     if by:
         one, other = one.sort_by(by), other.sort_by(by)
     for name in one.schema.names:
@@ -55,4 +55,4 @@ def roads_along(cells: IntArray) -> pa.Table:
                 DirectedLink(f"{line}-{k}", "backward", f"road {line}", "primary", latitude[::-1], longitude[::-1])
             )
     found.append(DirectedLink("nobody", "forward", "", "", np.array([10.0, 10.0]), np.array([10.0, 10.01])))
-    return joined(RoadNetwork(found, {}))
+    return join_roads(RoadNetwork(found, {}))

@@ -69,7 +69,7 @@ def test_a_service_starts_on_an_empty_disk_with_all_that_it_knew(
         if with_checkpoint:
             checkpoints.save(root, engine._image())
             assert engine.copy is not None
-            engine.copy.follow()
+            engine.copy.sync()
         take(engine, second)
         engine.flush()
         assert engine.alerts > 0

@@ -17,7 +17,7 @@ import pytest
 
 from fleet_service.app.engine import Engine
 from fleet_service.archive import reading, segments
-from fleet_service.archive.files import lock
+from fleet_service.archive.files import lock_archive
 from fleet_service.archive.pseudonyms import Pseudonyms, number, texts
 from fleet_service.ingest.inbox import Message
 from schemas import tables, wire
@@ -85,9 +85,9 @@ def test_nothing_is_acknowledged_while_the_disk_fails_and_all_of_it_afterwards(e
 
 def test_a_second_service_on_an_archive_refuses_to_start(engine: Engine, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="^archive: .* belongs to a running service; "):
-        lock(tmp_path)
+        lock_archive(tmp_path)
     engine.close()
-    lock(tmp_path).close()
+    lock_archive(tmp_path).close()
 
 
 def test_a_damaged_segment_is_set_aside_and_the_others_are_read(engine: Engine, tmp_path: Path) -> None:

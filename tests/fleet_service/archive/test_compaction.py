@@ -20,7 +20,7 @@ import pytest
 from fleet_service.app.engine import Engine
 from fleet_service.archive import compaction, files, layout, reading, segments
 from fleet_service.archive import load as loading
-from fleet_service.archive.compaction import compact, compacting
+from fleet_service.archive.compaction import compact, hold_compaction_lock
 from fleet_service.archive.segments import Writer
 from schemas import grid, tables
 from schemas.config import ServiceConfig
@@ -181,7 +181,7 @@ def test_a_reader_that_is_overtaken_begins_again(tmp_path: Path, monkeypatch: py
 
 def test_only_one_compacts_at_a_time(tmp_path: Path) -> None:
     (tmp_path / "inbox").mkdir()
-    with compacting(tmp_path), pytest.raises(InputError, match="^archive: .* is being compacted; "):
+    with hold_compaction_lock(tmp_path), pytest.raises(InputError, match="^archive: .* is being compacted; "):
         compact(tmp_path)
     with pytest.raises(InputError, match="^archive: .* is no folder; "):
         compact(tmp_path / "nowhere")

@@ -10,7 +10,7 @@ import pytest
 
 from fleet_service.archive import layout, segments
 from fleet_service.archive.log import SegmentLog
-from fleet_service.archive.pseudonyms import kept_key
+from fleet_service.archive.pseudonyms import load_or_create_key
 from schemas.wire import Kind
 from tests.faults.crash_disk import CrashDisk
 from tests.fleet_service.archive.rows import identities, rows_of
@@ -85,7 +85,7 @@ def test_a_power_loss_after_the_first_key_was_given_never_takes_it_back(tmp_path
         live.mkdir()
         disk = CrashDisk(live, random.Random(seed), None, range(0))
         with disk.mounted():
-            key = kept_key(live / "keys" / "2026-01.key")
+            key = load_or_create_key(live / "keys" / "2026-01.key")
         disk.image(after)
         assert (after / "keys" / "2026-01.key").exists()
-        assert kept_key(after / "keys" / "2026-01.key") == key
+        assert load_or_create_key(after / "keys" / "2026-01.key") == key

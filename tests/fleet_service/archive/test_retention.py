@@ -41,11 +41,11 @@ def vehicles_in(root: Path, kind: Kind) -> list[str]:
 def test_old_raw_rows_go_and_their_roll_ups_stay(tmp_path: Path) -> None:
     fill(tmp_path, 2, 100)
     compact(tmp_path)
-    assert retention.retire(tmp_path, 31, DATE + timedelta(days=31)) == (0, 0)
+    assert retention.retire_rows(tmp_path, 31, DATE + timedelta(days=31)) == (0, 0)
     days = {kind: [path.name for path in layout.days(tmp_path, layout.TABLES[kind])] for kind in Kind}
     assert days == {kind: [f"date={DATE}", f"date={DATE + timedelta(days=1)}"] for kind in Kind}
     whole = len(identities(tmp_path, Kind.OBSERVATION))
-    done = retention.retire(tmp_path, 31, DATE + timedelta(days=32))
+    done = retention.retire_rows(tmp_path, 31, DATE + timedelta(days=32))
     assert done == (2, 4)  # a day of observations and one of states, two zones each
     left = len(identities(tmp_path, Kind.OBSERVATION))
     assert 0 < left < whole
@@ -57,7 +57,7 @@ def test_old_raw_rows_go_and_their_roll_ups_stay(tmp_path: Path) -> None:
 def test_too_few_days_are_refused_since_a_batch_may_come_again(tmp_path: Path) -> None:
     (tmp_path / "inbox").mkdir()
     with pytest.raises(InputError, match="^raw-days: 7 are too few "):
-        retention.retire(tmp_path, 7, DATE)
+        retention.retire_rows(tmp_path, 7, DATE)
 
 
 def test_one_vehicle_is_forgotten_and_the_others_are_not_touched(tmp_path: Path) -> None:
@@ -219,11 +219,11 @@ def test_compacted_files_are_put_elsewhere_once_and_again_when_rewritten(tmp_pat
     originals = [path for folder in mirror.FOLDERS for path in (root / folder).rglob("*.parquet")]
     assert copies == {path.relative_to(root): path.read_bytes() for path in originals}
     assert not [path for path in there.rglob("*") if path.name.endswith(".tmp")]
-    assert mirror.put(root, there.as_uri()) == 0
+    assert mirror.copy_new_files(root, there.as_uri()) == 0
     originals[0].write_bytes(originals[1].read_bytes() + b"")
-    assert mirror.put(root, there.as_uri()) == 1
+    assert mirror.copy_new_files(root, there.as_uri()) == 1
     with pytest.raises(InputError, match="^to: cannot use nonsense://x "):
-        mirror.put(root, "nonsense://x")
+        mirror.copy_new_files(root, "nonsense://x")
 
 
 @pytest.mark.parametrize("ending", [".parquet", ".geojson", ".csv"])

@@ -158,7 +158,7 @@ def test_compaction_of_segments_of_several_versions_loses_no_row_and_no_column(t
     compact(tmp_path)
     assert _identities(tmp_path, Kind.OBSERVATION) == before
     parts = []
-    for path in layout.compacted(tmp_path, Kind.OBSERVATION):
+    for path in layout.compacted_files(tmp_path, Kind.OBSERVATION):
         found = content(path)
         assert found is not None
         assert found.version == (1, 7), "who knows the column may be told that it is there"
@@ -171,10 +171,10 @@ def test_compaction_of_segments_of_several_versions_loses_no_row_and_no_column(t
 
 def test_forgetting_keeps_columns_and_version_of_a_newer_minor(old: Path) -> None:
     compact(old)
-    for path in layout.compacted(old, Kind.OBSERVATION):
+    for path in layout.compacted_files(old, Kind.OBSERVATION):
         rewritten(path, with_columns, "1.7", COMPACTED)
     assert cli.main(["forget", "--archive", str(old), "--period", "2024-10", "--vehicle", "sim-003"]) == 0
-    for path in layout.compacted(old, Kind.OBSERVATION):
+    for path in layout.compacted_files(old, Kind.OBSERVATION):
         found = content(path)
         assert found is not None
         assert (found.version, "road_wetness" in found.table.column_names) == ((1, 7), True)
@@ -239,7 +239,7 @@ def test_a_wider_type_of_the_same_column_is_read(tmp_path: Path) -> None:
     rewritten(path, wider, "1.2")
     compact(tmp_path)
     assert pa.concat_tables(reading.read(tmp_path, Kind.OBSERVATION)).schema.field("health").type == pa.int32()
-    rewritten(next(layout.compacted(tmp_path, Kind.OBSERVATION)), lambda t: t.set_column(
+    rewritten(next(layout.compacted_files(tmp_path, Kind.OBSERVATION)), lambda t: t.set_column(
         t.column_names.index("health"), "health", pa.array(["flat"] * t.num_rows)), "1.2")  # fmt: skip
     with pytest.raises(InputError, match="^archive: column health is string and not int32; "):
         list(reading.read(tmp_path, Kind.OBSERVATION))
@@ -251,7 +251,7 @@ def test_a_wider_type_of_the_same_column_is_read(tmp_path: Path) -> None:
 def test_a_changed_name_in_a_footer_is_damage_and_no_other_version(tmp_path: Path, name: str) -> None:
     fill(tmp_path, 1, 5)
     compact(tmp_path)
-    path = next(layout.compacted(tmp_path, Kind.OBSERVATION))
+    path = next(layout.compacted_files(tmp_path, Kind.OBSERVATION))
     assert content(path) is not None
     path.write_bytes(path.read_bytes().replace(name.encode(), name[:-1].encode() + b"z"))
     assert content(path) is None
@@ -263,7 +263,7 @@ def test_who_only_reads_passes_over_damage_and_renames_nothing(
     with closing(Engine(ServiceConfig(), old)) as engine:
         harmed = [
             segments.paths(old, Kind.OBSERVATION)[0],
-            next(layout.compacted(old, Kind.OBSERVATION)),
+            next(layout.compacted_files(old, Kind.OBSERVATION)),
             next((old / rollup.TABLE).rglob("*.parquet")),
             next((old / "weather").glob("*.parquet")),
         ]

@@ -103,8 +103,8 @@ def heard(vehicle: zenoh.Session, name: str, listener: zenoh.Session) -> bool:
 
 def test_reader_and_vehicle_see_who_serves_and_cannot_say_that_they_do(running: Network) -> None:
     where = settings(next(iter(running.endpoints.values())), running.folder)
-    served = keys.Served("1202/310/*", SERVICE, "1f")
-    false = keys.Served("1202/311/*", HONEST, "2f")
+    served = keys.ServiceToken("1202/310/*", SERVICE, "1f")
+    false = keys.ServiceToken("1202/311/*", HONEST, "2f")
     with (
         zenoh.open(configuration(where, SERVICE)) as service,
         zenoh.open(configuration(where, HONEST)) as vehicle,
@@ -114,14 +114,14 @@ def test_reader_and_vehicle_see_who_serves_and_cannot_say_that_they_do(running: 
         token = service.liveliness().declare_token(served.key)
 
         def sees(looks: zenoh.Session) -> bool:
-            return served in tokens.standing(looks)
+            return served in tokens.active_tokens(looks)
 
         for looks in (vehicle, reader):
             until(partial(sees, looks))
-        with tokens.watched(reader) as seen:
-            assert seen.here == {served}
+        with tokens.track_tokens(reader) as seen:
+            assert seen.active == {served}
             token.undeclare()
-            until(lambda: seen.withdrawn == {served})
+            until(lambda: seen.lost == {served})
 
 
 def test_a_new_vehicle_comes_in_while_routers_are_restarted_one_at_a_time(running: Network) -> None:

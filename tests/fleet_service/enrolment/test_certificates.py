@@ -44,7 +44,7 @@ def test_everyone_on_the_list_gets_a_certificate_of_the_authority(folder: Path) 
     (authority,) = trusted(folder)
     for name in EVERYONE:
         found = certificate(folder, name)
-        assert ca.signed(found, authority)
+        assert ca.is_signed_by(found, authority)
         assert found.subject.rfc4514_string() == f"CN={name}"
         assert found.not_valid_after_utc == NOW + timedelta(days=365)
         uses = found.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
@@ -104,7 +104,7 @@ def test_another_authority_comes_in_three_steps_and_both_are_trusted_in_between(
     assert set(at(folder).enrol(enrolment(), "switch").made) == EVERYONE
     second = trusted(folder)[0]
     assert set(trusted(folder)) == {first, second}
-    assert ca.signed(certificate(folder, SERVICE), second)
+    assert ca.is_signed_by(certificate(folder, SERVICE), second)
     assert set(at(folder).enrol(enrolment(), "drop").kept) == EVERYONE
     assert trusted(folder) == [second]
 

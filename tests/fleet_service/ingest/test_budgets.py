@@ -18,7 +18,7 @@ from fleet_service.app.engine import Engine
 from fleet_service.archive import reading
 from fleet_service.archive.pseudonyms import Pseudonyms, number
 from fleet_service.archive.retention import drop_checkpoints, forget_period
-from fleet_service.archive.witnesses import Witnesses, read
+from fleet_service.archive.witnesses import VehicleIds, read
 from fleet_service.ingest.budgets import FASTEST, STREAMS_AT_ONCE, Bucket, NewCells, Tracks
 from fleet_service.ingest.inbox import Message
 from schemas import grid, keys, wire
@@ -109,16 +109,16 @@ def test_a_car_with_one_foot_in_last_month_raises_no_alert_alone(engine: Engine)
 
 
 def test_a_line_of_the_witnesses_that_is_damaged_is_left_out(tmp_path: Path) -> None:
-    pseudonyms, witnesses, now = Pseudonyms(tmp_path), Witnesses(tmp_path), time.time_ns()
+    pseudonyms, witnesses, now = Pseudonyms(tmp_path), VehicleIds(tmp_path), time.time_ns()
     names = {f"car-{k:03}": number(pseudonyms.of(f"car-{k:03}", now)) for k in range(3)}
-    known = {p: witnesses.of(name, pseudonyms.month(now), p) for name, p in names.items()}
+    known = {p: witnesses.id_of(name, pseudonyms.month(now), p) for name, p in names.items()}
     assert read(tmp_path) == known
     path = next(tmp_path.glob("*.witnesses"))
     data = bytearray(path.read_bytes())
     data[30] ^= 1
     path.write_bytes(data)
     assert len(read(tmp_path)) == 2
-    assert Witnesses(tmp_path).of("car-000", pseudonyms.month(now), names["car-000"]) == known[names["car-000"]]
+    assert VehicleIds(tmp_path).id_of("car-000", pseudonyms.month(now), names["car-000"]) == known[names["car-000"]]
     assert path.stat().st_mode & 0o077 == 0
 
 

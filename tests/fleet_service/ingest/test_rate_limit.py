@@ -94,10 +94,10 @@ def test_an_acknowledgement_is_never_larger_than_its_receiver_reads() -> None:
     acks, sent = Acks(), [batch("sim-001", seq, 0, [0.8]) for seq in range(1, 3001, 2)]
     for one in sent:
         head = Head(one.kind, one.vehicle, one.boot, one.region, one.seq, one.first_held, one.estimator)
-        acks.rejected("sim-001", head, 0, "x" * 120)
+        acks.record_rejected("sim-001", head, 0, "x" * 120)
     stream = SequenceTracker((1, sent[0].boot, sent[0].kind, sent[0].region))
     stream.vehicle, stream.boot = "sim-001", sent[0].boot
-    acks.durable((stream, seq) for seq in range(5001, 9001, 2))
+    acks.record_durable((stream, seq) for seq in range(5001, 9001, 2))
     messages = acks.messages()
     told = [part for _, payload in messages for part in wire.decode_ack(payload)[1]]
     assert max(len(payload) for _, payload in messages) <= wire.MAX_BYTES

@@ -64,7 +64,7 @@ def test_an_ancestor_is_the_worst_of_what_was_measured_below_it_and_tells_the_un
     table: pa.Table, level: int
 ) -> None:
     cells = records.of_table(table)
-    found = records.worst(cells, level)
+    found = records.aggregate_worst(cells, level)
     shift = 2 * (CELL_LEVEL - level)
     assert len(np.unique(found["place"])) == len(found)
     for one in found:
@@ -85,7 +85,7 @@ def test_one_icy_cell_among_thousands_is_what_is_seen_from_far() -> None:
     for name, whole in (("mu", 170), ("lower", 160), ("upper", 180), ("basis", MEASURED)):
         cells[name] = whole
     cells[1234] = (0, 1234 * 4, 24, 14, 40, 254, MEASURED, 3, 0)
-    far = records.worst(cells, LEAST_LEVEL)
+    far = records.aggregate_worst(cells, LEAST_LEVEL)
     assert len(far) == 1
     assert (far["mu"][0], far["upper"][0], far["slippery"][0]) == (24, 40, 254)
 
@@ -93,12 +93,12 @@ def test_one_icy_cell_among_thousands_is_what_is_seen_from_far() -> None:
 def test_what_changed_laid_over_what_was_is_what_is(table: pa.Table) -> None:
     before, after = records.of_table(table)[:700], records.of_table(table)[300:].copy()
     after["mu"][::7] = 11
-    change = records.changed(before, after)
+    change = records.changed_records(before, after)
     held = {int(one["place"]): one for one in before} | {int(one["place"]): one for one in change}
     left = {place: one for place, one in held.items() if one["basis"] != GONE}
     assert left == {int(one["place"]): one for one in after}
     assert len(change) < len(before) + len(after)
-    assert len(records.changed(after, after)) == 0
+    assert len(records.changed_records(after, after)) == 0
 
 
 def test_a_cell_takes_thirteen_bytes(table: pa.Table) -> None:

@@ -27,7 +27,7 @@ from fleet_service.page.files import Files
 from fleet_service.page.health import values
 from fleet_service.page.records import HEAD
 from fleet_service.page.watchers import WAITING, TooManyWatchersError, View, Watchers
-from fleet_service.page.world import HeldWorld
+from fleet_service.page.world import MapMirror
 from fleet_service.serve.encode import cell_table
 from schemas.config import ZenohSettings
 from tests.faults.processes import Part
@@ -221,7 +221,7 @@ def test_a_page_without_a_router_says_so(router: ZenohSettings) -> None:
 
 def test_a_slow_watcher_is_told_to_reload_and_nothing_else_piles_up() -> None:
     async def slow() -> list[bytes]:
-        world = HeldWorld()
+        world = MapMirror()
         watchers = Watchers(world, dict, most=1)
         stream = watchers.enter(WORLD)
         with pytest.raises(TooManyWatchersError):

@@ -264,5 +264,5 @@ def test_a_checkpoint_that_a_service_dies_of_is_given_up(tmp_path: Path) -> None
         checkpoints.begin(path)
     with pytest.raises(InputError, match="died at once"):
         checkpoints.load(path)
-    checkpoints.survived(tmp_path)
+    checkpoints.mark_survived(tmp_path)
     checkpoints.load(path)

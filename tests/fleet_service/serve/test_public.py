@@ -19,7 +19,7 @@ from fleet_service.archive.retention import drop_checkpoints
 from fleet_service.fusion import Fusion
 from fleet_service.ingest.inbox import Message
 from fleet_service.replay import checkpoints
-from fleet_service.serve.view import CellView, coarse
+from fleet_service.serve.view import CellView, coarsen
 from fleet_service.serve.visitors import PART_NS, Visitors
 from schemas import grid, query, wire
 from schemas.config import ServiceConfig
@@ -106,10 +106,10 @@ def test_coarse_counts_are_never_more_than_there_were() -> None:
     cells = CellView(
         zeros, zeros, np.zeros((len(counts), 32)), zeros.astype(np.float32), counts, counts, zeros, zeros, zeros > 0
     )
-    seen = coarse(cells)
+    seen = coarsen(cells)
     assert (seen.vehicles <= counts).all()
     assert (seen.vehicles >= 0.39 * counts).all()
-    assert (coarse(seen).vehicles == seen.vehicles).all()
+    assert (coarsen(seen).vehicles == seen.vehicles).all()
 
 
 def test_who_passes_alone_at_night_is_not_seen_where_many_were_by_day(start: Start) -> None:
@@ -168,7 +168,7 @@ def test_visitors_are_never_counted_as_more_than_they_were() -> None:
         o = observations(np.arange(40) * 0.1, who, value(np.full(40, 0.8)))
         o = replace(o, time=o.time + turn * PART_NS)
         fusion.update(o)
-        visitors.heard(o)
+        visitors.add(o)
         now = int(o.time[-1])
     slots = np.arange(fusion.size)
     assert 40 < visitors.count(slots, now)[0] <= 64
@@ -196,7 +196,7 @@ def test_cells_that_nobody_visits_for_a_week_are_dropped_by_the_service_and_by_a
     at = now + 601 * SECOND
     (row,) = [one for one in rows(engine, at) if one["cell"] == CELL]
     assert row["vehicles"] == 8
-    assert [alert.cell for alert in engine.repeated(9)] == [ice[0].cell]
+    assert [alert.cell for alert in engine.alerts_to_repeat(9)] == [ice[0].cell]
     hear(engine, "sim-020", now=at + SECOND)
     shown = {one["cell"]: one["vehicles"] for one in rows(engine, at + 2 * SECOND)}
     engine.close()

@@ -22,7 +22,7 @@ NOW = START + 60 * SECOND
 
 def visit(state: MapState, vehicle: int, cell: int = TILE << 14) -> None:
     """One visit, noted as the engine does."""
-    state.changed(state.fusion.update(observations([1.0], [vehicle], value([0.5]), cell)).slots)
+    state.mark_changed(state.fusion.update(observations([1.0], [vehicle], value([0.5]), cell)).slots)
 
 
 @pytest.fixture

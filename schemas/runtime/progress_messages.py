@@ -1,7 +1,7 @@
 """Progress messages of a command: on stderr, never on stdout, and none in quiet mode.
 
 On a terminal a spinner with a clock appears when something takes longer than a second. Elsewhere a long operation is
-reported once as a line. An imported library reports nothing: only the command lines call `speak`.
+reported once as a line. An imported library reports nothing: only the command lines call `enable_messages`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ TICK_S: Final = 1.0
 COMPILING: Final = "compiling kernels, once on this machine: about 40 s for the default estimator"
 
 
-class _Voice:
+class _State:
     """State of the progress messages; one per process."""
 
     def __init__(self) -> None:
@@ -33,29 +33,29 @@ class _Voice:
         self.lock = threading.Lock()
 
 
-_voice = _Voice()
+_voice = _State()
 
 
-def speak(*, quiet: bool = False) -> None:
+def enable_messages(*, quiet: bool = False) -> None:
     """Enable progress messages; the command lines call it."""
     _voice.on = not quiet
     _voice.said_once.clear()
 
 
-def say(line: str) -> None:
+def report(line: str) -> None:
     """Print a line of progress."""
     if _voice.on:
         print_line(line, sys.stderr)
 
 
-def say_once(line: str) -> None:
+def report_once(line: str) -> None:
     """Report something once; on a terminal it becomes the spinner's text."""
     if line not in _voice.said_once:
         _voice.said_once.add(line)
-        say(line)
+        report(line)
 
 
-def doing(words: str) -> None:
+def set_status(words: str) -> None:
     """Set the current activity, shown by the spinner."""
     with _voice.lock:
         _voice.words = words
@@ -64,22 +64,22 @@ def doing(words: str) -> None:
 
 
 @contextmanager
-def busy(words: str) -> Iterator[None]:
+def show_status(words: str) -> Iterator[None]:
     """Show a spinner while the block runs, from PATIENCE_S on and only on a terminal."""
     if not (_voice.on and sys.stderr.isatty()) or _voice.shown is not None:
         yield
         return
-    doing(words)
+    set_status(words)
     _voice.timer = threading.Timer(PATIENCE_S, _show)
     _voice.timer.daemon = True
     _voice.timer.start()
     try:
         yield
     finally:
-        hush()
+        stop_status()
 
 
-def hush() -> None:
+def stop_status() -> None:
     """Stop the spinner: the command has ended, or asks the user a question."""
     timer, _voice.timer = _voice.timer, None
     if timer is not None:
@@ -93,7 +93,7 @@ def hush() -> None:
 
 def _show() -> None:
     began = time.monotonic()
-    loading = threading.Thread(target=_load, daemon=True)
+    loading = threading.Thread(target=_load_drawing, daemon=True)
     loading.start()
     while loading.is_alive():  # seconds, beside a command that computes or loads its own
         with suppress(OSError):
@@ -113,6 +113,6 @@ def _show() -> None:
         _voice.shown = shown
 
 
-def _load() -> None:
+def _load_drawing() -> None:
     """Import the drawing library before it is needed."""
     importlib.import_module("rich.progress")

@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from schemas.runtime import talk
+from schemas.runtime import progress_messages
 from tests.waiting import until
 
 
@@ -23,27 +23,27 @@ class Terminal(io.StringIO):
 def test_it_is_said_each_second_that_it_runs_while_what_draws_is_still_loading(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal, loaded = Terminal(), threading.Event()
     monkeypatch.setattr(sys, "stderr", terminal)
-    monkeypatch.setattr(talk, "PATIENCE_S", 0.01)
-    monkeypatch.setattr(talk, "TICK_S", 0.01)
-    monkeypatch.setattr(talk, "_load", loaded.wait)
-    talk.speak()
+    monkeypatch.setattr(progress_messages, "PATIENCE_S", 0.01)
+    monkeypatch.setattr(progress_messages, "TICK_S", 0.01)
+    monkeypatch.setattr(progress_messages, "_load_drawing", loaded.wait)
+    progress_messages.enable_messages()
     try:
-        with talk.busy("replay"):
+        with progress_messages.show_status("replay"):
             until(lambda: terminal.getvalue().count("replay … 0 s\r") >= 3)
-            talk.doing("compiling step")
+            progress_messages.set_status("compiling step")
             until(lambda: "compiling step … 0 s\r" in terminal.getvalue())
             loaded.set()
             until(lambda: "0:00:00" in terminal.getvalue())  # the line that turns
     finally:
         loaded.set()
-        talk.speak(quiet=True)
+        progress_messages.enable_messages(quiet=True)
 
 
 def test_nobody_is_told_anything_who_asked_for_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
-    monkeypatch.setattr(talk, "PATIENCE_S", 0.0)
-    talk.speak(quiet=True)
-    with talk.busy("replay"):
-        talk.say("a line")
+    monkeypatch.setattr(progress_messages, "PATIENCE_S", 0.0)
+    progress_messages.enable_messages(quiet=True)
+    with progress_messages.show_status("replay"):
+        progress_messages.report("a line")
     assert terminal.getvalue() == ""
