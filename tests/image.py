@@ -39,7 +39,7 @@ def steps(text: str) -> list[tuple[str, str]]:
 
 
 class Image:
-    """What the steps leave, below `root`."""
+    """Result of the steps, below `root`."""
 
     def __init__(self, root: Path) -> None:
         self.root, self.user = root, "root"

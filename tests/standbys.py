@@ -34,11 +34,11 @@ class Link:
 
     @property
     def is_cut(self) -> bool:
-        """Whether it is cut."""
+        """True if it is cut."""
         return not self._open.is_set()
 
     def mend(self) -> None:
-        """What waited goes on."""
+        """Resume the waiting traffic."""
         self._open.set()
 
     def close(self) -> None:
@@ -93,7 +93,7 @@ class Host:
         self.part = Part("service", [sys.executable, *words], folder)
 
     def said(self, start: str) -> bool:
-        """Whether a line of the present start begins so."""
+        """Return True if a line of the present start begins with this text."""
         return any(line.startswith(start) for line in self.part.lines())
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""What nobody measured has no number to colour by, in any form in which it leaves the house.
+"""Unmeasured cells have no number to colour by, in any form of output.
 
 The first promise: unknown never reads as dry. A cell of which only lower bounds are known, or a row that rolled, has a
 median that is mostly the prior, and the prior's median looks like wet asphalt.

@@ -125,7 +125,7 @@ def test_what_destroys_can_be_tried_and_asks_on_a_terminal(words: list[str], arc
 
 
 def on_terminal(command: list[str], answer: str) -> str:
-    """What a command says to a person on a terminal who answers its question so."""
+    """Return the output of a command for a person who types this answer."""
     here, there = pty.openpty()
     with subprocess.Popen(command, stdin=there, stdout=there, stderr=there) as process:
         os.close(there)

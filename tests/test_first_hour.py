@@ -1,4 +1,4 @@
-"""What new users once met in their first hour and no other test holds; the other bugs have theirs beside the code."""
+"""Bugs that new users met in their first hour and that no other test covers."""
 
 from __future__ import annotations
 

@@ -124,7 +124,7 @@ def test_the_page_of_the_demo_opens_in_a_browser_with_both_maps_and_its_figures(
 def test_who_was_warned_and_lost_grip_on_the_new_ice_is_counted_by_passes_told_and_drawn(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of two warned and one unwarned pass since the first alert; what was before it counts for nobody."""
+    """Count two warned passes and one unwarned pass since the first alert; earlier ones do not count."""
     driven = visits(
         ("sim-001", 1.0, 7, 0.9, 0.5), ("sim-002", 11.0, 7, 0.2, 1.0), ("sim-001", 31.0, 7, 0.2, 0.6),
         ("sim-001", 32.0, 7, 0.2, 0.99), ("sim-002", 33.0, 7, 0.2, 1.0), ("sim-004", 40.0, 7, 0.2, 0.7),

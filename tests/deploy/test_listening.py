@@ -13,7 +13,7 @@ from edge_agent.lab.simulation.listeners import WarnedDrivers
 
 
 def test_a_town_that_hears_its_own_map_makes_the_same_map_bit_for_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of drivers who do not react to it, for who drives otherwise measures otherwise."""
+    """Compare drivers who do not react, because different driving gives different measurements."""
     monkeypatch.setattr(listening, "ASKED_S", 4.0)
     hearing, deaf = (ListeningTown("test", 12, 3, listening=hears, rough=0.0) for hears in (True, False))
     hearing.drivers = WarnedDrivers(hearing.fleet, 0.0)

@@ -151,7 +151,8 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def driven(words: list[str], monkeypatch: pytest.MonkeyPatch, folder: Path) -> object:
-    """What a live command hands to the loop: vehicles, names, signals, settings, estimator, duration; and its files."""
+    """Record what a live command passes to the loop: vehicles, names, signals, settings, estimator, duration; and its
+    files."""
     seen: list[object] = []
 
     def note(

@@ -86,7 +86,7 @@ def _smaller(site: Site, millions: float) -> tuple[dict[str, float], dict[str, f
 
 
 def _asked_of(root: Path) -> tuple[dict[str, float], dict[str, float]]:
-    """What a start from a checkpoint costs, and a question about the past."""
+    """Measure a start from a checkpoint, and a query about the past."""
     _measured("checkpoint", root)
     synthetic.write(root, SyntheticFleet(SINCE, 1, vehicles=50, seed=int(time.time())), SEGMENT)
     return _measured("ready", root), _measured("past", root, _asked(root))
@@ -150,7 +150,7 @@ def _asked(root: Path) -> bytes:
 
 
 def _measured(what: str, root: Path, asked: bytes = b"") -> dict[str, float]:
-    """What a process says of itself; see `age_process`."""
+    """Return the output of a process; see `age_process`."""
     command = [sys.executable, "-m", "tests.faults.age_process", what, str(root)]
     done = subprocess.run(command, input=asked, stdout=subprocess.PIPE, check=True)
     found: dict[str, float] = json.loads(done.stdout.splitlines()[-1])

@@ -1,4 +1,4 @@
-"""What the generators know to be safe against what the archive holds."""
+"""Comparison of the generators' journals with the archive."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Census:
 
 
 class Told(NamedTuple):
-    """What the journals say: records and time [s] of every stored batch, time of every settled one."""
+    """Content of the journals: records and time [s] of every stored batch, time of every settled one."""
 
     stored: dict[Name, tuple[int, float]]
     settled: dict[Name, float]

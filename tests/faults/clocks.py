@@ -58,13 +58,13 @@ class Machine:
         return SteadyClock(seen, lambda: self.true + self.off, lambda: self.true)
 
     def jumped(self, clock: SteadyClock) -> bool:
-        """Whether a service's clock is far from the true time, or says that the system's is."""
+        """Return True if a service's clock is far from the true time, or reports that the system clock is."""
         return max(abs(clock.now() - self.true), abs(clock.lag())) > YEAR // 2
 
 
 @dataclass
 class Found:
-    """What went wrong, summed up over cases."""
+    """Failures, summed over cases."""
 
     sent: int = 0
     rejected: int = 0
@@ -158,7 +158,7 @@ def _message(vehicle: int, seq: int, at: int) -> Message:
 
 
 def _rows(root: Path) -> Counter[tuple[int, int]]:
-    """How often each batch's row is in the archive; a vehicle has another pseudonym in another month."""
+    """Return how often each batch's row is in the archive; a vehicle has another pseudonym in another month."""
     tables = list(reading.read(root, Kind.OBSERVATION, ["boot", "seq"]))
     table = pa.concat_tables(tables)
     return Counter(zip(table["boot"].to_numpy().tolist(), table["seq"].to_numpy().tolist(), strict=True))

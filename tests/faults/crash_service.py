@@ -61,7 +61,7 @@ class Sent(NamedTuple):
 
     @property
     def rows(self) -> tuple[int, int]:
-        """What its rows are known by in the archive."""
+        """Return the identity of its rows in the archive."""
         return self.time - SECOND, self.time
 
     @property
@@ -228,7 +228,7 @@ class ServiceHistory(Lives[Sent]):
         return one.rows[0] // layout.DAY_NS <= self.retired or bool(marks & self.forgetting)
 
     def _came_back(self, root: Path, rows: Counter[int]) -> list[str]:
-        """What was forgotten, and is there nevertheless."""
+        """Return forgotten data that is there nevertheless."""
         found = [f"{one.vehicle} {one.seq} came back" for one in self.gone if any(rows[time] for time in one.rows)]
         keys = (path.read_bytes() for path in (root / "keys").glob("*.key"))
         return found + ["the key of a month came back" for key in keys if key in self.destroyed]
@@ -270,7 +270,7 @@ def _boot(vehicle: str) -> int:
 
 
 def _different(begun: ServiceState, whole: ServiceState, now: int) -> list[str]:
-    """What two memories of one archive believe otherwise."""
+    """Return the differences in belief of two states of one archive."""
     if not whole.fusion.size:
         return []
     slots = np.arange(whole.fusion.size)

@@ -66,7 +66,7 @@ def _history(random_: random.Random, folder: Path) -> list[str]:
 
 
 def _torn(random_: random.Random, before: Files, after: Files) -> Files:
-    """What power loss during the commit may leave."""
+    """Return the files that power loss during the commit may leave."""
     if before.database != after.database and random_.random() < 0.5:
         pages = range(0, max(len(before.database), len(after.database)), PAGE)
         chosen = (random_.choice((before, after)).database[at : at + PAGE].ljust(PAGE, b"\0") for at in pages)

@@ -154,7 +154,7 @@ def _text(one: Batch) -> Message:
 
 
 def _alone(latitude: float, longitude: float) -> bool:
-    """Whether an alert is where only the insider says to have been."""
+    """Return True if an alert is at a place that only the insider reports."""
     return abs(latitude - LATITUDE) > 1e-3 or not -1e-3 <= longitude - LONGITUDE <= 5e-3
 
 

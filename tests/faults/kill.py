@@ -49,7 +49,7 @@ RETIRING_KILLED: Final = 0.5
 
 
 class Load(NamedTuple):
-    """What was offered amid the kills, for how long [s], and whether retention removed a day meanwhile."""
+    """Load during the kills: its amount, its duration [s], and whether retention removed a day meanwhile."""
 
     observations: int
     seconds: float
@@ -106,7 +106,7 @@ def old_days(archive: Path) -> list[Path]:
 
 
 def _done(archive: Path) -> frozenset[str]:
-    """What upkeep left: the kills met it only if it was there."""
+    """Return the results of background jobs, which prove that the kills met them."""
     found = {"checkpoints": "checkpoints/*-*", "compaction": "observations/*/*/*.parquet"}
     return frozenset(name for name, pattern in found.items() if any(archive.glob(pattern)))
 

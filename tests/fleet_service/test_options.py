@@ -137,7 +137,7 @@ CAMPAIGN: Final = {"--out", "--quick", "--skip-end-to-end", "--end-to-end"}
 
 
 class Done(NamedTuple):
-    """What a command did: exit code, what it printed, and the files below its folder."""
+    """Result of a command: exit code, output, and the files below its folder."""
 
     code: int
     said: str
@@ -162,7 +162,7 @@ def place(folder: Path) -> dict[str, str]:
 
 
 def content(path: Path, folder: Path) -> str:
-    """What a file holds, as far as it is the same each time."""
+    """Return the reproducible content of a file."""
     if path.suffix == ".key" or path.name.startswith("README"):
         return ""
     if path.suffix == ".pem":
@@ -182,7 +182,7 @@ def done(words: list[str], folder: Path, capsys: Capture) -> Done:
 
 
 def options(command: Command) -> set[str]:
-    """What a command takes."""
+    """Return the options of a command."""
     parser = argparse.ArgumentParser(add_help=False)
     importlib.import_module(command.module).add_arguments(parser)
     return {action.option_strings[0] if action.option_strings else action.dest for action in parser._actions}

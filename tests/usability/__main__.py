@@ -106,7 +106,7 @@ def pages_with_errors(house: House) -> float:
 
 
 def live_page(house: House) -> tuple[str, list[str], list[str]] | None:
-    """What is wrong with the live page before a service with cars on ice; None where nothing is."""
+    """Return the faults of the live page with a service and cars on ice; None if there are none."""
     router, endpoints = open_router(listen="tcp/127.0.0.1:0")
     connection = ZenohSettings(connect=endpoints)
     with router, running(connection, house.folder / "live"), page_of(connection) as address:
@@ -211,7 +211,7 @@ def figures_stale(house: House) -> float:
 
 
 def alerts_per_stretch(house: House) -> float:
-    """Of the last demo."""
+    """Return the alerts per stretch of the last demo."""
     path = ROOT / ".demo" / "figures.json"
     rows = json.loads(path.read_text()) if path.exists() else []
     values = {row["name"]: row["value"] for row in rows if "name" in row}

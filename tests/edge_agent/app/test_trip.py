@@ -34,7 +34,7 @@ def source(drive: Recorded) -> Generator[Block]:
 
 
 def driven(trip: Trip, drive: Recorded) -> tuple[list[bool], list[Block]]:
-    """Whether each block was admitted, and what the estimator would have got; the doctor is waited for."""
+    """Return whether each block was admitted, and the estimator's input; wait for the doctor."""
     admitted, blocks = [], []
     for block in trip.blocks(source(drive), lambda: np.full(ROWS, np.nan)):
         if trip._looking is not None:

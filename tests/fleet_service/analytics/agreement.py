@@ -1,4 +1,4 @@
-"""Whether two engines answer alike: the same rows, floats within the stated error."""
+"""Comparison of two engines' answers: the same rows, floats within the stated error."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Order: TypeAlias = list[tuple[str, Literal["ascending", "descending"]]]
 
 
 def differs(one: pa.Table, other: pa.Table, question: Question) -> str | None:
-    """What differs, or None."""
+    """Return the difference, or None."""
     if one.schema.names != other.schema.names or one.num_rows != other.num_rows:
         return f"{one.num_rows} rows of {one.schema.names}, {other.num_rows} of {other.schema.names}"
     keys = ["day", "cell", "sector", "onset", "vehicle", "period", "basis", "age_h", "temperature", "frame"]

@@ -1,4 +1,4 @@
-"""What a running service does for its archive beside its work."""
+"""Background jobs of a running service."""
 
 from __future__ import annotations
 

@@ -195,7 +195,7 @@ def test_ice_raises_an_alert_after_few_passes_and_grip_clears_it(fleet: Fleet) -
 
 
 def standing(session: zenoh.Session) -> list[wire.Alert]:
-    """What a client hears that comes late."""
+    """Return the alerts that a late client receives."""
     replies = [reply.ok for reply in session.get(f"{keys.ROOT}/alert/**") if reply.ok]
     assert all(str(reply.encoding) == wire.STANDING_ENCODING for reply in replies)
     return [alert for reply in replies for alert in wire.decode_standing(reply.payload.to_bytes())]

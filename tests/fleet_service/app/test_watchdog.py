@@ -1,4 +1,4 @@
-"""What systemd hears of a service: signs of life, until something hangs beside its worker."""
+"""Watchdog signals of a service, until something hangs next to its worker."""
 
 from __future__ import annotations
 

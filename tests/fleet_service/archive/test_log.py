@@ -1,4 +1,4 @@
-"""What waits for the disk: nothing is settled before it is durable, and what fails is not lost."""
+"""The log: nothing is settled before it is durable, and a failed write loses nothing."""
 
 from __future__ import annotations
 

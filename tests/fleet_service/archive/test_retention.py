@@ -1,4 +1,4 @@
-"""What goes: old raw rows, keys, one vehicle's rows; and what stays."""
+"""Removal of old raw rows, of keys and of one vehicle's rows, and the data that stays."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ ERASED = "time: its month, or its vehicle in it, was erased; delete it"
 
 
 def told(engine: Engine, sent: Batch, now: int) -> list[str]:
-    """What the sender of a batch is told, once a segment is written."""
+    """Return the acknowledgement of a batch, once a segment is written."""
     engine.ingest([Message(sent.kind, key(sent.vehicle), wire.encode(sent), "")], now)
     streams = [stream for _, data in engine.flush() for stream in wire.decode_ack(data)[1]]
     assert all(stream.durable in ((), ((sent.seq, sent.seq),)) for stream in streams)

@@ -1,4 +1,4 @@
-"""What the routers let through: real sessions with real certificates against the generated access list."""
+"""Access list of the routers: real sessions with real certificates against the generated list."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_a_vehicle_may_exactly_what_the_design_says() -> None:
 
 
 def heard(vehicle: zenoh.Session, name: str, listener: zenoh.Session) -> bool:
-    """Whether what a vehicle puts on its own key reaches a service."""
+    """Return True if a vehicle's message on its own key reaches a service."""
     received: list[bytes] = []
     with listener.declare_subscriber(f"{keys.ROOT}/obs/**", lambda sample: received.append(sample.payload.to_bytes())):
         publisher = listener.declare_publisher(key(name))  # only a service is told who hears

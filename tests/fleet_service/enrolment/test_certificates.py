@@ -1,4 +1,4 @@
-"""What `fleet-service certs` leaves in its folder, whatever was there before."""
+"""Results of `fleet-service certs`, for any former content of its folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who is listened to, and how much: buckets against the clock, names that are made up, long acknowledgements."""
+"""Rate limits: buckets against the clock, invented names, long acknowledgements."""
 
 from __future__ import annotations
 

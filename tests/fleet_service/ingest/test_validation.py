@@ -1,4 +1,4 @@
-"""What is let in: rules one by one, and bytes that mean harm."""
+"""Validation: rules one by one, and malicious bytes."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def data(seen: Opened, name: str) -> str:
 
 
 def kinds(seen: Opened) -> list[int]:
-    """How many places of each kind were drawn."""
+    """Return the number of drawn places of each kind."""
     return [int(n) for n in data(seen, "kinds").split(",") if n] or [0] * 8
 
 
@@ -68,7 +68,7 @@ def cell_of(part: str, index: int = 1) -> int:
 
 
 def read(seen: Opened, sector: int) -> dict[str, str]:
-    """What the panel says of one heading."""
+    """Return the panel's text of one heading."""
     found: dict[str, str] = seen.page.evaluate(
         "s => Object.fromEntries([...document.querySelectorAll(`[data-sector='${s}'] dd`)]"
         ".map(one => [one.dataset.value, one.textContent]))",

@@ -121,7 +121,7 @@ def known(engine: Engine) -> dict[str, NDArray[Any]]:
 
 @pytest.mark.parametrize("oldest_s", [30 * DAY_S, DAY_S])
 def test_a_batch_that_is_too_old_to_come_again_is_not_fused_again_by_a_restart(tmp_path: Path, oldest_s: float) -> None:
-    """What was compacted after the checkpoint lies in one file with what it knows."""
+    """Restart after a compaction that joined old and new rows in one file."""
     config, now = ServiceConfig(oldest_s=oldest_s), time.time_ns()
     old = now - int(30.5 * DAY_S * SECOND)
     with closing(Engine(config, tmp_path)) as engine:

@@ -1,4 +1,4 @@
-"""What the public sees: cells of enough vehicles, and how hard one may brake on them."""
+"""Public view: cells of enough vehicles, and their safe deceleration."""
 
 from __future__ import annotations
 

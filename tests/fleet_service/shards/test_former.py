@@ -1,4 +1,4 @@
-"""What a service that was followed still puts: it takes the place of nothing that its successor put."""
+"""Late uploads of a service that lost its lease replace nothing of its successor."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ def test_a_standby_goes_on_with_all_that_was_acknowledged(
 
 
 def driven(fleet: Fleet, sent: list[Batch]) -> Callable[[], bool]:
-    """Whether all is acknowledged; what is not is sent again each second, as spools do."""
+    """Return True if all is acknowledged; the rest is sent again each second, as outboxes do."""
     last = [0.0]
 
     def done() -> bool:

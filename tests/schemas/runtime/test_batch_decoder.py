@@ -45,7 +45,7 @@ def sent(draw: Callable[[Any], Any], kind: Kind) -> Any:  # noqa: ANN401 protobu
 
 
 def agrees(kind: Kind, payload: bytes) -> bool:
-    """Whether the reader understands the bytes; if so, it has read what the module reads, or this fails."""
+    """Return True if the scanner understands the bytes; fail if it then reads something else than the library."""
     data = np.frombuffer(payload, np.uint8)
     found = walk(kind, data, np.array([len(payload)]))
     if not found.understood[0]:

@@ -28,7 +28,7 @@ FULL_DISK = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0));
 
 
 def run(folder: Path, factor: str, before: str = "") -> str:
-    """What outer(1.0) gives in a new process, with `inner` multiplying by `factor`."""
+    """Return the result of outer(1.0) in a new process, with `inner` multiplying by `factor`."""
     package = folder / "kernels"
     (package / "inner.py").write_text(INNER.format(factor=factor))
     source = Path(__file__).parents[3] / "schemas"

@@ -1,4 +1,4 @@
-"""What a scraper and an operator's programs see: real HTTP on loopback, and lines of JSON."""
+"""Metrics and health for a scraper and for programs: real HTTP on loopback, and lines of JSON."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What lies behind standard output never ends a process."""
+"""Errors of standard output never end a process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a person who waits on a terminal is told."""
+"""Progress messages on a terminal."""
 
 from __future__ import annotations
 
