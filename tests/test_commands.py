@@ -225,9 +225,7 @@ def test_what_may_be_written_is_known_before_anything_is_computed(tmp_path: Path
 
 
 @pytest.mark.parametrize("out", ["/proc/none/e.parquet", "file/e.parquet"])
-def test_estimates_for_a_place_that_cannot_be_written_are_refused_in_one_line(
-    out: str, tmp_path: Path, capsys: Capture
-) -> None:
+def test_unwritable_estimates_are_refused_in_one_line(out: str, tmp_path: Path, capsys: Capture) -> None:
     log = tmp_path / "x.parquet"
     drive = ["simulate", "slalom", "--duration", "1", "--out", str(log), "--vehicle-out", str(tmp_path / "x.json")]
     assert edge_agent.cli.main(drive) == 0

@@ -82,7 +82,7 @@ def test_an_alert_elsewhere_or_none_at_all_is_an_infinite_delay() -> None:
     assert compare.delay_passes(road, patch, [], 10 * S) == float("inf")
 
 
-def test_old_snow_its_border_and_where_nobody_was_before_are_not_the_new_patch() -> None:
+def test_old_snow_and_unvisited_places_are_not_the_new_patch() -> None:
     before = (("a", 1, 7, 0.2, 0.9), ("a", 2, 8, 0.9, 0.9), ("a", 3, 9, 0.41, 0.9), ("b", 4, 9, 0.6, 0.9))
     after = (("a", 11, 7, 0.2, 0.9), ("a", 12, 8, 0.2, 0.9), ("a", 13, 9, 0.39, 0.9), ("a", 14, 10, 0.2, 0.9))
     new = compare.newly_slippery(visits(*before, *after), 10 * S)
@@ -107,7 +107,7 @@ def test_picture_and_page_are_written_and_no_value_can_end_the_script(tmp_path: 
     assert "http" not in text
 
 
-def test_the_page_of_the_demo_opens_in_a_browser_with_both_maps_and_its_figures(tmp_path: Path) -> None:
+def test_demo_page_opens_in_a_browser_with_both_maps_and_figures(tmp_path: Path) -> None:
     found = compare.compare(tile([7, 8], 0.1, 0.4), visits(("a", 11, 7, 0.2, 0.1), ("a", 12, 8, 0.5, 0.1)), 10 * S)
     basis = found.cells.schema.get_field_index("basis")
     found = replace(found, cells=found.cells.set_column(basis, "basis", [["bound", "measured"]]))
@@ -121,7 +121,7 @@ def test_the_page_of_the_demo_opens_in_a_browser_with_both_maps_and_its_figures(
         assert "demo.map.rmse" in shown.page.locator("#table").inner_text()
 
 
-def test_who_was_warned_and_lost_grip_on_the_new_ice_is_counted_by_passes_told_and_drawn(
+def test_lost_grip_on_new_ice_is_counted_by_passes_and_drawn(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Count two warned passes and one unwarned pass since the first alert; earlier ones do not count."""

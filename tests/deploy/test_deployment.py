@@ -111,7 +111,7 @@ def test_systemd_accepts_the_units(site: Site, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd on this machine")
-def test_systemd_accepts_a_standby_and_starts_it_as_the_service_with_one_word_more(site: Site, tmp_path: Path) -> None:
+def test_systemd_accepts_a_standby_with_one_more_word(site: Site, tmp_path: Path) -> None:
     folder = tmp_path / "units"
     (folder / "gripmap-service.service.d").mkdir(parents=True)
     unit = DEPLOY / "systemd" / "gripmap-service.service"

@@ -53,7 +53,7 @@ def test_every_page_stands_in_the_contents_of_the_site() -> None:
     assert len(decisions) >= 12
 
 
-def test_the_page_of_answers_has_every_column_of_the_map_the_sectors_and_the_cell_sizes() -> None:
+def test_map_columns_page_has_every_column_sector_and_cell_size() -> None:
     page = (DOCS / "reference" / "map-columns.md").read_text()
     rows = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
     named = [name for row in rows for name in re.findall(r"`(\w+)`", row)]

@@ -183,7 +183,7 @@ BREAKS = "service.Service._shut_down = lambda self, *_: [][0]"
 
 
 @pytest.mark.parametrize(("more", "code"), [("", 0), (BREAKS, 1)])
-def test_a_service_that_has_to_be_ended_says_with_its_exit_code_whether_all_was_well(
+def test_exit_code_of_a_forced_end_tells_whether_all_was_well(
     tmp_path: Path, router: ZenohSettings, more: str, code: int
 ) -> None:
     config = tmp_path / "service.json"

@@ -267,9 +267,7 @@ def test_certificates_that_end_within_so_many_days_are_renewed(
     assert capsys.readouterr().out.startswith("issued 7: ") == renewed
 
 
-def test_weather_archive_and_configuration_of_a_service_are_those_that_run_is_given(
-    tmp_path: Path, router: ZenohSettings
-) -> None:
+def test_service_weather_archive_and_configuration_are_those_given(tmp_path: Path, router: ZenohSettings) -> None:
     rain = pa.table({"region": [REGION], "time": [time.time_ns()], "precipitation": [2.0]})
     pq.write_table(rain, tmp_path / "rain.parquet")
     for name, more in (("shard-1", []), ("shard-2", ["--weather", str(tmp_path / "rain.parquet")])):
@@ -332,7 +330,7 @@ def test_every_option_of_a_query_changes_the_answer(router: ZenohSettings, tmp_p
     assert capsys.readouterr().out.splitlines()[-1] == "2 cells"
 
 
-def test_a_box_chooses_the_tiles_that_are_watched_and_either_way_names_the_router(
+def test_box_selects_watched_tiles_and_both_options_name_the_router(
     service: Running, session: zenoh.Session, router: ZenohSettings, tmp_path: Path
 ) -> None:
     (tmp_path / "config.json").write_text(json.dumps({"zenoh": router.model_dump()}))

@@ -128,7 +128,7 @@ def test_without_a_network_the_horizon_fades_to_unknown() -> None:
     assert not gone.basis.any()
 
 
-def test_a_warning_fades_in_half_an_hour_and_an_alert_that_is_not_repeated_in_ten_minutes() -> None:
+def test_a_warning_fades_in_half_an_hour_and_an_alert_in_ten_minutes() -> None:
     said = cells(keys_on(), 0.15, width=0.05)
     said = said._replace(belief=0.9 * said.belief + 0.1 * cells(said.key, 0.8, width=0.05).belief)
     cache, path = told([said]), straight_path(HOME, 60.0)
@@ -174,7 +174,7 @@ def test_an_older_tile_takes_nothing_from_a_newer_one() -> None:
     assert cache.cells == len(keys), "a tile without cells is none"
 
 
-def test_alerts_that_no_longer_stand_are_forgotten_with_the_tile_that_says_so() -> None:
+def test_alerts_missing_from_a_tiles_standing_list_are_dropped() -> None:
     cache, keys = LocalMap(), keys_on()
     tile = int(grid.tile_of(keys[3] // grid.SECTORS))
     assert cache.alert(alert(keys[3]), NOW)
@@ -230,7 +230,7 @@ def test_the_other_carriageway_is_no_way_on() -> None:
     assert ways_on(HOME._replace(yaw=0.0), back, 200.0) == []
 
 
-def test_the_safe_speed_lets_one_stop_in_sight_and_falls_comfortably_before_a_slower_place() -> None:
+def test_safe_speed_allows_stopping_in_sight_and_falls_comfortably() -> None:
     lower = np.concatenate([np.full(100, 0.8), np.full(50, 0.12)])
     speed = safe_speed(np.zeros(150), lower)
     v, a = speed[120], 0.12 * GRAVITY
@@ -251,7 +251,7 @@ def test_one_looks_as_far_as_it_takes_to_stop_on_an_unknown_road() -> None:
     assert horizon_length(80.0) == 1000.0
 
 
-def test_an_alert_of_who_comes_the_other_way_warns_until_somebody_finds_grip_on_this_side() -> None:
+def test_opposite_alert_warns_until_grip_is_found_on_this_side() -> None:
     road, path = keys_on(), straight_path(HOME, 60.0)
     other = [int(key) ^ OTHER_WAY for key in road[2:4]]
     cache = LocalMap()

@@ -171,9 +171,7 @@ def test_what_lies_ahead_is_put_on_the_vehicles_own_key(router: Router, town: Ma
     assert encode_ahead(told) == sample.payload.to_bytes()
 
 
-def test_ice_that_came_while_the_router_was_away_is_heard_when_the_session_is_back(
-    router: Router, town: MadeUpService
-) -> None:
+def test_ice_during_a_router_outage_is_received_after_reconnect(router: Router, town: MadeUpService) -> None:
     with driving(router) as car:
         until(lambda: any("alert" in asked for asked in town.asked))
         router.stop()
@@ -218,7 +216,7 @@ def test_what_was_observed_yesterday_says_how_old_it_is(router: Router) -> None:
             assert np.nanmin(seen.runs.age_s) == pytest.approx(86_400.0, rel=0.01)
 
 
-def test_a_map_of_yesterday_neither_warns_nor_advises_and_takes_nothing_from_that_of_today(router: Router) -> None:
+def test_a_map_of_yesterday_neither_warns_nor_replaces_that_of_today(router: Router) -> None:
     """Report ice of yesterday after a dry road, and then of today the other way round."""
     yesterday = {int(key): 0.85 for key in keys_on()} | {int(key): 0.15 for key in ICE}
     with driving(router) as car:
@@ -318,7 +316,7 @@ class Liar(MadeUpService):
         return [*lies, *NOISE, tile_payload(HERE[:0], 0.2, NOW)][self.said % (len(LIES) + len(NOISE) + 1)]
 
 
-def test_hostile_tiles_are_refused_and_counted_and_the_car_hears_of_ice_all_the_same(router: Router) -> None:
+def test_hostile_tiles_are_refused_and_ice_is_still_received(router: Router) -> None:
     every = len(LIES) + len(NOISE) + 1
     with Liar(router.settings, time.time_ns(), {int(key): 0.85 for key in keys_on()}) as liar, driving(router) as car:
         later_s = 0.0
@@ -377,7 +375,7 @@ def test_pieces_of_the_way_are_asked_for_once_and_again_when_they_are_old() -> N
     assert asked.wanting(path, pose, 100.0), "the session has come back"
 
 
-def test_a_handful_of_tiles_is_heard_and_a_car_at_a_border_does_not_flicker() -> None:
+def test_few_tiles_are_subscribed_and_a_border_causes_no_flicker() -> None:
     tiles, begun, ceased = Tiles(), 0, 0
     for second in range(600):
         metre = 40.0 * second

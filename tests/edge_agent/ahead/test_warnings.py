@@ -60,7 +60,7 @@ def dry_but(*ice: IntArray) -> LocalMap:
     return told([cells(rest[~np.isin(rest, slippery)], 0.9), cells(slippery, 0.15, width=0.05)])
 
 
-def test_one_warning_comes_in_time_to_stop_and_ends_when_the_stretch_is_passed() -> None:
+def test_one_warning_in_time_to_stop_ends_when_the_stretch_is_passed() -> None:
     car = Car(dry_but(icy()))
     told = car.drive(450.0)
     assert [one.state for one in told] == ["raised", "ended"]
@@ -104,7 +104,7 @@ def test_one_vehicle_alone_warns_nobody() -> None:
     assert Car(told([lonely._replace(vehicles=np.ones(len(lonely.key), np.int64))])).drive(450.0) == []
 
 
-def test_an_alert_where_the_map_has_only_a_bound_by_now_is_told_with_its_own_grip() -> None:
+def test_alert_over_a_mere_bound_is_exported_with_its_own_grip() -> None:
     """Ice fades on the map, before its alert ends: what was a value is a bound then."""
     cache = told([cells(icy(), 0.1, basis=BOUND)])
     for key in icy():
@@ -147,7 +147,7 @@ def test_a_car_that_takes_another_way_is_told_that_the_warning_is_over() -> None
     assert told[0].reason == "the car took another way"
 
 
-def test_two_stretches_that_nearly_touch_are_one_warning_and_distant_ones_two() -> None:
+def test_nearly_touching_stretches_are_one_warning_distant_ones_two() -> None:
     near = Car(dry_but(icy(250.0, 20.0), icy(290.0, 20.0))).drive(300.0)
     assert [one.state for one in near] == ["raised"]
     apart = Car(dry_but(icy(200.0, 20.0), icy(320.0, 20.0))).drive(500.0)

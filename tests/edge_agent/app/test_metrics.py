@@ -52,7 +52,7 @@ def test_what_nobody_can_send_is_dropped_and_counted_and_the_rest_goes_on(
     assert publisher.close(within_s=5.0)
 
 
-def test_an_agent_that_nobody_answers_or_whose_outbox_is_full_is_in_trouble(tmp_path: Path, router: Router) -> None:
+def test_agent_without_answers_or_with_full_outbox_reports_problems(tmp_path: Path, router: Router) -> None:
     late: list[float] = []
     config = settings(router, tmp_path)
     publisher = Publisher(

@@ -131,7 +131,7 @@ def test_an_agent_may_start_before_the_router(tmp_path: Path) -> None:
     router.stop()
 
 
-def test_without_a_router_it_leaves_in_time_and_keeps_everything_for_the_next_start(tmp_path: Path) -> None:
+def test_without_a_router_it_exits_in_time_and_keeps_everything(tmp_path: Path) -> None:
     nobody = ZenohSettings(connect=["tcp/127.0.0.1:9"])
     config = AgentConfig(zenoh=nobody, spool=tmp_path / "spool.sqlite", flush_s=0.05)
     publisher = publisher_of(config)
@@ -178,7 +178,7 @@ def test_a_rejected_batch_is_settled_counted_and_logged(
     assert "of car-b was rejected at row 0: speed" in caplog.text
 
 
-def test_acknowledgements_that_cannot_be_read_or_are_anothers_are_counted_and_settle_nothing(
+def test_unreadable_or_foreign_acknowledgements_settle_nothing(
     router: Router, service: Service, tmp_path: Path
 ) -> None:
     service.answer = False

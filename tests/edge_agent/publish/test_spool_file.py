@@ -31,7 +31,7 @@ def found(batches: list[StoredBatch]) -> dict[int, bytes]:
     return {batch.seq: batch.payload for batch in batches}
 
 
-def test_with_any_page_gone_the_car_goes_on_and_most_of_its_batches_are_saved(tmp_path: Path) -> None:
+def test_outbox_with_any_page_lost_recovers_most_of_its_batches(tmp_path: Path) -> None:
     whole = stored(tmp_path / "whole.sqlite")
     image = (tmp_path / "whole.sqlite").read_bytes()
     noticed, least = 0, BATCHES

@@ -68,7 +68,7 @@ def test_only_files_of_zones_near_a_box_are_read(archive: Path) -> None:
     assert not files_near(files, (0.0, 0.0, 1.0, 1.0))
 
 
-def test_the_command_says_what_it_did_and_refuses_a_folder_with_something_in_it(
+def test_rebuild_reports_its_result_and_refuses_a_non_empty_folder(
     archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["rebuild", "--archive", str(archive), "--out", str(tmp_path / "out"), "--to", "2026-01-28"]

@@ -36,7 +36,7 @@ class System:
         return SteadyClock(seen, lambda: self.wall, lambda: self.steady)
 
 
-def test_a_jump_back_is_not_followed_nor_one_ahead_that_no_report_agrees_with() -> None:
+def test_unconfirmed_clock_jumps_are_not_followed() -> None:
     start = time.time_ns()
     system = System(start)
     clock = system.clock()
@@ -56,7 +56,7 @@ def test_a_jump_back_is_not_followed_nor_one_ahead_that_no_report_agrees_with() 
 
 
 @pytest.mark.parametrize("wrong", [-30 * 365, 365])
-def test_a_clock_that_was_wrong_and_is_put_right_is_followed_when_most_reports_agree(wrong: int) -> None:
+def test_a_corrected_clock_is_followed_when_most_reports_agree(wrong: int) -> None:
     true = time.time_ns()
     system = System(true + wrong * DAY)
     clock = system.clock()
@@ -91,7 +91,7 @@ def test_after_a_restart_what_was_seen_before_is_not_the_future() -> None:
     assert not at.sure
 
 
-def test_after_a_restart_a_year_ahead_nothing_is_too_old_and_nothing_ends_by_time() -> None:
+def test_restart_with_a_clock_a_year_ahead_refuses_and_ends_nothing() -> None:
     seen = time.time_ns()
     clock = System(seen + YEAR).clock(seen)
     assert clock.moment().least == seen
@@ -120,7 +120,7 @@ def test_honest_reports_are_kept_through_jumps_and_restarts_of_the_service(tmp_p
             assert engine.counts["refused.time"] == 0
 
 
-def test_a_vehicle_whose_clock_is_a_day_ahead_is_refused_and_does_not_make_the_others_late(tmp_path: Path) -> None:
+def test_vehicle_with_a_clock_a_day_ahead_is_refused_and_harms_nobody(tmp_path: Path) -> None:
     now = time.time_ns()
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         engine.ingest([message(1, now + DAY)], now)

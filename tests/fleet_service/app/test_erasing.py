@@ -160,7 +160,7 @@ def test_a_question_that_cannot_be_done_is_answered_and_taken_away(tmp_path: Pat
         assert not requests.open_requests(tmp_path)
 
 
-def test_a_question_outlives_a_service_that_ends_and_the_command_does_it_then(tmp_path: Path) -> None:
+def test_erasure_request_outlives_a_service_and_the_command_does_it(tmp_path: Path) -> None:
     engine = filled(tmp_path, GONE, *OTHERS)
     stopped = threading.Event()
     stopped.set()

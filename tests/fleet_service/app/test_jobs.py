@@ -66,7 +66,7 @@ def test_a_job_that_fails_is_counted_said_and_done_again(tmp_path: Path) -> None
     assert lines == ["mending failed: no disk", "well"]
 
 
-def test_a_job_that_fails_in_a_way_nobody_foresaw_ends_no_other_and_is_a_trouble(tmp_path: Path) -> None:
+def test_an_unforeseen_job_failure_ends_no_other_job_and_is_reported(tmp_path: Path) -> None:
     turns: list[int] = []
 
     def work(stop: threading.Event) -> str | None:
@@ -97,7 +97,7 @@ def test_a_copy_of_a_days_folder_is_none_of_the_archive(tmp_path: Path) -> None:
     assert [path.name for path in layout.days(tmp_path, "observations")] == ["date=2026-01-31"]
 
 
-def test_a_checkpoint_that_no_good_segment_comes_for_does_not_keep_the_jobs_that_make_room(
+def test_a_checkpoint_without_good_segments_does_not_block_other_jobs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tasks, "MOST_S", 0.05)
@@ -140,7 +140,7 @@ def test_rounds_of_no_rows_are_refused(tmp_path: Path, capsys: pytest.CaptureFix
     assert capsys.readouterr().err.startswith("error: round-rows: ")
 
 
-def test_a_compaction_that_fails_is_said_and_one_that_runs_is_stopped_with_the_service(tmp_path: Path) -> None:
+def test_failing_compaction_is_reported_and_a_running_one_is_stopped(tmp_path: Path) -> None:
     engine = Engine(ServiceConfig(), tmp_path)
     with closing(engine):
         engine.ingest(

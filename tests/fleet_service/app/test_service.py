@@ -134,7 +134,7 @@ def test_a_changed_tile_is_put_on_its_own_key(fleet: Fleet) -> None:
     assert table["cell"].to_pylist() == [CELL]
 
 
-def test_a_batch_that_comes_again_is_acknowledged_again_and_not_counted_again(fleet: Fleet, service: Running) -> None:
+def test_repeated_batch_is_acknowledged_again_and_not_counted_again(fleet: Fleet, service: Running) -> None:
     sent = batch("sim-001", 1, now(), [0.8])
     fleet.settle(sent)
     before = fleet.acks

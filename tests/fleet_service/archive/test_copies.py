@@ -69,7 +69,7 @@ def test_what_is_settled_is_in_the_bucket_byte_for_byte(bucket: BucketServer, ma
         assert there(bucket) == held(root)
 
 
-def test_nothing_is_settled_while_the_bucket_is_away_and_all_of_it_once_when_it_is_back(
+def test_nothing_is_settled_while_the_bucket_is_away_and_all_once_after(
     bucket: BucketServer, make: Make, tmp_path: Path
 ) -> None:
     root = tmp_path / "archive"
@@ -132,7 +132,7 @@ def test_the_copy_follows_compaction_and_retention(bucket: BucketServer, make: M
         assert there(bucket) == held(root)
 
 
-def test_a_segment_that_was_compacted_before_its_put_is_settled_by_what_it_became(
+def test_segment_compacted_before_its_upload_is_settled_by_the_result(
     bucket: BucketServer, make: Make, tmp_path: Path
 ) -> None:
     root = tmp_path / "archive"
@@ -218,7 +218,7 @@ def test_settings_that_cannot_be_used_say_which_and_why(tmp_path: Path, monkeypa
         BucketReplica(tmp_path, "s3://bucket", {})
 
 
-def test_a_bucket_is_reached_by_the_environment_alone_and_the_same_trouble_is_the_same_line(
+def test_bucket_works_by_environment_alone_and_errors_are_stable_lines(
     bucket: BucketServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, value in bucket.store.items():

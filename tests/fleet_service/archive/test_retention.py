@@ -80,7 +80,7 @@ def test_one_vehicle_is_forgotten_and_the_others_are_not_touched(tmp_path: Path)
     assert retention.forget_vehicle(tmp_path, "sim-003", MONTH) == (0, (), None)
 
 
-def test_what_could_tell_of_a_forgotten_vehicle_goes_too_here_and_in_the_mirror(tmp_path: Path) -> None:
+def test_traces_of_a_forgotten_vehicle_are_removed_in_the_mirror_too(tmp_path: Path) -> None:
     root, there = tmp_path / "archive", tmp_path / "there"
     now = time.time_ns()
     month = f"{datetime.fromtimestamp(now / 1e9, UTC):%Y-%m}"
@@ -127,7 +127,7 @@ def rows_kept(root: Path) -> int:
     return sum(table.num_rows for table in reading.read(root, Kind.OBSERVATION, ["vehicle"]))
 
 
-def test_what_was_measured_in_a_forgotten_month_does_not_come_in_again_over_restarts(tmp_path: Path) -> None:
+def test_measurements_of_a_forgotten_month_stay_refused_over_restarts(tmp_path: Path) -> None:
     """Nobody can tell any more that a batch was there before; a spool may hold it, for its acknowledgement was lost."""
     old, away, after = batch("car-001", 1, NOON, [0.8]), batch("car-002", 1, NOON - DAY, [0.8]), NOON + 3 * DAY
     later = batch("car-001", 2, after, [0.8])
@@ -147,7 +147,7 @@ def test_what_was_measured_in_a_forgotten_month_does_not_come_in_again_over_rest
     assert not list((tmp_path / "keys").glob("2026-01.key"))
 
 
-def test_what_a_forgotten_vehicle_measured_does_not_come_in_again_over_restarts(tmp_path: Path) -> None:
+def test_a_forgotten_vehicles_measurements_stay_refused_over_restarts(tmp_path: Path) -> None:
     """A spool that was brought back from a copy may hold what was acknowledged long ago."""
     old, other, late = (batch(f"car-00{k}", 1, NOON + k * SECOND, [0.8]) for k in (1, 2, 3))
     late = replace(late, vehicle="car-001", boot=2)
@@ -168,7 +168,7 @@ def test_what_a_forgotten_vehicle_measured_does_not_come_in_again_over_restarts(
     assert [path.name.count(".") for path in (tmp_path / "keys").glob("*.erased")] == [2], "it goes with the key"
 
 
-def test_the_last_of_a_forgotten_vehicle_does_not_come_in_again_when_its_month_is_forgotten_after_it(
+def test_forgetting_a_month_does_not_readmit_an_already_forgotten_vehicle(
     tmp_path: Path,
 ) -> None:
     other, last = (batch(f"car-00{k}", 1, NOON + k * SECOND, [0.8]) for k in (1, 2))
@@ -190,7 +190,7 @@ def test_a_file_whose_only_vehicle_was_forgotten_is_empty_and_not_damaged(tmp_pa
     assert rows_kept(tmp_path) == 0
 
 
-def test_of_a_month_that_goes_on_all_is_forgotten_until_the_newest_there_is(tmp_path: Path) -> None:
+def test_forgetting_the_current_month_ends_at_its_newest_row(tmp_path: Path) -> None:
     seen, new = batch("car-001", 1, NOON - DAY, [0.8]), batch("car-001", 2, NOON, [0.8])
     with closing(Engine(ServiceConfig(), tmp_path)) as engine:
         assert told(engine, seen, NOON) == ["durable"]

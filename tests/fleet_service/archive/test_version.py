@@ -56,7 +56,7 @@ def files(root: Path) -> Iterator[Path]:
     return (path for path in sorted(root.rglob("*.parquet")))
 
 
-def test_the_kept_archive_is_of_the_first_version_and_holds_every_kind_of_file(old: Path) -> None:
+def test_kept_archive_is_of_version_one_and_has_every_kind_of_file(old: Path) -> None:
     kinds = Counter(path.relative_to(old).parts[0] for path in files(old))
     assert kinds.keys() == {"inbox", "observations", "states", "rollup", "map", "weather"}
     digests = set()
@@ -69,9 +69,7 @@ def test_the_kept_archive_is_of_the_first_version_and_holds_every_kind_of_file(o
 
 
 @pytest.mark.parametrize("begin", ["checkpoint", "log"])
-def test_a_service_on_the_kept_archive_makes_the_same_map_of_it_with_its_checkpoint_and_without(
-    old: Path, begin: str
-) -> None:
+def test_kept_archive_gives_the_same_map_with_and_without_checkpoint(old: Path, begin: str) -> None:
     if begin == "log":
         drop_checkpoints(old)
     with closing(Engine(ServiceConfig(), old)) as engine:
@@ -83,7 +81,7 @@ def test_a_service_on_the_kept_archive_makes_the_same_map_of_it_with_its_checkpo
     assert not list(old.rglob("*.bad"))
 
 
-def test_what_is_kept_is_compacted_together_with_what_is_new_and_gives_the_same_map(old: Path) -> None:
+def test_kept_and_new_files_compact_together_to_the_same_map(old: Path) -> None:
     with closing(Engine(ServiceConfig(), old)) as engine:
         for turn in (ROUNDS, ROUNDS + 1):
             engine.ingest(list(messages(turn)), now_of(turn))
@@ -149,7 +147,7 @@ def test_a_missing_column_is_null_and_an_unknown_one_is_passed_over(tmp_path: Pa
         assert engine.counts["files_set_aside"] == 0
 
 
-def test_compaction_of_segments_of_several_versions_loses_no_row_and_no_column(tmp_path: Path) -> None:
+def test_compacting_segments_of_several_versions_loses_nothing(tmp_path: Path) -> None:
     fill(tmp_path, 3, 20)
     first, second, _ = segments.paths(tmp_path, Kind.OBSERVATION)
     rewritten(first, without_columns, "1.0")
@@ -182,7 +180,7 @@ def test_forgetting_keeps_columns_and_version_of_a_newer_minor(old: Path) -> Non
     assert len(_identities(old, Kind.OBSERVATION)) == 7 * 2 * ROUNDS
 
 
-def test_the_questions_of_analysts_see_files_of_several_versions_as_one_table(tmp_path: Path) -> None:
+def test_questions_see_files_of_several_versions_as_one_table(tmp_path: Path) -> None:
     for seed, change in enumerate((without_columns, with_columns, lambda table: table)):
         fill(tmp_path, 1, 20, seed)
         rewritten(segments.paths(tmp_path, Kind.OBSERVATION)[0], change, "1.7")
@@ -198,7 +196,7 @@ AHEAD = {
 
 
 @pytest.mark.parametrize("folder", AHEAD)
-def test_a_service_refuses_an_archive_of_a_newer_major_version_and_touches_nothing(old: Path, folder: str) -> None:
+def test_archive_of_a_newer_major_version_is_refused_untouched(old: Path, folder: str) -> None:
     path = next((old / folder).glob("*.parquet"), None) or next((old / folder).rglob("*.parquet"))
     rewritten(path, lambda table: table, "2.0", AHEAD[folder])
     with pytest.raises(InputError, match=r"^archive: .* is of version 2\.0, .* reads 1\.x; use a newer GripMap$"):

@@ -191,9 +191,7 @@ def test_a_declared_publisher_of_a_vehicle_is_told_that_somebody_listens(running
 
 
 @pytest.mark.parametrize("own", [keys.ahead_key, keys.vss_key])
-def test_what_is_ahead_of_a_vehicle_and_under_it_is_seen_by_it_and_its_owner_alone(
-    tmp_path: Path, own: Callable[[str], str]
-) -> None:
+def test_private_keys_of_a_vehicle_are_for_it_and_its_owner_alone(tmp_path: Path, own: Callable[[str], str]) -> None:
     other = next(name for name in VEHICLES if name != HONEST)
     fleet = enrolment(owners={"owner-0": [HONEST], "owner-1": [other]})
     listeners = (HONEST, other, SERVICE, READER, "owner-0", "owner-1")

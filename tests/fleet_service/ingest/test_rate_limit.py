@@ -78,7 +78,7 @@ def test_who_is_not_enrolled_is_not_looked_at() -> None:
     assert len(found) == 1
 
 
-def test_names_that_are_made_up_share_one_bucket_and_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invented_names_share_one_bucket_and_fill_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rate_limit, "MOST_NAMES", 100)
     clock = Clock()
     found, _ = buckets(clock)
@@ -105,7 +105,7 @@ def test_an_acknowledgement_is_never_larger_than_its_receiver_reads() -> None:
     assert [first for part in told for first, _ in part.durable] == list(range(5001, 9001, 2))
 
 
-def test_a_service_listens_to_those_on_its_list_and_drops_without_an_answer_what_is_too_much(
+def test_service_ignores_unlisted_vehicles_and_excess_data(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path
 ) -> None:
     file = tmp_path / "fleet.json"

@@ -101,7 +101,7 @@ def beliefs(engine: Engine, now: int) -> np.ndarray:
     return engine.fusion.beliefs(np.arange(engine.fusion.size), now)
 
 
-def test_a_restart_from_the_archive_has_the_weather_that_was_used_and_gives_the_same_map(tmp_path: Path) -> None:
+def test_restart_has_the_used_weather_and_gives_the_same_map(tmp_path: Path) -> None:
     start = time.time_ns() - 7200 * SECOND
     path = file(
         tmp_path / "w.parquet", region=[grid.quadkey(REGION, grid.REGION_ZOOM)],
@@ -129,7 +129,7 @@ def test_a_restart_from_the_archive_has_the_weather_that_was_used_and_gives_the_
     dry.close()
 
 
-def test_reports_of_a_day_are_gathered_in_a_file_and_the_map_stays_whatever_a_checkpoint_knew(tmp_path: Path) -> None:
+def test_weather_reports_of_a_day_are_joined_and_the_map_stays(tmp_path: Path) -> None:
     start, root = time.time_ns() - 7200 * SECOND, tmp_path / "a"
     with closing(Engine(ServiceConfig(), root)) as engine:
         for k in range(6):

@@ -43,7 +43,7 @@ _ALL: Final = """() => {
 }"""
 
 
-def test_the_share_that_is_unknown_is_seen_in_the_smallest_square_and_no_square_vanishes(page: RunningPage) -> None:
+def test_unknown_share_shows_in_the_smallest_square(page: RunningPage) -> None:
     with shown(page) as seen:
         for side in (3.3, 4.0, 4.7, 5.6, 7.9, 12.2):
             for unknown in (1, 60, 127, 253):

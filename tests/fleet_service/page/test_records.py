@@ -36,7 +36,7 @@ def table() -> pa.Table:
     return cell_table(fusion, np.arange(fusion.size), START + 60 * 10**9)
 
 
-def test_a_record_is_at_most_half_a_step_off_in_mu_and_never_narrower_or_drier(table: pa.Table) -> None:
+def test_a_record_is_accurate_and_never_narrower_or_drier(table: pa.Table) -> None:
     found = records.of_table(table)
     place = (table["cell"].to_numpy() & 0x3FFF) * 4 + table["sector"].to_numpy()
     row = {key: k for k, key in enumerate(place.tolist())}
@@ -60,9 +60,7 @@ def test_a_bound_has_no_number_to_colour_by_whoever_sent_it(table: pa.Table) -> 
 
 
 @pytest.mark.parametrize("level", range(LEAST_LEVEL, CELL_LEVEL + 1))
-def test_an_ancestor_is_the_worst_of_what_was_measured_below_it_and_tells_the_unknown_share(
-    table: pa.Table, level: int
-) -> None:
+def test_an_ancestor_has_the_worst_of_its_cells_and_the_unknown_share(table: pa.Table, level: int) -> None:
     cells = records.of_table(table)
     found = records.aggregate_worst(cells, level)
     shift = 2 * (CELL_LEVEL - level)

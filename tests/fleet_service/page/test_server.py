@@ -106,7 +106,7 @@ def test_a_file_outside_the_page_and_another_hosts_name_are_refused(bare: str) -
     assert ask(bare, "/", Host="localhost:1")[0] == 200
 
 
-def test_a_file_comes_packed_where_the_browser_takes_it_and_not_again_where_it_has_it(bare: str) -> None:
+def test_file_is_compressed_if_accepted_and_not_sent_again(bare: str) -> None:
     _, plain, text = ask(bare, "/static/main.js")
     assert "content-encoding" not in plain
     _, packed, body = ask(bare, "/static/main.js", **{"Accept-Encoding": "gzip"})

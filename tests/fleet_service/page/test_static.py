@@ -72,7 +72,7 @@ def test_every_module_is_in_the_one_script_that_the_page_asks_for() -> None:
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "fleet_service/page/static").glob("*.js")), ids=lambda path: path.name)
-def test_a_module_is_short_enough_to_be_read_and_takes_nothing_from_elsewhere(path: Path) -> None:
+def test_page_modules_are_short_and_take_nothing_from_elsewhere(path: Path) -> None:
     text = path.read_text()
     assert text.count("\n") <= 400
     assert "http://" not in text.replace("http://www.w3.org/2000/svg", "")

@@ -90,16 +90,14 @@ def called(mu: float, vehicles: range, then: float, others: range) -> tuple[Fusi
     return fusion, under[len(vehicles) :]
 
 
-def test_what_many_called_dry_takes_four_sources_however_sure_the_belief_is() -> None:
+def test_a_road_called_dry_by_many_needs_four_sources_of_ice() -> None:
     fusion, under = called(0.85, range(20), 0.2, range(5, 11))
     assert slippery(belief(fusion)) > 0.9
     assert under == [False, False, False, True, True, True]
 
 
 @pytest.mark.parametrize(("drivers", "found", "raised"), [(4, 0, False), (4, 1, False), (4, 2, True), (6, 2, False)])
-def test_neighbours_confirm_two_who_found_ice_where_their_reports_outweigh_what_was(
-    drivers: int, found: int, raised: bool
-) -> None:
+def test_neighbours_confirm_two_reports_of_ice_that_outweigh_the_past(drivers: int, found: int, raised: bool) -> None:
     fusion, (before, here, behind) = Fusion(120.0), grid.interleave(COLUMN + np.arange(-1, 2), np.full(3, ROW)).tolist()
     for cell in (before, here, behind):  # of a road where more grip was used than ice has
         seconds = 20.0 * np.arange(drivers)
@@ -130,7 +128,7 @@ def test_what_many_called_ice_takes_five_vehicles_to_clear() -> None:
     assert under == [True, True, True, True, False, False]
 
 
-def test_who_lost_its_trust_corroborates_nothing_of_what_it_reported_before() -> None:
+def test_a_vehicle_without_trust_no_longer_corroborates() -> None:
     fusion, _ = called(0.2, range(4), 0.2, range(0))
     slot = np.zeros(1, np.int64)
     assert fusion.sources(slot, ICE, 0)[0] == [4]

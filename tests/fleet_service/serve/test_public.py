@@ -179,7 +179,7 @@ def test_visitors_are_never_counted_as_more_than_they_were() -> None:
     assert Visitors.of(Fusion(60.0), visitors.columns()).count(np.zeros(0, np.int64), now).tolist() == []
 
 
-def test_cells_that_nobody_visits_for_a_week_are_dropped_by_the_service_and_by_a_restart(start: Start) -> None:
+def test_cells_unvisited_for_a_week_are_dropped_live_and_by_restart(start: Start) -> None:
     engine, now = start(1), time.time_ns()
     names, alone = [f"sim-{k:03}" for k in range(4)], LATITUDE - 0.002
     old = now - 8 * 86_400 * SECOND

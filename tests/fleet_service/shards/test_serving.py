@@ -81,7 +81,7 @@ def ask(router: ZenohSettings, **parameters: str) -> map_client.Answer:
     return map_client.ask(router, parameters)
 
 
-def test_answers_over_three_services_are_whole_in_order_and_say_what_is_missing(
+def test_answers_over_three_services_are_ordered_and_name_gaps(
     router: ZenohSettings, session: zenoh.Session, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     box = f"{WEST - 0.05},{SOUTH},{EAST + 0.05},{NORTH}"
@@ -160,7 +160,7 @@ def test_a_second_service_of_a_region_refuses_to_start(router: ZenohSettings, tm
         assert rival_tokens(mine, tokens.active_tokens(other)) == []
 
 
-def test_a_region_is_said_to_be_served_only_while_all_that_is_asked_is_answered(
+def test_region_is_announced_only_while_queries_are_answered(
     router: ZenohSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen = []
@@ -231,7 +231,7 @@ def drive_one(session: zenoh.Session, service: Running) -> None:
 
 
 @pytest.mark.parametrize("comes_back", [False, True])
-def test_who_goes_while_it_is_asked_may_have_been_asked_in_place_of_who_followed_it(
+def test_a_leaving_service_may_be_asked_instead_of_its_successor(
     router: ZenohSettings, monkeypatch: pytest.MonkeyPatch, comes_back: bool
 ) -> None:
     inside = f"{WEST + 0.001},{SOUTH + 0.001},{EAST - 0.001},{NORTH - 0.001}"
@@ -257,7 +257,7 @@ def test_who_goes_while_it_is_asked_may_have_been_asked_in_place_of_who_followed
             again.__exit__(None, None, None)
 
 
-def test_of_a_service_that_is_killed_while_it_is_asked_the_token_may_fall_after_the_answer(
+def test_token_of_a_killed_service_may_fall_after_the_answer(
     router: ZenohSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     inside = f"{WEST + 0.001},{SOUTH + 0.001},{EAST - 0.001},{NORTH - 0.001}"

@@ -209,9 +209,7 @@ def test_what_a_frozen_service_had_under_way_counts_for_nothing(bucket: BucketSe
     back.close()
 
 
-def test_a_folder_that_was_served_without_its_bucket_is_not_made_what_the_bucket_is(
-    bucket: BucketServer, tmp_path: Path
-) -> None:
+def test_folder_served_without_its_bucket_is_not_synchronised(bucket: BucketServer, tmp_path: Path) -> None:
     one = Machine(tmp_path / "one", bucket)
     one.write(0)
     one.close()
@@ -265,9 +263,7 @@ def test_a_compaction_that_outlived_its_service_is_waited_for(
     back[0].close()
 
 
-def test_who_starts_while_the_bucket_is_away_says_so_and_ends_or_waits_as_a_standby(
-    bucket: BucketServer, tmp_path: Path
-) -> None:
+def test_start_without_bucket_ends_or_waits_as_a_standby(bucket: BucketServer, tmp_path: Path) -> None:
     bucket.stop()
     with pytest.raises(InputError, match="cannot be used .* see that it is reached"):
         Machine(tmp_path / "one", bucket, standby=False)
@@ -283,7 +279,7 @@ def test_who_starts_while_the_bucket_is_away_says_so_and_ends_or_waits_as_a_stan
 
 
 @pytest.mark.campaign
-def test_a_standby_is_ready_for_systemd_gives_signs_of_life_and_shows_that_it_does_not_serve(
+def test_standby_signals_systemd_and_shows_that_it_does_not_serve(
     router: ZenohSettings, bucket: BucketServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     holder = Machine(tmp_path / "one", bucket)
@@ -337,7 +333,7 @@ def test_one_of_many_takes_a_lease(bucket: BucketServer) -> None:
 
 @pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="this system does not count while it is suspended")
 @pytest.mark.parametrize("lease_s", [4.0, 40.0])
-def test_half_a_lease_after_a_renewal_began_nothing_is_acknowledged_any_more(
+def test_acknowledgement_stops_half_a_lease_after_the_last_renewal(
     bucket: BucketServer, monkeypatch: pytest.MonkeyPatch, lease_s: float
 ) -> None:
     now = [100.0]

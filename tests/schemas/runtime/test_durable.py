@@ -50,7 +50,7 @@ def test_what_fails_leaves_the_file_as_it_was(tmp_path: Path, error: BaseExcepti
     assert (path.read_bytes(), [p.name for p in tmp_path.iterdir()]) == (b"old", ["a"])
 
 
-def test_a_secret_is_never_readable_by_others_not_even_in_a_draft_that_was_left(tmp_path: Path) -> None:
+def test_a_secret_is_never_readable_by_others_even_in_a_draft(tmp_path: Path) -> None:
     path = tmp_path / "key"
     draft_of(path).write_bytes(b"of a process that died, open to all")
     with open_durably(path, 0o600) as file:

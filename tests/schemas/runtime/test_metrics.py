@@ -36,7 +36,7 @@ def fetch(address: str) -> tuple[int, str, str]:
             return error.code, error.headers["Content-Type"], error.read().decode()
 
 
-def test_values_are_read_by_the_formats_own_parser_whatever_their_labels_hold() -> None:
+def test_metric_values_survive_the_formats_own_parser() -> None:
     with serve_metrics("127.0.0.1", 0, read, list) as address:
         status, form, text = fetch(f"{address}/metrics")
     families = {family.name: family for family in text_string_to_metric_families(text)}

@@ -22,7 +22,7 @@ print("said", end=" ")
 """
 
 
-def test_a_command_that_is_done_leaves_without_taking_the_interpreter_apart() -> None:
+def test_finished_command_exits_without_interpreter_teardown() -> None:
     done = subprocess.run([sys.executable, "-c", f"{LEAVE}leave(3)"], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (3, "said registered\n")
 

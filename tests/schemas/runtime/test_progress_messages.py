@@ -20,7 +20,7 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_it_is_said_each_second_that_it_runs_while_what_draws_is_still_loading(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_is_shown_while_the_drawing_library_still_loads(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal, loaded = Terminal(), threading.Event()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr(progress_messages, "PATIENCE_S", 0.01)
