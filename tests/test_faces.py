@@ -179,7 +179,8 @@ def test_estimator_source_and_question_of_another_distribution_are_found(tmp_pat
     archive = DATA / "v1.0" / "archive"
     done = command("fleet_service", "analyze", "busiest", "--archive", str(archive), "--as-it-lies", "--json")
     assert json.loads(done.stdout)["rows"] > 0, done.stderr
-    words = "from schemas.runtime import plugins; b = list(plugins.loaded(plugins.SOURCES, 'mine')('1')); print(len(b))"
+    words = "from schemas.runtime.plugins import SOURCES, load_entry_point; "
+    words += "print(len(list(load_entry_point(SOURCES, 'mine')('1'))))"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
     done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=True, env=environment)
     assert int(done.stdout) >= 10
